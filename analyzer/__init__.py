@@ -1,0 +1,1 @@
+"""Everything that reads logs and labelled audio: training, summaries, pictures."""

@@ -1,0 +1,1 @@
+"""What decides: classifier inference, segments and the model file, on numpy alone."""

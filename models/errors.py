@@ -1,0 +1,7 @@
+"""Errors of models and their files."""
+
+from schemas.errors import HearthlogError
+
+
+class ModelError(HearthlogError):
+    """A model file is missing, damaged, or made for something else."""

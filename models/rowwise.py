@@ -1,0 +1,39 @@
+"""Matrix products whose rows do not depend on each other."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+_ROWS = 16
+
+
+def rowwise_matmul(rows: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Multiply `rows @ weights` so that a row's result is the same in any company.
+
+    A BLAS picks its kernels, and its threads, by the size of the whole product, and each sums
+    in an order of its own. Stacks of one small, fixed shape leave it no choice.
+
+    Parameters
+    ----------
+    rows : np.ndarray [shape=(n, k)]
+    weights : np.ndarray [shape=(k, m)]
+        At most a few thousand values, or the BLAS may still divide a stack among threads.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, m)]
+    """
+    count, width = rows.shape
+    columns = weights.shape[1]
+    product = np.empty((count, columns))
+    stacks, rest = divmod(count, _ROWS)
+    whole = stacks * _ROWS
+    np.matmul(
+        rows[:whole].reshape(stacks, _ROWS, width),
+        weights,
+        out=product[:whole].reshape(stacks, _ROWS, columns),
+    )
+    if rest:
+        last = np.zeros((_ROWS, width))
+        last[:rest] = rows[whole:]
+        product[whole:] = (last @ weights)[:rest]
+    return product

@@ -1,0 +1,65 @@
+"""Audio files as one stream of samples at 16 kHz, mono."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import soundfile
+import soxr
+from numpy.typing import NDArray
+
+from recorder.errors import SourceError
+from recorder.features import SAMPLE_RATE
+
+_BLOCK_SECONDS = 10.0
+_RATES = range(1_000, 768_001)  # what any recording has, and soxr converts in bounded memory
+
+Float32 = NDArray[np.float32]
+
+
+def read_audio(path: Path) -> Iterator[Float32]:
+    """Read an audio file of any rate and channel count, block by block.
+
+    Channels are averaged, other rates resampled; samples that are not finite become 0.
+
+    Yields
+    ------
+    np.ndarray [shape=(n,)], float32
+        Samples in full scale, -1 to 1, at 16 kHz.
+
+    Raises
+    ------
+    SourceError
+        If the file is missing, is no audio, or ends in the middle of its data.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: no such file")
+    try:
+        with soundfile.SoundFile(path) as audio:
+            if audio.samplerate not in _RATES:
+                message = f"{path}: a sample rate of {audio.samplerate} Hz cannot be recorded"
+                raise SourceError(message)
+            if audio.frames == 0:
+                raise SourceError(f"{path}: holds no audio")
+            yield from _resampled(_mono_blocks(audio), audio.samplerate)
+    except soundfile.LibsndfileError as error:
+        reason = error.error_string.rstrip(".")
+        raise SourceError(f"{path}: cannot be read as audio ({reason})") from error
+
+
+def _mono_blocks(audio: soundfile.SoundFile) -> Iterator[Float32]:
+    size = int(audio.samplerate * _BLOCK_SECONDS)
+    while len(block := audio.read(size, dtype="float32", always_2d=True)):
+        if not np.isfinite(block).all():
+            np.nan_to_num(block, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        yield block[:, 0] if block.shape[1] == 1 else block.mean(axis=1)
+
+
+def _resampled(blocks: Iterator[Float32], rate: int) -> Iterator[Float32]:
+    if rate == SAMPLE_RATE:
+        yield from blocks
+        return
+    resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
+    for block in blocks:
+        yield resampler.resample_chunk(np.ascontiguousarray(block))
+    yield resampler.resample_chunk(np.empty(0, np.float32), last=True)

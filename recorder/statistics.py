@@ -1,0 +1,69 @@
+"""Mean and standard deviation of the features over the last second, at every frame."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+WINDOW_FRAMES = 20
+_FRAMES_AT_ONCE = 256
+
+Float32 = NDArray[np.float32]
+
+
+class RollingStatistics:
+    """Statistics of one stream of frames over its last 20 frames.
+
+    Every window is summed anew from its own frames: running sums would drift over months.
+    """
+
+    def __init__(self) -> None:
+        self._recent: Float32 | None = None
+
+    @property
+    def frames_heard(self) -> int:
+        """Frames in the window, at most 20; a full second was heard when it is 20."""
+        return 0 if self._recent is None else min(len(self._recent) + 1, WINDOW_FRAMES)
+
+    def restart(self) -> None:
+        """Empty the window: the next frame does not follow the last one."""
+        self._recent = None
+
+    def __call__(self, features: Float32) -> tuple[Float32, Float32]:
+        """Compute the statistics at each of successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+
+        Returns
+        -------
+        mean, std : np.ndarray [shape=(n, d)], float32
+            Over the last 20 frames, or over those heard since the start or the last restart if
+            they are fewer; the standard deviation divides by their number.
+        """
+        mean = np.empty_like(features)
+        std = np.empty_like(features)
+        for start in range(0, len(features), _FRAMES_AT_ONCE):
+            block = slice(start, start + _FRAMES_AT_ONCE)
+            self._compute(features[block], mean[block], std[block])
+        return mean, std
+
+    def _compute(self, features: Float32, mean: Float32, std: Float32) -> None:
+        recent = features[:0] if self._recent is None else self._recent
+        heard = np.concatenate([recent, features])
+        filling = min(max(WINDOW_FRAMES - 1 - len(recent), 0), len(features))
+        for i in range(filling):
+            _mean_and_std(heard[np.newaxis, : len(recent) + i + 1], mean[i : i + 1], std[i : i + 1])
+        if filling < len(features):
+            windows = np.lib.stride_tricks.sliding_window_view(heard, WINDOW_FRAMES, axis=0)
+            _mean_and_std(windows.transpose(0, 2, 1), mean[filling:], std[filling:])
+        self._recent = heard[max(len(heard) - WINDOW_FRAMES + 1, 0) :].copy()
+
+
+def _mean_and_std(windows: Float32, mean: Float32, std: Float32) -> None:
+    """Reduce windows of shape (n, frames, d) along their frames, in float64."""
+    frames = windows.shape[1]
+    center = windows.sum(axis=1, dtype=np.float64) / frames
+    mean[...] = center
+    deviation = windows - center[:, np.newaxis]
+    np.square(deviation, out=deviation)
+    std[...] = np.sqrt(deviation.sum(axis=1) / frames)

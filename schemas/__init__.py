@@ -1,0 +1,1 @@
+"""The contract of hearthlog: messages, topics, file names, reading and writing logs."""

@@ -1,0 +1,1 @@
+"""The command `hearthlog`, one module a verb."""
