@@ -19,9 +19,9 @@ class RollingStatistics:
         self._recent: Float32 | None = None
 
     @property
-    def frames_heard(self) -> int:
-        """Frames in the window, at most 20; a full second was heard when it is 20."""
-        return 0 if self._recent is None else min(len(self._recent) + 1, WINDOW_FRAMES)
+    def remembered(self) -> int:
+        """Frames that the window of the next frame begins with, at most 19."""
+        return 0 if self._recent is None else len(self._recent)
 
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""

@@ -1,0 +1,125 @@
+"""Scenarios: which labels of a manifest make up which class of a model."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from analyzer.errors import DataError
+from models.modelfile import CLASS_NAME
+
+_SIZE_LIMIT = 1 << 20
+
+# What is audible in a home, by the names the built-in scenarios use. `other_negative` (rain, a
+# dog, sirens …) is no class of either: an honest recogniser calls it unknown.
+_GENERAL = (
+    "silence",
+    "speech",
+    "music",
+    "phone_ring",
+    "coughing",
+    "crying",
+    "yelling",
+    "laughing",
+    "objects_activity",
+)
+_WATER = ("flushing_water", "shower", "tap_water")
+_BATHROOM_OTHER = ("bathroom_other", *_GENERAL[1:])
+LABELS = frozenset({*_GENERAL, *_WATER, "bathroom_other", "other_negative"})
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What a model is to tell apart.
+
+    Attributes
+    ----------
+    name : str
+    classes : mapping of str to tuple of str
+        Each class and the labels that belong to it, in the order of the model's classes.
+    ignored : frozenset of str
+        Labels that may stand in a manifest and are left out.
+    """
+
+    name: str
+    classes: Mapping[str, tuple[str, ...]]
+    ignored: frozenset[str] = frozenset()
+
+    @property
+    def class_of(self) -> dict[str, str]:
+        """Class of each label that has one."""
+        return {label: name for name, labels in self.classes.items() for label in labels}
+
+    @property
+    def labels(self) -> frozenset[str]:
+        """Labels a manifest may use: built in, in a class, or ignored."""
+        return LABELS | self.class_of.keys() | self.ignored
+
+
+BUILTIN = {
+    "bathroom": Scenario(
+        "bathroom",
+        {"silence": ("silence",)} | {w: (w,) for w in _WATER} | {"other": _BATHROOM_OTHER},
+    ),
+    "general": Scenario("general", {label: (label,) for label in _GENERAL}),
+}
+
+
+def load_scenario(name: str) -> Scenario:
+    """Return a built-in scenario, or read one from a TOML file.
+
+    The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
+    ...]` above it.
+
+    Raises
+    ------
+    DataError
+        If there is no such scenario, or the file does not say what it must.
+    """
+    if name in BUILTIN:
+        return BUILTIN[name]
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise DataError(f"unknown scenario {name!r}: use {', '.join(BUILTIN)} or a .toml file")
+    content = _read_toml(path)
+    unknown = content.keys() - {"classes", "ignore"}
+    if unknown:
+        raise DataError(f"{path}: unknown key {min(unknown)!r}; known are classes, ignore")
+    classes = content.get("classes")
+    if not isinstance(classes, dict) or len(classes) < 2:
+        raise DataError(f"{path}: needs a table [classes] with two classes or more")
+    table = {_class_name(path, key): _labels(path, key, value) for key, value in classes.items()}
+    ignored = frozenset(_labels(path, "ignore", content["ignore"])) if "ignore" in content else ()
+    every = [label for labels in (*table.values(), ignored) for label in labels]
+    twice = sorted({label for label in every if every.count(label) > 1})
+    if twice:
+        raise DataError(f"{path}: label {twice[0]!r} is in two places")
+    return Scenario(path.stem, table, frozenset(ignored))
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    if not path.is_file():
+        raise DataError(f"{path}: no such scenario file")
+    try:
+        if path.stat().st_size > _SIZE_LIMIT:
+            raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no scenario")
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: is not TOML in UTF-8 ({str(error)[:200]})") from error
+
+
+def _class_name(path: Path, name: str) -> str:
+    if not CLASS_NAME.fullmatch(name):
+        raise DataError(
+            f"{path}: class name {name[:64]!r} must be at most 64 lower-case letters, digits and "
+            "'_', starting with a letter"
+        )
+    return name
+
+
+def _labels(path: Path, key: str, value: object) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
+        raise DataError(f"{path}: {key} must be a list of labels, such as [\"speech\"]")
+    return tuple(value)

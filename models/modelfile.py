@@ -1,0 +1,353 @@
+"""The model file: one `.safetensors` file, arrays and a JSON description, checked when loaded."""
+
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from safetensors.numpy import save
+
+from models.errors import ModelError
+from schemas.files import sync_folder
+
+SUFFIX = ".safetensors"
+CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+_FEATURE_SET = "auros21"
+_KEY = "hearthlog"
+_SIZE_LIMIT = 64 << 20  # a hundred times what a home needs
+_MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
+_LARGEST = 1e9  # with _SMALLEST_SCALE: no product of finite statistics overflows
+_SMALLEST_SCALE = 1e-30
+_DTYPES = {
+    "scaler_mean": ("F64", np.float64),
+    "scaler_scale": ("F64", np.float64),
+    "support_vectors": ("F32", np.float32),
+    "support_counts": ("I64", np.int64),
+    "dual_coefficients": ("F64", np.float64),
+    "intercepts": ("F64", np.float64),
+}
+
+Float64 = NDArray[np.float64]
+
+_ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
+_Text = Annotated[str, StringConstraints(max_length=300, pattern=r"^[^\x00-\x1f\x7f]*$")]
+_Digest = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
+_Count = Annotated[int, Field(ge=0, lt=1 << 53)]
+_Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+_Seconds = Annotated[float, Field(ge=0.0, le=1e12)]
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class Amount(_Record):
+    """How much of something was learned from; a source is a source group of the manifest."""
+
+    sources: _Count
+    segments: _Count
+    seconds: _Seconds
+
+
+class Collection(_Record):
+    """A public collection the audio came from: to be named wherever the model goes."""
+
+    name: _Text
+    licence: _Text
+    clips: _Count
+
+
+class TrainingData(_Record):
+    """What the model learned from; the digest is of its segments, not of files."""
+
+    sha256: _Digest
+    classes: dict[_ClassName, Amount]
+    collections: Annotated[list[Collection], Field(max_length=10_000)]
+
+
+class ClassMetrics(_Record):
+    """Of the segments of one class, cross-validated."""
+
+    precision: _Share
+    recall: _Share
+    f1: _Share
+
+
+class Metrics(_Record):
+    """Cross-validated by source group, with the model's own parameters.
+
+    The confusion matrix has a row for each true class and a column for each predicted one.
+    """
+
+    folds: _Count
+    macro_f1: _Share
+    expected_calibration_error: _Share
+    classes: dict[_ClassName, ClassMetrics]
+    confusion: list[list[_Count]]
+
+
+class Smoothing(_Record):
+    """How labels become segments."""
+
+    method: Literal["merge"]
+
+
+class Description(_Record):
+    """Everything about a model that is no array.
+
+    `inverse_temperature` calibrates: it multiplies the decision values before the softmax.
+    """
+
+    format: Literal[1]
+    kind: Literal["svm-rbf"]
+    classes: Annotated[list[_ClassName], Field(min_length=2, max_length=_MOST_CLASSES)]
+    feature_set: _Text
+    feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
+    window_seconds: _Positive
+    scenario_name: _Text
+    scenario: dict[_ClassName, list[_Text]]
+    cost: _Positive
+    gamma: _Positive
+    calibration: Literal["temperature"]
+    inverse_temperature: _Positive
+    smoothing: Smoothing
+    training_data: TrainingData
+    metrics: Metrics
+    versions: dict[_Text, _Text]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A support vector machine with RBF kernel, one against one.
+
+    Attributes
+    ----------
+    description : Description
+    scaler_mean, scaler_scale : np.ndarray [shape=(2d,)], float64
+        Of the statistics: d means, then d standard deviations, in the order of the feature names.
+    support_vectors : np.ndarray [shape=(n, 2d)], float32
+        Statistics, not scaled, class after class.
+    support_counts : np.ndarray [shape=(C,)], int64
+        Support vectors of each class.
+    dual_coefficients : np.ndarray [shape=(C - 1, n)], float64
+        As in libsvm: row j of a vector of class i is against class j if j < i, else j + 1.
+    intercepts : np.ndarray [shape=(C (C - 1) / 2,)], float64
+        Of the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
+    name : str
+        Stem of the file it was loaded from.
+    sha256 : str
+        Of that file.
+    """
+
+    description: Description
+    scaler_mean: Float64
+    scaler_scale: Float64
+    support_vectors: NDArray[np.float32]
+    support_counts: NDArray[np.int64]
+    dual_coefficients: Float64
+    intercepts: Float64
+    name: str = ""
+    sha256: str = ""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the probabilities."""
+        return tuple(self.description.classes)
+
+    def card(self) -> str:
+        """Describe the model to people, as Markdown."""
+        about, metrics = self.description, self.description.metrics
+        amounts = about.training_data.classes
+        lines = [
+            f"# Model {self.name or about.scenario_name}",
+            "",
+            f"Tells apart {len(about.classes)} classes of sound in windows of "
+            f"{about.window_seconds:g} s, from feature set {about.feature_set} "
+            f"({about.kind}, {len(self.support_vectors)} support vectors).",
+            "",
+            f"- sha256: {self.sha256 or 'not saved'}",
+            f"- scenario: {about.scenario_name}",
+            f"- cross-validated macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, sources "
+            "never split)",
+            f"- expected calibration error: {metrics.expected_calibration_error:.3f}",
+            f"- training data sha256: {about.training_data.sha256}",
+            f"- made with {', '.join(f'{k} {v}' for k, v in sorted(about.versions.items()))}",
+            "",
+            "| class | labels | sources | seconds | precision | recall | F1 |",
+            "|---|---|---|---|---|---|---|",
+        ]
+        for name in about.classes:
+            amount, result = amounts[name], metrics.classes[name]
+            lines.append(
+                f"| {name} | {', '.join(about.scenario[name])} | {amount.sources} | "
+                f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
+                f"{result.f1:.3f} |"
+            )
+        lines += ["", "Learned from recordings of:", ""]
+        lines += [
+            f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
+            for item in about.training_data.collections
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def check_output(path: Path) -> None:
+    """Raise ModelError unless a model can be saved under this name."""
+    if path.suffix != SUFFIX:
+        raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
+    if os.path.lexists(path):
+        raise ModelError(f"{path}: exists already; choose another name, or delete it first")
+    if not path.parent.is_dir():
+        raise ModelError(f"{path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ModelError(f"{path}: the folder cannot be written to")
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model file; the same model gives the same bytes.
+
+    Raises
+    ------
+    ModelError
+        If the file exists, the folder does not or cannot be written, or the model is inconsistent.
+    """
+    check_output(path)
+    arrays = {
+        name: np.ascontiguousarray(getattr(model, name), dtype)
+        for name, (_, dtype) in _DTYPES.items()
+    }
+    _check_arrays(path, model.description, arrays)
+    text = json.dumps(model.description.model_dump(), sort_keys=True, ensure_ascii=False)
+    data = save(arrays, {_KEY: text})
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("xb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        path.hardlink_to(temporary)  # unlike a rename, never over another file
+        sync_folder(path.parent)
+    except FileExistsError as error:
+        raise ModelError(f"{path}: exists already; choose another name, or delete it") from error
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model file and check everything in it; nothing of it is executed.
+
+    Raises
+    ------
+    ModelError
+        If it is missing, too large, damaged, inconsistent, or made for another feature set.
+    """
+    data = _read(path)
+    try:
+        tensors = safetensors.deserialize(data)
+    except safetensors.SafetensorError as error:
+        raise ModelError(f"{path}: is no model file ({_one_line(error)})") from error
+    description = _description(path, data)
+    arrays = {name: _array(path, name, dict(tensors).get(name)) for name in _DTYPES}
+    if len(tensors) != len(_DTYPES):
+        raise ModelError(f"{path}: holds arrays that are no part of a model")
+    _check_arrays(path, description, arrays)
+    name, digest = path.stem, hashlib.sha256(data).hexdigest()
+    return Model(description, **arrays, name=name, sha256=digest)
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise ModelError(f"{path}: no such model file")
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(_SIZE_LIMIT + 1)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror})") from error
+    if len(data) > _SIZE_LIMIT:
+        raise ModelError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no model of ours")
+    return data
+
+
+def _description(path: Path, data: bytes) -> Description:
+    length = int.from_bytes(data[:8], "little")
+    text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get(_KEY)
+    if text is None:
+        raise ModelError(f"{path}: is no model of hearthlog: it does not describe itself")
+    try:
+        description = Description.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
+        raise ModelError(f"{path}: {where}: {_one_line(first['msg'])}") from error
+    problem = _problem(description)
+    if problem:
+        raise ModelError(f"{path}: {problem}")
+    return description
+
+
+def _problem(about: Description) -> str | None:
+    """Say what in a description contradicts the rest of it."""
+    classes = set(about.classes)
+    if about.feature_set != _FEATURE_SET:
+        return f"is for feature set {about.feature_set!r}; this version has {_FEATURE_SET}"
+    if len(classes) != len(about.classes):
+        return "names a class twice"
+    if about.scenario.keys() != classes:
+        return "its scenario has other classes"
+    if about.training_data.classes.keys() != classes or about.metrics.classes.keys() != classes:
+        return "its training data or metrics are of other classes"
+    if any(len(row) != len(classes) for row in (about.metrics.confusion, *about.metrics.confusion)):
+        return "its confusion matrix does not fit its classes"
+    return None
+
+
+def _array(path: Path, name: str, tensor: dict[str, Any] | None) -> NDArray[Any]:
+    if tensor is None:
+        raise ModelError(f"{path}: has no array {name}")
+    stored, dtype = _DTYPES[name]
+    if tensor["dtype"] != stored:
+        raise ModelError(f"{path}: {name} is of type {tensor['dtype']}, not {stored}")
+    array = np.frombuffer(tensor["data"], np.dtype(dtype).newbyteorder("<"))
+    array = array.reshape(tensor["shape"]).astype(dtype)
+    array.flags.writeable = False
+    return array
+
+
+def _check_arrays(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> None:
+    classes, width = len(about.classes), 2 * len(about.feature_names)
+    total = len(arrays["support_vectors"]) if arrays["support_vectors"].ndim else 0
+    shapes: dict[str, tuple[int, ...]] = {
+        "scaler_mean": (width,),
+        "scaler_scale": (width,),
+        "support_vectors": (total, width),
+        "support_counts": (classes,),
+        "dual_coefficients": (classes - 1, total),
+        "intercepts": (classes * (classes - 1) // 2,),
+    }
+    for name, shape in shapes.items():
+        array = arrays[name]
+        if array.shape != shape:
+            raise ModelError(f"{path}: {name} has shape {array.shape}, not {shape}")
+        if not np.isfinite(array).all():
+            raise ModelError(f"{path}: {name} has values that are not finite")
+        if name != "support_vectors" and not (np.abs(array.astype(np.float64)) <= _LARGEST).all():
+            raise ModelError(f"{path}: {name} has values that make no sense")
+    if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
+        raise ModelError(f"{path}: scaler_scale has values that are not positive")
+    counts = arrays["support_counts"]
+    if (counts < 0).any() or counts.sum() != total:
+        raise ModelError(f"{path}: support_counts do not add up to the {total} support vectors")
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())[:200]

@@ -1,0 +1,83 @@
+"""When a sample was taken: a line through the times at which the sound card says it was."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+_WINDOW_SECONDS = 2.0
+_WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
+_PRIOR_PPM = 50.0  # what a sound card's crystal is off by, before it has been measured
+_PRIOR_NOISE = 100e-6  # seconds: what the least late observation of a window is still late by
+
+
+class SampleClock:
+    """Maps the index of a sample to the time of its taking.
+
+    Observations are late, never early: by the time that the sound card and the scheduler took.
+    So each window of two seconds counts by its earliest one, and a line is fitted through these.
+    The time it gives is steered towards each new line, never moved: time does not jump.
+
+    Parameters
+    ----------
+    rate : float
+        Nominal samples per second.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._windows: deque[tuple[float, float]] = deque(maxlen=_WINDOWS)
+        self._window_end = 0.0
+        self._earliest: tuple[float, float] | None = None
+        self._earliest_steered = 0.0
+        # From `_anchor` (a nominal time) on, time = nominal + _late + _slope * (nominal - _anchor).
+        self._origin: float | None = None
+        self._anchor = 0.0
+        self._late = 0.0
+        self._slope = 0.0
+        self._fitted_slope = 0.0
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a time to give."""
+        return self._origin is not None
+
+    @property
+    def ppm(self) -> float:
+        """How much faster than nominal the samples come, in parts per million."""
+        return -self._fitted_slope * 1e6
+
+    def observe(self, index: int, time: float) -> None:
+        """Note that sample `index` was taken no later than `time` (seconds, monotonic)."""
+        nominal = index / self._rate
+        if self._origin is None:
+            self._origin = time - nominal
+            self._anchor, self._window_end = nominal, nominal + _WINDOW_SECONDS
+        late = time - self._origin - nominal
+        if nominal >= self._window_end:
+            self._close_window(nominal)
+        steered = late - self._slope * (nominal - self._anchor)
+        if self._earliest is None or steered < self._earliest_steered:
+            self._earliest, self._earliest_steered = (nominal, late), steered
+
+    def time(self, index: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return the time of samples on the clock of the observations, in seconds."""
+        assert self._origin is not None
+        nominal = np.asarray(index) / self._rate
+        return self._origin + nominal + self._late + self._slope * (nominal - self._anchor)
+
+    def _close_window(self, nominal: float) -> None:
+        if self._earliest is not None:
+            self._windows.append(self._earliest)
+        self._earliest = None
+        self._window_end = nominal + _WINDOW_SECONDS
+        now = self._late + self._slope * (nominal - self._anchor)
+        at, late = np.array(self._windows).T
+        center = at.mean()
+        spread = ((at - center) ** 2).sum() + (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
+        slope = float(((at - center) * (late - late.mean())).sum() / spread)
+        # Meet the fitted line one window ahead.
+        ahead = late.mean() + slope * (nominal + _WINDOW_SECONDS - center)
+        self._anchor, self._late = nominal, now
+        self._slope = (float(ahead) - now) / _WINDOW_SECONDS
+        self._fitted_slope = slope

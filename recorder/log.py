@@ -1,0 +1,118 @@
+"""The log that is being recorded: one file after another, aligned to the clock."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recorder.pipeline import Record
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.files import log_path
+from schemas.messages import NANOSECONDS, encode, header
+from schemas.topics import Topic, topic
+from schemas.writer import Attachment, LogWriter
+
+# From a sound to its messages: a block of frames, the capture's latency, and some leeway.
+_DELAY = 0.4 * NANOSECONDS
+
+
+@dataclass(frozen=True)
+class LogDescription:
+    """What every file of a recording says of itself.
+
+    Attributes
+    ----------
+    info : message
+        `AudioStreamInfo` without its stamp.
+    """
+
+    root: Path
+    node: str
+    microphone: str
+    topics: Sequence[Topic]
+    info: Any
+    metadata: Mapping[str, str]
+    attachments: Sequence[Attachment]
+
+
+class RollingLog:
+    """Writes records into hourly files.
+
+    Parameters
+    ----------
+    description : LogDescription
+    file_seconds : int
+        Files begin at multiples of this, in UTC.
+    flush_seconds : float
+        A killed process loses at most this much sound.
+    sync_seconds : float
+        A power cut loses at most this much sound.
+    """
+
+    def __init__(
+        self,
+        description: LogDescription,
+        file_seconds: int,
+        flush_seconds: float,
+        sync_seconds: float,
+    ) -> None:
+        self.finished: list[Path] = []
+        self._description = description
+        self._file_nanoseconds = file_seconds * NANOSECONDS
+        self._flush_nanoseconds = max(int(flush_seconds * NANOSECONDS - _DELAY), FRAME_NANOSECONDS)
+        self._sync_seconds = max(sync_seconds - flush_seconds, 0.0)
+        self._writer: LogWriter | None = None
+        self._until = 0
+        self._flush_at: int | None = None
+        self._synced = time.monotonic()
+
+    def write(self, records: Sequence[Record]) -> None:
+        """Append records, in the order of their log times."""
+        for record in records:
+            if self._writer is None or record.log_time >= self._until:
+                self._roll(record.log_time)
+            elif self._flush_at is not None and record.log_time >= self._flush_at:
+                self.flush()
+            assert self._writer is not None
+            self._writer.write(record.topic, record.log_time, record.data)
+            if self._flush_at is None:
+                self._flush_at = record.log_time + self._flush_nanoseconds
+        if time.monotonic() - self._synced >= self._sync_seconds:
+            self.sync()
+
+    def flush(self) -> None:
+        """Hand what was written to the operating system."""
+        if self._writer is not None and self._flush_at is not None:
+            self._writer.flush()
+            self._flush_at = None
+
+    def sync(self) -> None:
+        """Wait until what was written is on the disk."""
+        self.flush()
+        if self._writer is not None:
+            self._writer.sync()
+        self._synced = time.monotonic()
+
+    def finish(self) -> None:
+        """Complete the file that is open."""
+        if self._writer is not None:
+            self.finished.append(self._writer.finish())
+            self._writer = None
+
+    def abandon(self) -> None:
+        """Leave the open file as it is, for the next start to complete."""
+        if self._writer is not None:
+            self._writer.abandon()
+            self._writer = None
+
+    def _roll(self, stamp: int) -> None:
+        self.finish()
+        about = self._description
+        path = log_path(about.root, about.node, stamp)
+        self._writer = LogWriter(path, about.topics, about.metadata, about.attachments, stamp)
+        self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
+        about.info.header = header(stamp, about.microphone)
+        self._writer.write(topic(about.microphone, "info"), stamp, encode(about.info))
+        self._writer.flush()  # the file now says what it is, whatever happens next
+        self._flush_at = None

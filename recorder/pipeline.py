@@ -1,0 +1,181 @@
+"""Frames in, encoded messages out: features, statistics, labels and segments. No I/O."""
+
+from collections.abc import Mapping
+from operator import itemgetter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.classifier import Classifier
+from models.segments import Segment, SegmentMerger
+from recorder.features import FeatureExtractor
+from recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
+from schemas import messages
+from schemas.messages import NANOSECONDS, duration_message, encode, header, message
+from schemas.rows import Column, encode_rows
+from schemas.topics import DIAGNOSTICS, topic
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+_ROW_TYPES = {
+    "features": messages.FEATURES,
+    "statistics": messages.STATISTICS,
+    "label": messages.LABEL,
+}
+
+
+class Record(NamedTuple):
+    """One encoded message on its way into the log."""
+
+    log_time: int
+    topic: str
+    data: bytes
+
+
+class Pipeline:
+    """Everything that is computed from one microphone's sound.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name, which begins the topics and is the `frame_id` of every message.
+    classifier : Classifier or None
+        Without one there are no labels.
+    statistics_every : int
+        Frames from one statistics message to the next.
+    """
+
+    def __init__(
+        self, microphone: str, classifier: Classifier | None = None, statistics_every: int = 1
+    ) -> None:
+        self.microphone = microphone
+        self._classifier = classifier
+        self._statistics_every = statistics_every
+        self._features = FeatureExtractor()
+        self._statistics = RollingStatistics()
+        self._segments = SegmentMerger()
+        self._end = 0
+
+    def push(self, event: Event) -> list[Record]:
+        """Turn what a source handed on into messages, in the order of their log times."""
+        if isinstance(event, Frames):
+            return self.push_features(self._features(event.samples), event.first, event.stamps)
+        if isinstance(event, Gap):
+            return self._push_gap(event)
+        return [self._health_record(event)]
+
+    def push_features(self, features: Float32, first: int, stamps: Int64) -> list[Record]:
+        """Turn the features of successive frames into messages.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, 21)], float32
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        """
+        whole_window = max(WINDOW_FRAMES - 1 - self._statistics.remembered, 0)
+        mean, std = self._statistics(features)
+        frames = np.arange(first, first + len(features))
+        shown = np.flatnonzero(frames % self._statistics_every == 0)
+        records = [
+            *self._rows("features", frames, stamps, {"values": features}),
+            *self._rows(
+                "statistics", frames[shown], stamps[shown], {"mean": mean[shown], "std": std[shown]}
+            ),
+        ]
+        if self._classifier is not None and whole_window < len(features):
+            window = np.concatenate([mean, std], axis=1)[whole_window:]
+            records += self._labels(
+                self._classifier, window, frames[whole_window:], stamps[whole_window:]
+            )
+        records.sort(key=itemgetter(0))
+        self._end = int(stamps[-1]) + FRAME_NANOSECONDS
+        return records
+
+    def finish(self) -> list[Record]:
+        """Close what is open at the end of the sound."""
+        return self._segment_records(self._segments.close(self._end))
+
+    def _push_gap(self, gap: Gap) -> list[Record]:
+        self._features.restart()
+        self._statistics.restart()
+        closed = self._segment_records(self._segments.close(self._end))
+        data = encode(
+            message(
+                messages.GAP,
+                header=header(gap.start, self.microphone),
+                duration=duration_message(gap.end - gap.start),
+                reason=gap.reason,
+                frames_lost=gap.frames_lost,
+            )
+        )
+        return [*closed, Record(gap.end, topic(self.microphone, "gap"), data)]
+
+    def _labels(
+        self, classifier: Classifier, window: Float32, frames: Int64, stamps: Int64
+    ) -> list[Record]:
+        probabilities = classifier.probabilities(window)
+        best = probabilities.argmax(axis=1)
+        confidence = probabilities[np.arange(len(best)), best]
+        closed = self._segments.push(best, confidence, stamps)
+        columns = {
+            "label": [classifier.classes[i] for i in best],
+            "confidence": confidence,
+            "novelty": np.full(len(best), np.nan, np.float32),
+            "probabilities": probabilities,
+        }
+        return self._segment_records(closed) + self._rows("label", frames, stamps, columns)
+
+    def _rows(
+        self, kind: str, frames: Int64, stamps: Int64, columns: Mapping[str, Column]
+    ) -> list[Record]:
+        common: dict[str, Column] = {
+            "header.stamp.sec": stamps // NANOSECONDS,
+            "header.stamp.nanosec": stamps % NANOSECONDS,
+            "header.frame_id": self.microphone,
+            "frame": frames,
+        }
+        name = topic(self.microphone, kind)
+        rows = encode_rows(_ROW_TYPES[kind], common | dict(columns), len(frames))
+        return [Record(time, name, row) for time, row in zip(stamps.tolist(), rows, strict=True)]
+
+    def _segment_records(self, segments: list[Segment]) -> list[Record]:
+        return [self._segment_record(segment) for segment in segments]
+
+    def _segment_record(self, segment: Segment) -> Record:
+        assert self._classifier is not None
+        data = encode(
+            message(
+                messages.SEGMENT,
+                header=header(segment.start, self.microphone),
+                duration=duration_message(segment.end - segment.start),
+                label=self._classifier.classes[segment.label],
+                confidence=segment.confidence,
+            )
+        )
+        return Record(segment.end, topic(self.microphone, "segment"), data)
+
+    def _health_record(self, health: Health) -> Record:
+        values = [
+            message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+            for key, value in health.values.items()
+        ]
+        status = message(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=health.level,
+            name=f"hearthlog: {self.microphone}",
+            message=health.summary,
+            hardware_id=self.microphone,
+            values=values,
+        )
+        data = encode(
+            message(
+                messages.DIAGNOSTICS, header=header(health.stamp, self.microphone), status=[status]
+            )
+        )
+        return Record(health.stamp, DIAGNOSTICS, data)

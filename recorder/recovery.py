@@ -1,0 +1,154 @@
+"""Complete the logs that a killed recorder left behind."""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from recorder.stream import FRAME_NANOSECONDS
+from schemas import messages, rosbag2
+from schemas.errors import LogError
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, sync_folder
+from schemas.reader import read_records
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """A log that was completed.
+
+    Attributes
+    ----------
+    path : Path
+    end : int
+        End of its last frame, in nanoseconds of UTC; 0 if it has none.
+    damage : str
+        Why less than the whole file could be read; empty if it only ended early.
+    """
+
+    path: Path
+    end: int
+    damage: str
+
+
+def recover_active(root: Path, node: str) -> list[Recovered]:
+    """Complete all logs of a node that nobody writes any more.
+
+    Each is copied to its final name up to where it was cut, read again and counted, and only
+    then removed. One that is damaged, or holds no message, is kept beside it as `*.damaged`.
+    """
+    found = []
+    for active in sorted(root.rglob(f"{node}_*{ACTIVE_SUFFIX}")):
+        with _abandoned(active) as is_abandoned:
+            if is_abandoned:
+                found += _recover(active)
+    return found
+
+
+def _recover(active: Path) -> list[Recovered]:
+    path = active.with_name(active.name.removesuffix(ACTIVE_SUFFIX) + SUFFIX)
+    copy = active.with_name(path.name + ".recovering")
+    with copy.open("wb") as stream:
+        log = _Copy(stream)
+        log.read(active)
+        if log.count:
+            log.finish(path.name)
+            os.fsync(stream.fileno())
+    if log.count:
+        _check(copy, log.count)
+        if path.exists():
+            raise LogError(f"{path}: exists beside {active.name}; move one of them away")
+        copy.rename(path)
+    else:
+        copy.unlink()
+    if log.damage or not log.count:
+        active.rename(active.with_name(path.name + ".damaged"))
+    else:
+        active.unlink()
+    sync_folder(path.parent)
+    return [Recovered(path, log.end, log.damage)] if log.count else []
+
+
+class _Copy:
+    """A log being copied record by record."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.count = 0
+        self.end = 0
+        self.damage = ""
+        self._writer = Writer(stream)
+        self._schemas: dict[int, tuple[int, str]] = {}
+        self._channels: dict[int, tuple[int, rosbag2.TopicCount]] = {}
+        self._topics: dict[str, rosbag2.TopicCount] = {}
+        self._span = (1 << 64, 0)
+
+    def read(self, source: Path) -> None:
+        """Copy all complete records of a log."""
+        try:
+            for record in read_records(source):
+                self._add(record)
+        except LogError as error:
+            self.damage = str(error)
+
+    def finish(self, name: str) -> None:
+        """Complete the copy, which will bear this name."""
+        about = rosbag2.file_metadata(name, self._topics, self._span)
+        self._writer.add_metadata(rosbag2.METADATA, about)
+        self._writer.finish()
+
+    def _add(self, record: object) -> None:
+        if isinstance(record, Message):
+            self._add_message(record)
+        elif isinstance(record, Header):
+            self._writer.start(record.profile, record.library)
+        elif isinstance(record, Metadata):
+            self._writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+        elif isinstance(record, Schema) and record.id not in self._schemas:
+            new = self._writer.register_schema(record.name, record.encoding, record.data)
+            self._schemas[record.id] = new, record.name
+        elif isinstance(record, Channel) and record.id not in self._channels:
+            schema, name = self._schemas[record.schema_id]
+            topic = rosbag2.TopicCount(name, record.metadata)
+            new = self._writer.register_channel(
+                record.topic, record.message_encoding, schema, record.metadata
+            )
+            self._channels[record.id] = new, topic
+            self._topics[record.topic] = topic
+
+    def _add_message(self, record: Message) -> None:
+        channel, topic = self._channels[record.channel_id]
+        self._writer.add_message(
+            channel, record.log_time, record.data, record.publish_time, record.sequence
+        )
+        topic.messages += 1
+        self.count += 1
+        self._span = min(self._span[0], record.log_time), max(self._span[1], record.log_time)
+        if topic.type == messages.FEATURES:
+            self.end = max(self.end, record.log_time + FRAME_NANOSECONDS)
+
+
+def _check(path: Path, expected: int) -> None:
+    count = sum(isinstance(record, Message) for record in read_records(path))
+    if count != expected:
+        raise LogError(f"{path}: recovered {count} messages of {expected}; the disk may be failing")
+
+
+@contextmanager
+def _abandoned(path: Path) -> Iterator[bool]:
+    """Hold the file's lock, unless a recorder does."""
+    with path.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True

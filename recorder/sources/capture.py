@@ -1,0 +1,120 @@
+"""The capture process: hears one microphone and writes its sound to standard output.
+
+PortAudio hangs inside the process when a device vanishes, so this process is made to be killed.
+It imports no more than PortAudio needs and computes nothing.
+
+It writes one line of JSON, a `Format` or an error, and then blocks: a `BLOCK` header and as many
+samples (int16, one channel) as that says.
+"""
+
+import json
+import os
+import queue
+import signal
+import struct
+import sys
+import time
+from dataclasses import asdict, dataclass
+from types import ModuleType
+from typing import Any
+
+from recorder.errors import SourceError
+from recorder.sources.devices import Device, find_device, list_devices, load_portaudio
+
+# index of the first sample, samples, flags of PortAudio, time of the first sample by the ADC
+# (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC and by CLOCK_REALTIME (s)
+BLOCK = struct.Struct("<QIIddd")
+
+_PREFERRED_RATE = 16_000
+_BLOCK_SECONDS = 0.2
+_LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
+_QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
+
+
+@dataclass(frozen=True)
+class Format:
+    """What the blocks are made of."""
+
+    device: str
+    rate: int
+
+
+def main() -> None:
+    """Capture from the device named by the first argument until killed or left alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
+    output = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # the sound libraries print as they like
+    try:
+        sounddevice = load_portaudio()
+        device = find_device(list_devices(sounddevice), sys.argv[1])
+        _capture(sounddevice, device, output)
+    except SourceError as error:
+        output.write(json.dumps({"error": str(error)}).encode() + b"\n")
+        sys.exit(1)
+    except BrokenPipeError:
+        pass
+    # A stream of a device that is gone never closes.
+    os._exit(0)
+
+
+def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
+    blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
+    index = 0
+
+    def hear(samples: Any, count: int, times: Any, status: Any) -> None:
+        nonlocal index
+        head = BLOCK.pack(
+            index,
+            count,
+            int(status._flags),  # noqa: SLF001  the only way to hand the flags on
+            times.inputBufferAdcTime,
+            time.monotonic(),
+            time.time(),
+        )
+        index += count
+        if not blocks.full():  # what is dropped here shows in the next index
+            blocks.put_nowait((head, bytes(samples)))
+
+    stream, rate, channels = _open(sounddevice, device, hear)
+    output.write(json.dumps(asdict(Format(device.name, rate))).encode() + b"\n")
+    stream.start()
+    parent = os.getppid()
+    while os.getppid() == parent:
+        try:
+            head, samples = blocks.get(timeout=1.0)
+        except queue.Empty:
+            continue
+        output.write(head)
+        output.write(_first_channel(samples, channels))
+
+
+def _open(sounddevice: ModuleType, device: Device, hear: Any) -> tuple[Any, int, int]:
+    """Open the device at 16 kHz and one channel if it can, else as it can."""
+    reason = ""
+    for rate in (_PREFERRED_RATE, int(device.default_rate)):
+        for channels in (1, device.channels):
+            try:
+                stream = sounddevice.RawInputStream(
+                    samplerate=rate,
+                    blocksize=int(rate * _BLOCK_SECONDS),
+                    device=device.index,
+                    channels=channels,
+                    dtype="int16",
+                    latency=_LATENCY_SECONDS,
+                    callback=hear,
+                )
+            except sounddevice.PortAudioError as error:
+                reason = str(error)
+            else:
+                return stream, rate, channels
+    raise SourceError(f"microphone {device.name!r} cannot be opened ({reason})")
+
+
+def _first_channel(samples: bytes, channels: int) -> bytes:
+    if channels == 1:
+        return samples
+    return memoryview(samples).cast("h")[::channels].tobytes()
+
+
+if __name__ == "__main__":
+    main()

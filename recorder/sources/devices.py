@@ -1,0 +1,103 @@
+"""Microphones by names that survive a reboot."""
+
+import re
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+from recorder.errors import SourceError
+
+_CARD_NUMBER = re.compile(r" ?\((hw|plughw):\d+,\d+\)$")
+
+
+@dataclass(frozen=True)
+class Device:
+    """A microphone that PortAudio can open.
+
+    Attributes
+    ----------
+    index : int
+        PortAudio's, valid only in this process.
+    name : str
+        Without the number of its sound card, which changes from one start to the next.
+    channels : int
+    default_rate : float
+        In Hz.
+    is_default : bool
+    """
+
+    index: int
+    name: str
+    channels: int
+    default_rate: float
+    is_default: bool
+
+
+def load_portaudio() -> ModuleType:
+    """Import sounddevice, which looks for PortAudio and starts it.
+
+    Raises
+    ------
+    SourceError
+        If PortAudio is missing or cannot start.
+    """
+    try:
+        import sounddevice  # noqa: PLC0415  starting PortAudio may fail, and takes time
+    except OSError as error:
+        raise SourceError(
+            "PortAudio is missing: install it (Debian: apt install libportaudio2)"
+        ) from error
+    except Exception as error:  # its own error class is not importable when its import fails
+        raise SourceError(f"PortAudio cannot start ({error}): check ALSA's settings") from error
+    return sounddevice
+
+
+def list_devices(sounddevice: ModuleType) -> list[Device]:
+    """List the microphones, those of the same name numbered in the order of their cards."""
+    default = sounddevice.default.device[0]
+    devices = [
+        _device(info, is_default=info["index"] == default)
+        for info in sounddevice.query_devices()
+        if info["max_input_channels"] > 0
+    ]
+    seen: dict[str, int] = {}
+    numbered = []
+    for device in devices:
+        count = seen[device.name] = seen.get(device.name, 0) + 1
+        name = device.name if count == 1 else f"{device.name} #{count}"
+        numbered.append(
+            Device(device.index, name, device.channels, device.default_rate, device.is_default)
+        )
+    return numbered
+
+
+def find_device(devices: list[Device], name: str) -> Device:
+    """Choose a microphone: the default one, or the one with this name or part of a name.
+
+    Raises
+    ------
+    SourceError
+        Listing what there is, if none or several fit.
+    """
+    if not devices:
+        raise SourceError("no microphone found: connect one and check `hearthlog devices`")
+    if not name:
+        defaults = [device for device in devices if device.is_default]
+        return (defaults or devices)[0]
+    exact = [device for device in devices if device.name == name]
+    fitting = exact or [device for device in devices if name.lower() in device.name.lower()]
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = ", ".join(repr(device.name) for device in devices)
+    what = "no microphone" if not fitting else "more than one microphone"
+    raise SourceError(f"{what} is called {name!r}; there are {listed}")
+
+
+def _device(info: dict[str, Any], *, is_default: bool) -> Device:
+    return Device(
+        index=info["index"],
+        name=_CARD_NUMBER.sub("", info["name"]),
+        channels=info["max_input_channels"],
+        default_rate=info["default_samplerate"],
+        is_default=is_default,
+    )

@@ -1,0 +1,165 @@
+"""Blocks of captured samples to frames with stamps, and to gaps where samples are missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import soxr
+from numpy.typing import NDArray
+
+from recorder.clock import SampleClock
+from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from schemas.messages import NANOSECONDS
+
+_ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on no clock we know
+_LOSS_SECONDS = 0.010  # an ADC that is trusted is never this late
+_INT16_FULL_SCALE = np.float32(32768.0)
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples that came in one piece from the capture process.
+
+    Attributes
+    ----------
+    index : int
+        Number of the first sample since that process started.
+    samples : np.ndarray [shape=(n,)], int16
+    overflowed : bool
+        Samples were lost before this block, or a little earlier.
+    adc_time : float
+        When the first sample was taken, in seconds of a clock of the driver's choice.
+    monotonic, realtime : float
+        When the block arrived, by both clocks of the system, in seconds.
+    """
+
+    index: int
+    samples: NDArray[np.int16]
+    overflowed: bool
+    adc_time: float
+    monotonic: float
+    realtime: float
+
+    def taken_at(self, rate: float) -> float:
+        """Return when the first sample was taken, on CLOCK_MONOTONIC, at the latest."""
+        if abs(self.adc_time - self.monotonic) < _ADC_CLOCK_SECONDS:
+            return self.adc_time
+        if abs(self.adc_time - self.realtime) < _ADC_CLOCK_SECONDS:
+            return self.adc_time - self.realtime + self.monotonic
+        return self.monotonic - len(self.samples) / rate
+
+
+class Framer:
+    """Cuts the sound of one microphone into frames, over all lives of its capture process.
+
+    A frame is never cut from samples that do not follow each other: after a loss the next frame
+    begins with the first sample that was heard again.
+    """
+
+    def __init__(self) -> None:
+        self._next_frame = 0
+        self._end: int | None = None  # of the last frame, on CLOCK_MONOTONIC
+        self._end_offset = 0  # of that clock to the time of day, then
+        self._reason = ""
+        self._rate = float(SAMPLE_RATE)
+        self._clock = SampleClock(SAMPLE_RATE)
+        self._wall_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC, in nanoseconds
+        self._expected = 0  # index of the next block, if nothing is lost
+        self._lost = 0  # samples that the sound card lost, which its driver did not count
+        self._origin = 0  # index of the first sample since the last loss
+        self._heard = 0  # samples at 16 kHz that left as frames since then
+        self._held = np.empty(0, np.float32)
+        self._resampler: soxr.ResampleStream | None = None
+
+    @property
+    def ppm(self) -> float:
+        """How much faster than nominal the microphone's clock runs, in parts per million."""
+        return self._clock.ppm
+
+    @property
+    def end(self) -> int:
+        """End of the last frame in nanoseconds of UTC; 0 before the first one."""
+        return 0 if self._end is None else self._end + self._end_offset
+
+    def begin(self, rate: int, wall_offset: int, reason: str) -> None:
+        """Start anew with another capture process.
+
+        Parameters
+        ----------
+        rate : int
+            Samples per second that it delivers.
+        wall_offset : int
+            CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
+        reason : str
+            Why there was none in between.
+        """
+        self._rate = float(rate)
+        self._clock = SampleClock(rate)
+        self._expected = self._lost = 0
+        self._restart(0, reason)
+        self._wall_offset = wall_offset
+
+    def step_clock(self, wall_offset: int, reason: str) -> None:
+        """Go over to another time of day; no sound is lost but the frame in progress."""
+        self._restart(self._expected + self._lost, reason)
+        self._wall_offset = wall_offset
+
+    def add(self, block: Block) -> list[Frames | Gap]:
+        """Take a block and return the frames that it completes, after the gap before them."""
+        if block.index != self._expected:
+            self._restart(block.index + self._lost, "the recorder was too slow")
+        taken = block.taken_at(self._rate)
+        index = block.index + self._lost
+        if self._clock.started:
+            late = taken - float(self._clock.time(index))
+            if late > _LOSS_SECONDS:
+                missing = round(late * self._rate)
+                self._lost += missing
+                index += missing
+                self._restart(index, "the sound card lost samples")
+        self._clock.observe(index, taken)
+        self._expected = block.index + len(block.samples)
+        return self._cut(block.samples / _INT16_FULL_SCALE)
+
+    def _restart(self, origin: int, reason: str) -> None:
+        self._reason = reason
+        self._origin = origin
+        self._heard = 0
+        self._held = np.empty(0, np.float32)
+        self._resampler = None
+        if self._rate != SAMPLE_RATE:
+            self._resampler = soxr.ResampleStream(self._rate, SAMPLE_RATE, 1, dtype="float32")
+
+    def _cut(self, samples: Float32) -> list[Frames | Gap]:
+        if self._resampler is not None:
+            samples = self._resampler.resample_chunk(samples)
+        self._held = np.concatenate([self._held, samples])
+        count = len(self._held) // FRAME_SAMPLES
+        if count == 0:
+            return []
+        frames, self._held = np.split(self._held, [count * FRAME_SAMPLES])
+        times = self._times(count)
+        self._heard += count * FRAME_SAMPLES
+        gap = self._gap_before(int(times[0]))
+        stamps = times + self._wall_offset
+        found = Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
+        self._next_frame += count
+        self._end = int(times[-1]) + FRAME_NANOSECONDS
+        self._end_offset = self._wall_offset
+        return [found] if gap is None else [gap, found]
+
+    def _times(self, count: int) -> NDArray[np.int64]:
+        """Return when the next frames start, in nanoseconds of CLOCK_MONOTONIC."""
+        heard = self._heard + np.arange(count) * FRAME_SAMPLES
+        index = self._origin + heard * np.float64(self._rate / SAMPLE_RATE)
+        return np.round(self._clock.time(index) * NANOSECONDS).astype(np.int64)
+
+    def _gap_before(self, time: int) -> Gap | None:
+        reason, self._reason = self._reason, ""
+        if not reason or self._end is None:
+            return None
+        lost = max(round((time - self._end) / FRAME_NANOSECONDS), 1)
+        self._next_frame += lost
+        return Gap(self.end, time + self._wall_offset, reason, lost)

@@ -1,0 +1,80 @@
+"""Audio files in the place of a microphone."""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from threading import Event as Flag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorder.features import FRAME_SAMPLES
+from recorder.sources.files import read_audio
+from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
+from schemas.messages import NANOSECONDS
+
+_REALTIME_FRAMES = 4
+_HEALTH_FRAMES = 200  # every 10 s
+
+Float32 = NDArray[np.float32]
+
+
+class FileSource:
+    """Several audio files in a row, as one stream of frames.
+
+    What is left at the very end and fills no frame is not heard.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    start : int
+        Time of the first sample in nanoseconds of UTC.
+    realtime : bool
+        Hand on each frame only when its time has come since the first one.
+    """
+
+    def __init__(self, paths: Sequence[Path], start: int, *, realtime: bool = False) -> None:
+        self.device = " ".join(path.name for path in paths)
+        self._paths = paths
+        self._start = start
+        self._realtime = realtime
+
+    def events(self, stop: Flag) -> Iterator[Event]:
+        """Hand on the frames until the files end or `stop` is set.
+
+        Raises
+        ------
+        SourceError
+            If a file cannot be read.
+        """
+        began = time.monotonic()
+        first = 0
+        for samples in self._frames():
+            frames = Frames(first, samples, self._stamps(first, len(samples)))
+            if self._realtime:
+                heard_at = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
+                stop.wait(max(heard_at - time.monotonic(), 0.0))
+            if stop.is_set():
+                return
+            if first % _HEALTH_FRAMES == 0:
+                yield Health(int(frames.stamps[0]), 0, "reading", {"device": self.device})
+            yield frames
+            first += len(samples)
+
+    def _stamps(self, first: int, count: int) -> NDArray[np.int64]:
+        return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS
+
+    def _frames(self) -> Iterator[Float32]:
+        """Cut the sound into blocks of frames that divide the interval of the health reports."""
+        size = (_REALTIME_FRAMES if self._realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
+        held = np.empty(0, np.float32)
+        for path in self._paths:
+            for block in read_audio(path):
+                held = np.concatenate([held, block])
+                whole = len(held) - len(held) % size
+                for start in range(0, whole, size):
+                    yield held[start : start + size].reshape(-1, FRAME_SAMPLES)
+                held = held[whole:]
+        rest = len(held) - len(held) % FRAME_SAMPLES
+        if rest:
+            yield held[:rest].reshape(-1, FRAME_SAMPLES)

@@ -1,0 +1,60 @@
+"""Names of logs on disk: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`, in UTC."""
+
+import os
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+from schemas.errors import LogError
+from schemas.messages import NANOSECONDS
+
+SUFFIX = ".mcap"
+ACTIVE_SUFFIX = SUFFIX + ".active"
+
+
+def check_node_name(name: str) -> str:
+    """Return the name if it can begin a file name everywhere."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise LogError(
+            f"node name {name!r} cannot be part of a file name: use at most 64 letters, digits, "
+            "'-' and '_'"
+        )
+    return name
+
+
+def log_path(root: Path, node: str, start: int) -> Path:
+    """Name the log that starts at `start` (nanoseconds, UTC)."""
+    moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
+    return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
+
+
+def active_path(path: Path) -> Path:
+    """Name a log while it is being written."""
+    return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
+
+
+def find_logs(path: Path) -> list[Path]:
+    """List the logs in a folder, or the log itself; those still being written come too.
+
+    Raises
+    ------
+    LogError
+        If there is none.
+    """
+    if path.is_dir():
+        found = [p for p in path.rglob("*") if p.name.endswith((SUFFIX, ACTIVE_SUFFIX))]
+        if not found:
+            raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
+        return sorted(found)
+    if not path.exists():
+        raise LogError(f"{path}: no such log")
+    return [path]
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a file's creation or renaming in this folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,58 @@
+"""The topics of a log: their types, their quality of service, the names behind their arrays."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from schemas import messages
+from schemas.errors import LogError
+
+DIAGNOSTICS = "/diagnostics"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One channel of a log."""
+
+    name: str
+    type: str
+    transient_local: bool = False
+    array_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+def check_microphone_name(name: str) -> str:
+    """Return the name if it can be part of a ROS topic."""
+    if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
+        raise LogError(
+            f"microphone name {name!r} cannot be a topic: use lower-case letters, digits and "
+            "single underscores, starting with a letter"
+        )
+    return name
+
+
+def topic(microphone: str, kind: str) -> str:
+    """Name the topic of one kind (`info`, `features`, `label` …) of a microphone."""
+    return f"/{microphone}/{kind}"
+
+
+def topics_of(
+    microphone: str, feature_names: Sequence[str], classes: Sequence[str] | None
+) -> list[Topic]:
+    """List what a recorder writes for a microphone; without classes it writes no labels."""
+    statistics = {"mean": feature_names, "std": feature_names}
+    found = [
+        Topic(topic(microphone, "info"), messages.STREAM_INFO, transient_local=True),
+        Topic(
+            topic(microphone, "features"),
+            messages.FEATURES,
+            array_names={"values": feature_names},
+        ),
+        Topic(topic(microphone, "statistics"), messages.STATISTICS, array_names=statistics),
+        Topic(topic(microphone, "gap"), messages.GAP),
+        Topic(DIAGNOSTICS, messages.DIAGNOSTICS),
+    ]
+    if classes is not None:
+        names = {"probabilities": classes}
+        found.append(Topic(topic(microphone, "label"), messages.LABEL, array_names=names))
+        found.append(Topic(topic(microphone, "segment"), messages.SEGMENT))
+    return found

@@ -1,0 +1,49 @@
+"""The command `hearthlog`: its verbs, and how errors reach the user."""
+
+import os
+import sys
+from typing import Annotated
+
+# Before numpy is imported: the products here are small, and idle BLAS threads burn a core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import typer
+
+from schemas.errors import HearthlogError
+from tools.cli.record import record
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for verb in (record,):
+    app.command()(verb)
+
+
+@app.callback()
+def options(
+    *,
+    debug: Annotated[bool, typer.Option(help="Show where in the code an error came from.")] = False,
+) -> None:
+    """Listen to a home: sound to features and labels, in logs that anyone can open."""
+    _debug["on"] = debug
+
+
+_debug = {"on": False}
+
+
+def main() -> None:
+    """Run the command line; an error is one line, and exit status 1."""
+    try:
+        app()
+    except HearthlogError as error:
+        if _debug["on"]:
+            raise
+        print(f"hearthlog: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

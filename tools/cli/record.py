@@ -1,0 +1,95 @@
+"""`hearthlog record`: a microphone, or audio files in its place, to a log."""
+
+import signal
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Event as Flag
+from typing import Annotated, Any
+
+import typer
+
+
+def record(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Audio files, one after the other; without any, the microphone."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder of logs.  [default: logs]")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Model file; without one there are no labels.")
+    ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="Microphone, as `hearthlog devices` lists it.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the microphone in the log.  [default: mic]")
+    ] = None,
+    node: Annotated[
+        str | None, typer.Option(help="Name of this recorder.  [default: home]")
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="Time of the files' first sample, as 2026-03-01T07:00:00 (UTC unless it says "
+            "otherwise).  [default: the first file's modification time]"
+        ),
+    ] = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Play files at the pace of real time.")
+    ] = False,
+    max_bag_duration: Annotated[
+        int | None,
+        typer.Option("--max-bag-duration", "-d", help="Seconds a file.  [default: 3600]"),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Configuration, a TOML file.")] = None,
+) -> None:
+    """Record sound to a labelled log, from a microphone or from files.
+
+    SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps.
+    """
+    from recorder.config import load_settings
+    from recorder.service import record_files, record_microphone
+
+    given = {
+        "output": output,
+        "model": model,
+        "node": node,
+        "max_bag_duration": max_bag_duration,
+    }
+    settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
+    stop = Flag()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if files:
+        begin = _start_time(start, files[0])
+        recording = record_files(settings, files, begin, stop, realtime=realtime)
+    elif start is not None or realtime:
+        raise typer.BadParameter("--start and --realtime go with files")
+    else:
+        recording = record_microphone(settings, stop)
+    for log in recording.logs:
+        print(log)
+    if recording.gaps:
+        typer.echo(
+            f"hearthlog: {recording.gaps} gaps, {recording.frames_lost} frames not heard", err=True
+        )
+        raise typer.Exit(3)
+
+
+def _given(options: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in options.items() if value is not None}
+
+
+def _start_time(text: str | None, file: Path) -> int:
+    """Return nanoseconds of UTC."""
+    if text is None:
+        return file.stat().st_mtime_ns if file.exists() else 0
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--start {text}: not a time such as 2026-03-01T07:00") from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return int(moment.timestamp() * 1_000_000) * 1_000
