@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from analyzer.errors import DataError
 from analyzer.manifest import Clip
 from analyzer.scenario import Scenario
-from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, FeatureExtractor
+from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
 from recorder.sources.files import read_audio
 from recorder.statistics import WINDOW_FRAMES, RollingStatistics
 
 HOP_FRAMES = 10
-SHORTEST_FRAMES = 10  # a spoken digit or a ring is shorter than a window; less says little
 SEGMENTS_PER_GROUP = 24
 _ENERGY = FEATURE_NAMES.index("energy")
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
@@ -41,8 +40,8 @@ class Dataset:
     classes : tuple of str
     clips : tuple of Clip
         Those that gave segments.
-    clip : np.ndarray [shape=(n,)], intp
-        Index into `clips`.
+    clip_seconds : tuple of float
+        How long they are.
     skipped : dict of str to int
         Why clips gave no segment, and how many.
     """
@@ -52,7 +51,7 @@ class Dataset:
     group: NDArray[np.intp]
     classes: tuple[str, ...]
     clips: tuple[Clip, ...]
-    clip: NDArray[np.intp]
+    clip_seconds: tuple[float, ...]
     skipped: dict[str, int]
 
     @property
@@ -70,8 +69,8 @@ def build_dataset(
     """Cut the clips of a scenario's labels into one-second segments, half a second apart.
 
     A segment is kept if it is no more than 12 dB below its clip's mean level and above -60 dBFS;
-    of silence all are. A clip shorter than a second but not than half a second is one segment.
-    At most 24 segments, evenly spaced, are kept for each class and source group.
+    of silence all are. A clip shorter than a second gives none. At most 24 segments, evenly
+    spaced, are kept for each class and source group.
 
     Parameters
     ----------
@@ -92,6 +91,7 @@ def build_dataset(
     groups: dict[str, int] = {}
     skipped: Counter[str] = Counter()
     used: list[Clip] = []
+    seconds: list[float] = []
     statistics: list[Float32] = []
     target: list[int] = []
     group: list[int] = []
@@ -102,14 +102,15 @@ def build_dataset(
             skipped[f"label {clip.label} is not in the scenario"] += 1
             continue
         features = _features(clip)
-        if len(features) < SHORTEST_FRAMES:
-            skipped["shorter than half a second"] += 1
+        if len(features) < WINDOW_FRAMES:  # the recorder labels whole windows only
+            skipped["shorter than a second"] += 1
             continue
         segments = _segments(features, gated=clip.label != _UNGATED)
         if not len(segments):
             skipped["nowhere above -60 dBFS"] += 1
             continue
         used.append(clip)
+        seconds.append(len(features) * FRAME_SAMPLES / SAMPLE_RATE)
         statistics.append(segments)
         target.append(classes.index(name))
         group.append(groups.setdefault(clip.source_group, len(groups)))
@@ -128,7 +129,7 @@ def build_dataset(
         group_of[kept],
         classes,
         tuple(used),
-        clip_of[kept],
+        tuple(seconds),
         dict(sorted(skipped.items())),
     )
 
@@ -148,7 +149,7 @@ def _features(clip: Clip) -> Float32:
 def _segments(features: Float32, *, gated: bool) -> Float32:
     """Statistics of the segments of one clip that are loud enough, shape (n, 42)."""
     mean, std = RollingStatistics()(features)
-    ends = slice(min(WINDOW_FRAMES, len(features)) - 1, None, HOP_FRAMES)
+    ends = slice(WINDOW_FRAMES - 1, None, HOP_FRAMES)
     segments = np.concatenate([mean[ends], std[ends]], axis=1)
     if not gated:
         return segments
@@ -158,7 +159,7 @@ def _segments(features: Float32, *, gated: bool) -> Float32:
 
 
 def _thinned(key: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Indices of at most 24 evenly spaced rows of each key, in order."""
+    """Choose at most 24 evenly spaced rows of each key; return their indices in order."""
     kept = []
     for value in np.unique(key):
         rows = np.flatnonzero(key == value)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from analyzer.errors import DataError
+from models.modelfile import TEXT
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence")
@@ -75,9 +76,9 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
 
 
 def _read_text(path: Path) -> str:
-    if not path.is_file():
-        raise DataError(f"{path}: no such manifest")
     try:
+        if not path.is_file():
+            raise DataError(f"{path}: no such manifest")
         if path.stat().st_size > _SIZE_LIMIT:
             raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no manifest")
         raw = path.read_bytes()
@@ -117,6 +118,9 @@ def _clip(
     for name in REQUIRED:
         if not value[name]:
             raise DataError(f"{where}: {name} is empty")
+    for name in OPTIONAL:
+        if not TEXT.fullmatch(value[name]):
+            raise DataError(f"{where}: {name} must be one line of at most 300 characters")
     if value["label"] not in labels:
         known = ", ".join(sorted(labels))
         raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {known}")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from analyzer.errors import DataError
-from models.modelfile import CLASS_NAME
+from models.modelfile import CLASS_NAME, MOST_CLASSES, TEXT
 
 _SIZE_LIMIT = 1 << 20
 
@@ -81,26 +81,28 @@ def load_scenario(name: str) -> Scenario:
     path = Path(name)
     if path.suffix != ".toml":
         raise DataError(f"unknown scenario {name!r}: use {', '.join(BUILTIN)} or a .toml file")
+    if not path.stem.isprintable():
+        raise DataError(f"{name!a}: give the scenario a name that can be printed")
     content = _read_toml(path)
     unknown = content.keys() - {"classes", "ignore"}
     if unknown:
-        raise DataError(f"{path}: unknown key {min(unknown)!r}; known are classes, ignore")
+        raise DataError(f"{path}: unknown key {min(unknown)[:64]!r}; known are classes, ignore")
     classes = content.get("classes")
-    if not isinstance(classes, dict) or len(classes) < 2:
-        raise DataError(f"{path}: needs a table [classes] with two classes or more")
+    if not isinstance(classes, dict) or not 2 <= len(classes) <= MOST_CLASSES:
+        raise DataError(f"{path}: needs a table [classes] with 2 to {MOST_CLASSES} classes")
     table = {_class_name(path, key): _labels(path, key, value) for key, value in classes.items()}
     ignored = frozenset(_labels(path, "ignore", content["ignore"])) if "ignore" in content else ()
     every = [label for labels in (*table.values(), ignored) for label in labels]
     twice = sorted({label for label in every if every.count(label) > 1})
     if twice:
-        raise DataError(f"{path}: label {twice[0]!r} is in two places")
+        raise DataError(f"{path}: label {twice[0][:64]!r} is in two places")
     return Scenario(path.stem, table, frozenset(ignored))
 
 
 def _read_toml(path: Path) -> dict[str, object]:
-    if not path.is_file():
-        raise DataError(f"{path}: no such scenario file")
     try:
+        if not path.is_file():
+            raise DataError(f"{path}: no such scenario file")
         if path.stat().st_size > _SIZE_LIMIT:
             raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no scenario")
         return tomllib.loads(path.read_text("utf-8"))
@@ -120,6 +122,10 @@ def _class_name(path: Path, name: str) -> str:
 
 
 def _labels(path: Path, key: str, value: object) -> tuple[str, ...]:
-    if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
-        raise DataError(f"{path}: {key} must be a list of labels, such as [\"speech\"]")
+    if not isinstance(value, list) or not value or not all(map(_is_label, value)):
+        raise DataError(f'{path}: {key} must be a list of labels, such as ["speech"]')
     return tuple(value)
+
+
+def _is_label(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and bool(TEXT.fullmatch(value))

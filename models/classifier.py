@@ -17,15 +17,21 @@ class Classifier:
     """Inference of one model; equal to scikit-learn's calibrated `SVC` within 1e-5.
 
     A row's probabilities do not depend on the rows computed together with it, nor on threads.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names behind the columns of the probabilities.
     """
 
     def __init__(self, model: Model) -> None:
+        self.classes = model.classes
         self._mean = model.scaler_mean
         self._scale = model.scaler_scale
         self._intercepts = model.intercepts
         self._inverse_temperature = model.description.inverse_temperature
         self._blocks = _blocks(model)
-        count = len(model.classes)
+        count = len(self.classes)
         self._first, self._second = np.triu_indices(count, 1)
         one_hot = np.eye(count)
         self._sides = one_hot[self._first] - one_hot[self._second]
@@ -44,7 +50,7 @@ class Classifier:
         np.ndarray [shape=(n, C)], float32
             In the order of the model's classes; every row sums to 1.
         """
-        result = np.empty((len(statistics), len(self._times_second)), np.float32)
+        result = np.empty((len(statistics), len(self.classes)), np.float32)
         for start in range(0, len(statistics), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
             votes = self._votes(self._pairs(statistics[rows])) * self._inverse_temperature
@@ -58,7 +64,7 @@ class Classifier:
         scaled = (statistics - self._mean) / self._scale
         square = np.vecdot(scaled, scaled)[:, np.newaxis]
         extended = np.concatenate([scaled, square, np.ones_like(square)], axis=1)
-        classes = len(self._times_second)
+        classes = len(self.classes)
         against = np.zeros((classes, len(statistics), classes - 1))
         for index, weights, coefficients in self._blocks:
             kernel = rowwise_matmul(extended, weights)
@@ -71,7 +77,7 @@ class Classifier:
 
     def _votes(self, decision: Float64) -> Float64:
         """One value a class from the pairs, as scikit-learn's `decision_function_shape="ovr"`."""
-        if len(self._times_second) == 2:
+        if len(self.classes) == 2:
             return np.concatenate([decision, -decision], axis=1)
         won = rowwise_matmul((decision >= 0.0).astype(np.float64), self._sides)
         sure = rowwise_matmul(decision, self._sides)

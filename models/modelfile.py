@@ -12,32 +12,34 @@ import numpy as np
 import safetensors
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from models.errors import ModelError
 from schemas.files import sync_folder
 
 SUFFIX = ".safetensors"
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_FEATURE_SET = "auros21"
+TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
+_FEATURE_COUNTS = {"auros21": 21}
 _KEY = "hearthlog"
 _SIZE_LIMIT = 64 << 20  # a hundred times what a home needs
-_MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
+_HEADER_LIMIT = 4 << 20  # parsed, it takes many times its size
+MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 _LARGEST = 1e9  # with _SMALLEST_SCALE: no product of finite statistics overflows
 _SMALLEST_SCALE = 1e-30
-_DTYPES = {
-    "scaler_mean": ("F64", np.float64),
-    "scaler_scale": ("F64", np.float64),
-    "support_vectors": ("F32", np.float32),
-    "support_counts": ("I64", np.int64),
-    "dual_coefficients": ("F64", np.float64),
-    "intercepts": ("F64", np.float64),
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "scaler_mean": np.dtype(np.float64),
+    "scaler_scale": np.dtype(np.float64),
+    "support_vectors": np.dtype(np.float32),
+    "support_counts": np.dtype(np.int64),
+    "dual_coefficients": np.dtype(np.float64),
+    "intercepts": np.dtype(np.float64),
 }
 
 Float64 = NDArray[np.float64]
 
 _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
-_Text = Annotated[str, StringConstraints(max_length=300, pattern=r"^[^\x00-\x1f\x7f]*$")]
+_Text = Annotated[str, StringConstraints(pattern=rf"^{TEXT.pattern}$")]
 _Digest = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Count = Annotated[int, Field(ge=0, lt=1 << 53)]
 _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -70,7 +72,7 @@ class TrainingData(_Record):
 
     sha256: _Digest
     classes: dict[_ClassName, Amount]
-    collections: Annotated[list[Collection], Field(max_length=10_000)]
+    collections: list[Collection]
 
 
 class ClassMetrics(_Record):
@@ -108,7 +110,7 @@ class Description(_Record):
 
     format: Literal[1]
     kind: Literal["svm-rbf"]
-    classes: Annotated[list[_ClassName], Field(min_length=2, max_length=_MOST_CLASSES)]
+    classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
     feature_set: _Text
     feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
     window_seconds: _Positive
@@ -166,20 +168,22 @@ class Model:
         """Describe the model to people, as Markdown."""
         about, metrics = self.description, self.description.metrics
         amounts = about.training_data.classes
+        purpose = (
+            f"Tells apart {len(about.classes)} classes of sound in windows of "
+            f"{about.window_seconds:g} s, from feature set {about.feature_set} "
+            f"({about.kind}, {len(self.support_vectors)} support vectors)."
+        )
         lines = [
             f"# Model {self.name or about.scenario_name}",
             "",
-            f"Tells apart {len(about.classes)} classes of sound in windows of "
-            f"{about.window_seconds:g} s, from feature set {about.feature_set} "
-            f"({about.kind}, {len(self.support_vectors)} support vectors).",
+            purpose,
             "",
             f"- sha256: {self.sha256 or 'not saved'}",
             f"- scenario: {about.scenario_name}",
-            f"- cross-validated macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, sources "
-            "never split)",
+            f"- macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, no source in two of them)",
             f"- expected calibration error: {metrics.expected_calibration_error:.3f}",
             f"- training data sha256: {about.training_data.sha256}",
-            f"- made with {', '.join(f'{k} {v}' for k, v in sorted(about.versions.items()))}",
+            f"- made with: {', '.join(f'{k} {v}' for k, v in sorted(about.versions.items()))}",
             "",
             "| class | labels | sources | seconds | precision | recall | F1 |",
             "|---|---|---|---|---|---|---|",
@@ -203,6 +207,8 @@ def check_output(path: Path) -> None:
     """Raise ModelError unless a model can be saved under this name."""
     if path.suffix != SUFFIX:
         raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
+    if not path.stem.isprintable():
+        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
     if os.path.lexists(path):
         raise ModelError(f"{path}: exists already; choose another name, or delete it first")
     if not path.parent.is_dir():
@@ -220,13 +226,11 @@ def save_model(model: Model, path: Path) -> None:
         If the file exists, the folder does not or cannot be written, or the model is inconsistent.
     """
     check_output(path)
-    arrays = {
-        name: np.ascontiguousarray(getattr(model, name), dtype)
-        for name, (_, dtype) in _DTYPES.items()
-    }
+    arrays = {name: np.ascontiguousarray(getattr(model, name)) for name in _DTYPES}
     _check_arrays(path, model.description, arrays)
     text = json.dumps(model.description.model_dump(), sort_keys=True, ensure_ascii=False)
     data = save(arrays, {_KEY: text})
+    _check_header(path, data)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("xb") as stream:
@@ -252,23 +256,27 @@ def load_model(path: Path) -> Model:
         If it is missing, too large, damaged, inconsistent, or made for another feature set.
     """
     data = _read(path)
+    _check_header(path, data)
     try:
-        tensors = safetensors.deserialize(data)
-    except safetensors.SafetensorError as error:
+        arrays = load(data)
+    except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
         raise ModelError(f"{path}: is no model file ({_one_line(error)})") from error
     description = _description(path, data)
-    arrays = {name: _array(path, name, dict(tensors).get(name)) for name in _DTYPES}
-    if len(tensors) != len(_DTYPES):
-        raise ModelError(f"{path}: holds arrays that are no part of a model")
+    if arrays.keys() != _DTYPES.keys():
+        raise ModelError(f"{path}: has other arrays than a model of hearthlog")
     _check_arrays(path, description, arrays)
+    for array in arrays.values():
+        array.flags.writeable = False
     name, digest = path.stem, hashlib.sha256(data).hexdigest()
     return Model(description, **arrays, name=name, sha256=digest)
 
 
 def _read(path: Path) -> bytes:
-    if not path.is_file():
-        raise ModelError(f"{path}: no such model file")
     try:
+        if not path.is_file():
+            raise ModelError(f"{path}: no such model file")
+        if not path.stem.isprintable():
+            raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
         with path.open("rb") as stream:
             data = stream.read(_SIZE_LIMIT + 1)
     except OSError as error:
@@ -276,6 +284,11 @@ def _read(path: Path) -> bytes:
     if len(data) > _SIZE_LIMIT:
         raise ModelError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no model of ours")
     return data
+
+
+def _check_header(path: Path, data: bytes) -> None:
+    if int.from_bytes(data[:8], "little") > _HEADER_LIMIT:
+        raise ModelError(f"{path}: is no model file (its header is too large)")
 
 
 def _description(path: Path, data: bytes) -> Description:
@@ -288,7 +301,7 @@ def _description(path: Path, data: bytes) -> Description:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
-        raise ModelError(f"{path}: {where}: {_one_line(first['msg'])}") from error
+        raise ModelError(f"{path}: {_one_line(where)}: {_one_line(first['msg'])}") from error
     problem = _problem(description)
     if problem:
         raise ModelError(f"{path}: {problem}")
@@ -298,29 +311,21 @@ def _description(path: Path, data: bytes) -> Description:
 def _problem(about: Description) -> str | None:
     """Say what in a description contradicts the rest of it."""
     classes = set(about.classes)
-    if about.feature_set != _FEATURE_SET:
-        return f"is for feature set {about.feature_set!r}; this version has {_FEATURE_SET}"
+    if about.feature_set not in _FEATURE_COUNTS:
+        known = ", ".join(_FEATURE_COUNTS)
+        return f"is for feature set {about.feature_set!r}; this version has {known}"
+    if len(about.feature_names) != _FEATURE_COUNTS[about.feature_set]:
+        return f"names {len(about.feature_names)} features, which {about.feature_set} has not"
     if len(classes) != len(about.classes):
         return "names a class twice"
     if about.scenario.keys() != classes:
         return "its scenario has other classes"
     if about.training_data.classes.keys() != classes or about.metrics.classes.keys() != classes:
         return "its training data or metrics are of other classes"
-    if any(len(row) != len(classes) for row in (about.metrics.confusion, *about.metrics.confusion)):
+    confusion = about.metrics.confusion
+    if {len(confusion), *map(len, confusion)} != {len(classes)}:
         return "its confusion matrix does not fit its classes"
     return None
-
-
-def _array(path: Path, name: str, tensor: dict[str, Any] | None) -> NDArray[Any]:
-    if tensor is None:
-        raise ModelError(f"{path}: has no array {name}")
-    stored, dtype = _DTYPES[name]
-    if tensor["dtype"] != stored:
-        raise ModelError(f"{path}: {name} is of type {tensor['dtype']}, not {stored}")
-    array = np.frombuffer(tensor["data"], np.dtype(dtype).newbyteorder("<"))
-    array = array.reshape(tensor["shape"]).astype(dtype)
-    array.flags.writeable = False
-    return array
 
 
 def _check_arrays(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> None:
@@ -336,6 +341,8 @@ def _check_arrays(path: Path, about: Description, arrays: dict[str, NDArray[Any]
     }
     for name, shape in shapes.items():
         array = arrays[name]
+        if array.dtype != _DTYPES[name]:
+            raise ModelError(f"{path}: {name} is of type {array.dtype}, not {_DTYPES[name]}")
         if array.shape != shape:
             raise ModelError(f"{path}: {name} has shape {array.shape}, not {shape}")
         if not np.isfinite(array).all():
@@ -349,5 +356,5 @@ def _check_arrays(path: Path, about: Description, arrays: dict[str, NDArray[Any]
         raise ModelError(f"{path}: support_counts do not add up to the {total} support vectors")
 
 
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:200]
+def _one_line(text: object) -> str:
+    return "".join(c if c.isprintable() else " " for c in str(text))[:200]

@@ -63,19 +63,23 @@ class RollingLog:
         self._flush_nanoseconds = max(int(flush_seconds * NANOSECONDS - _DELAY), FRAME_NANOSECONDS)
         self._sync_seconds = max(sync_seconds - flush_seconds, 0.0)
         self._writer: LogWriter | None = None
-        self._until = 0
+        self._last = self._until = 0  # no time lies between: the first record opens a file
         self._flush_at: int | None = None
         self._synced = time.monotonic()
 
     def write(self, records: Sequence[Record]) -> None:
-        """Append records, in the order of their log times."""
+        """Append records, in the order of their log times.
+
+        Where time runs backwards, because the clock was set, another file begins.
+        """
         for record in records:
-            if self._writer is None or record.log_time >= self._until:
+            if not self._last <= record.log_time < self._until:
                 self._roll(record.log_time)
             elif self._flush_at is not None and record.log_time >= self._flush_at:
                 self.flush()
             assert self._writer is not None
             self._writer.write(record.topic, record.log_time, record.data)
+            self._last = record.log_time
             if self._flush_at is None:
                 self._flush_at = record.log_time + self._flush_nanoseconds
         if time.monotonic() - self._synced >= self._sync_seconds:
@@ -111,6 +115,7 @@ class RollingLog:
         about = self._description
         path = log_path(about.root, about.node, stamp)
         self._writer = LogWriter(path, about.topics, about.metadata, about.attachments, stamp)
+        self._last = stamp
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
         about.info.header = header(stamp, about.microphone)
         self._writer.write(topic(about.microphone, "info"), stamp, encode(about.info))

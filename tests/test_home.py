@@ -174,6 +174,15 @@ def test_a_day_is_loud_where_its_truth_says_so_and_only_there(tmp_path):
             assert level > -55.0
 
 
+def test_no_two_events_of_a_day_sound_the_same(tmp_path):
+    truth = write_day(tmp_path / "day.flac", 6.0, seed=0)
+    day, _ = soundfile.read(tmp_path / "day.flac")
+    starts = [round(start * SAMPLE_RATE) for start, _, label in truth if label == "tap_water"]
+    assert len(starts) > 1
+    alike = np.corrcoef([day[start : start + 3 * SAMPLE_RATE] for start in starts])
+    assert np.abs(alike - np.eye(len(starts))).max() < 0.5
+
+
 def test_a_day_of_24_minutes_holds_every_sound_in_a_plausible_order_and_length():
     for seed in range(20):
         events = _plan_day(24.0, seed)
@@ -236,7 +245,7 @@ def test_a_day_that_cannot_be_is_refused_in_one_line(tmp_path, name, minutes, se
 
 
 def test_a_model_trained_on_the_clips_labels_the_day_mostly_right(tmp_path):
-    manifest = write_training_set(tmp_path / "clips", clips_per_class=6, seed=1)
+    manifest = write_training_set(tmp_path / "clips", clips_per_class=12, seed=1)
     statistics, labels = [], []
     with manifest.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -246,11 +255,11 @@ def test_a_model_trained_on_the_clips_labels_the_day_mostly_right(tmp_path):
     model = make_pipeline(StandardScaler(), SVC(C=4.0, gamma=0.5 / 42, class_weight="balanced"))
     model.fit(np.concatenate(statistics), labels)
 
-    starts, _, truth = zip(*write_day(tmp_path / "day.flac", 12.0, seed=2), strict=True)
+    starts, _, truth = zip(*write_day(tmp_path / "day.flac", 24.0, seed=2), strict=True)
     day, _ = soundfile.read(tmp_path / "day.flac", dtype="float32")
     predicted = model.predict(one_second_statistics(day))
     middles = np.arange(len(predicted)) + 0.5
     true = np.array(truth)[np.searchsorted(starts, middles, side="right") - 1]
     assert np.mean(predicted == true) > 0.85
-    heard = true != "silence"
-    assert np.mean(predicted[heard] == true[heard]) > 0.85
+    for label in np.unique(true):
+        assert np.mean(predicted[true == label] == label) > 0.6, label

@@ -121,7 +121,7 @@ class Framer:
                 self._restart(index, "the sound card lost samples")
         self._clock.observe(index, taken)
         self._expected = block.index + len(block.samples)
-        return self._cut(block.samples / _INT16_FULL_SCALE)
+        return self._cut(block.samples.astype(np.float32) / _INT16_FULL_SCALE)
 
     def _restart(self, origin: int, reason: str) -> None:
         self._reason = reason

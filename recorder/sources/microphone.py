@@ -53,6 +53,7 @@ class CaptureProcess:
         self._process = subprocess.Popen(  # noqa: S603  our own module
             [sys.executable, "-m", "recorder.sources.capture", device],
             stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,
         )
         assert self._process.stdout is not None
@@ -148,6 +149,10 @@ class MicrophoneSource:
             if self._capture is not None:
                 reason = yield from self._one_life(self._capture, reason, stop)
                 self.close()
+                if stop.is_set():
+                    return
+                self._health = (ERROR, reason)
+                yield from self._report(self._now())
 
     def close(self) -> None:
         """End the capture process."""
@@ -185,7 +190,7 @@ class MicrophoneSource:
                 self._health = (ERROR, str(error))
             else:
                 return
-            yield from self._report(time.monotonic_ns() + self._wall_offset)
+            yield from self._report(self._now())
             if stop.wait(pause):
                 return
 
@@ -207,6 +212,9 @@ class MicrophoneSource:
         if abs(step) > _STEP_SECONDS:
             self._wall_offset = offset
             self._framer.step_clock(offset, f"the clock was set by {step:+.3f} s")
+
+    def _now(self) -> int:
+        return time.monotonic_ns() + self._wall_offset
 
     def _report(self, stamp: int) -> Iterator[Health]:
         """Yield the state every ten seconds, and when it has changed."""

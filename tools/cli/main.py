@@ -10,6 +10,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from schemas.errors import HearthlogError
+from tools.cli.devices import devices
+from tools.cli.info import info
 from tools.cli.record import record
 
 app = typer.Typer(
@@ -18,7 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (record,):
+for verb in (record, devices, info):
     app.command()(verb)
 
 

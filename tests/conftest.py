@@ -1,0 +1,51 @@
+"""Fixtures that several tests share."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
+
+from recorder.features import FRAME_SAMPLES
+from recorder.sources.files import read_audio
+
+__all__ = ["labmic", "labmic_plugin", "pulse_daemon", "pulse_microphone"]
+
+_HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
+HEARTHLOG = [sys.executable, "-m", "tools.cli.main"]
+
+
+@pytest.fixture(scope="session")
+def household() -> Path:
+    """The folder of real labelled recordings, where the machine has it."""
+    if not (_HOUSEHOLD / "manifest.csv").exists():
+        pytest.skip("the household recordings are not on this machine")
+    return _HOUSEHOLD
+
+
+@pytest.fixture(scope="session")
+def real_frames(household) -> np.ndarray:
+    """Four minutes of real sound of all classes, as frames."""
+    files = sorted(household.glob("*/*.flac"))[::16]
+    samples = np.concatenate([block for path in files for block in read_audio(path)])
+    return samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+
+
+@pytest.fixture
+def hearthlog():
+    """Run the command in a process of its own and return what came of it."""
+
+    def run(*arguments, env=None, timeout=120):
+        return subprocess.run(
+            [*HEARTHLOG, *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            env={**os.environ, **(env or {})},
+            timeout=timeout,
+            check=False,
+        )
+
+    return run
