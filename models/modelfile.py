@@ -227,8 +227,8 @@ def save_model(model: Model, path: Path) -> None:
     """
     check_output(path)
     arrays = {name: np.ascontiguousarray(getattr(model, name)) for name in _DTYPES}
-    _check_arrays(path, model.description, arrays)
-    text = json.dumps(model.description.model_dump(), sort_keys=True, ensure_ascii=False)
+    _check(path, model.description, arrays)
+    text = json.dumps(model.description.model_dump(), ensure_ascii=False)
     data = save(arrays, {_KEY: text})
     _check_header(path, data)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -264,7 +264,7 @@ def load_model(path: Path) -> Model:
     description = _description(path, data)
     if arrays.keys() != _DTYPES.keys():
         raise ModelError(f"{path}: has other arrays than a model of hearthlog")
-    _check_arrays(path, description, arrays)
+    _check(path, description, arrays)
     for array in arrays.values():
         array.flags.writeable = False
     name, digest = path.stem, hashlib.sha256(data).hexdigest()
@@ -277,13 +277,12 @@ def _read(path: Path) -> bytes:
             raise ModelError(f"{path}: no such model file")
         if not path.stem.isprintable():
             raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+        if path.stat().st_size > _SIZE_LIMIT:
+            raise ModelError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no model file")
         with path.open("rb") as stream:
-            data = stream.read(_SIZE_LIMIT + 1)
+            return stream.read(_SIZE_LIMIT)
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(data) > _SIZE_LIMIT:
-        raise ModelError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no model of ours")
-    return data
 
 
 def _check_header(path: Path, data: bytes) -> None:
@@ -297,20 +296,18 @@ def _description(path: Path, data: bytes) -> Description:
     if text is None:
         raise ModelError(f"{path}: is no model of hearthlog: it does not describe itself")
     try:
-        description = Description.model_validate_json(text)
+        return Description.model_validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
         raise ModelError(f"{path}: {_one_line(where)}: {_one_line(first['msg'])}") from error
-    problem = _problem(description)
-    if problem:
-        raise ModelError(f"{path}: {problem}")
-    return description
 
 
 def _problem(about: Description) -> str | None:
     """Say what in a description contradicts the rest of it."""
     classes = set(about.classes)
+    tables = (about.scenario, about.training_data.classes, about.metrics.classes)
+    confusion = about.metrics.confusion
     if about.feature_set not in _FEATURE_COUNTS:
         known = ", ".join(_FEATURE_COUNTS)
         return f"is for feature set {about.feature_set!r}; this version has {known}"
@@ -318,17 +315,17 @@ def _problem(about: Description) -> str | None:
         return f"names {len(about.feature_names)} features, which {about.feature_set} has not"
     if len(classes) != len(about.classes):
         return "names a class twice"
-    if about.scenario.keys() != classes:
-        return "its scenario has other classes"
-    if about.training_data.classes.keys() != classes or about.metrics.classes.keys() != classes:
-        return "its training data or metrics are of other classes"
-    confusion = about.metrics.confusion
+    if any(table.keys() != classes for table in tables):
+        return "its scenario, training data and metrics are not all of its classes"
     if {len(confusion), *map(len, confusion)} != {len(classes)}:
         return "its confusion matrix does not fit its classes"
     return None
 
 
-def _check_arrays(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> None:
+def _check(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> None:
+    problem = _problem(about)
+    if problem:
+        raise ModelError(f"{path}: {problem}")
     classes, width = len(about.classes), 2 * len(about.feature_names)
     total = len(arrays["support_vectors"]) if arrays["support_vectors"].ndim else 0
     shapes: dict[str, tuple[int, ...]] = {

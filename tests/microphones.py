@@ -100,8 +100,8 @@ class PulseMicrophone:
         The name PortAudio lists it under.
     """
 
-    # A name of our own: distributions define `pcm.pulse` themselves, and a second definition
-    # merges with theirs into one that ALSA rejects.
+    # A name of our own: distributions define `pcm.pulse` themselves, and ALSA merges a second
+    # definition into theirs.
     device = "nullsink"
 
     def __init__(self, folder: Path):

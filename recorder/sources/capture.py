@@ -22,8 +22,8 @@ from recorder.errors import SourceError
 from recorder.sources.devices import Device, find_device, list_devices, load_portaudio
 
 # index of the first sample, samples, flags of PortAudio, time of the first sample by the ADC
-# (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC and by CLOCK_REALTIME (s)
-BLOCK = struct.Struct("<QIIddd")
+# (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)
+BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
 _BLOCK_SECONDS = 0.2
@@ -69,7 +69,6 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
             int(status._flags),  # noqa: SLF001  the only way to hand the flags on
             times.inputBufferAdcTime,
             time.monotonic(),
-            time.time(),
         )
         index += count
         if not blocks.full():  # what is dropped here shows in the next index

@@ -12,7 +12,9 @@ from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
 from schemas.messages import NANOSECONDS
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on no clock we know
-_LOSS_SECONDS = 0.010  # an ADC that is trusted is never this late
+_LOSS_SECONDS = 0.010
+_STEADY_SECONDS = 0.002  # an ADC that has been this exact for so many blocks
+_STEADY_BLOCKS = 50  # is believed when it says that samples are missing
 _INT16_FULL_SCALE = np.float32(32768.0)
 
 Float32 = NDArray[np.float32]
@@ -28,27 +30,27 @@ class Block:
         Number of the first sample since that process started.
     samples : np.ndarray [shape=(n,)], int16
     overflowed : bool
-        Samples were lost before this block, or a little earlier.
+        The sound card lost samples before the last one of this block, or a little earlier.
     adc_time : float
         When the first sample was taken, in seconds of a clock of the driver's choice.
-    monotonic, realtime : float
-        When the block arrived, by both clocks of the system, in seconds.
+    arrival : float
+        When the block arrived, in seconds of CLOCK_MONOTONIC.
     """
 
     index: int
     samples: NDArray[np.int16]
     overflowed: bool
     adc_time: float
-    monotonic: float
-    realtime: float
+    arrival: float
+
+    @property
+    def has_adc_time(self) -> bool:
+        """Whether its ADC time can be trusted: those on other clocks jump about by 0.1 s."""
+        return abs(self.adc_time - self.arrival) < _ADC_CLOCK_SECONDS
 
     def taken_at(self, rate: float) -> float:
         """Return when the first sample was taken, on CLOCK_MONOTONIC, at the latest."""
-        if abs(self.adc_time - self.monotonic) < _ADC_CLOCK_SECONDS:
-            return self.adc_time
-        if abs(self.adc_time - self.realtime) < _ADC_CLOCK_SECONDS:
-            return self.adc_time - self.realtime + self.monotonic
-        return self.monotonic - len(self.samples) / rate
+        return self.adc_time if self.has_adc_time else self.arrival - len(self.samples) / rate
 
 
 class Framer:
@@ -67,6 +69,8 @@ class Framer:
         self._clock = SampleClock(SAMPLE_RATE)
         self._wall_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC, in nanoseconds
         self._expected = 0  # index of the next block, if nothing is lost
+        self._steady = 0  # blocks in a row that came when expected
+        self._was_steady = False
         self._lost = 0  # samples that the sound card lost, which its driver did not count
         self._origin = 0  # index of the first sample since the last loss
         self._heard = 0  # samples at 16 kHz that left as frames since then
@@ -97,7 +101,7 @@ class Framer:
         """
         self._rate = float(rate)
         self._clock = SampleClock(rate)
-        self._expected = self._lost = 0
+        self._expected = self._lost = self._steady = 0
         self._restart(0, reason)
         self._wall_offset = wall_offset
 
@@ -110,18 +114,26 @@ class Framer:
         """Take a block and return the frames that it completes, after the gap before them."""
         if block.index != self._expected:
             self._restart(block.index + self._lost, "the recorder was too slow")
-        taken = block.taken_at(self._rate)
-        index = block.index + self._lost
-        if self._clock.started:
-            late = taken - float(self._clock.time(index))
-            if late > _LOSS_SECONDS:
-                missing = round(late * self._rate)
-                self._lost += missing
-                index += missing
-                self._restart(index, "the sound card lost samples")
-        self._clock.observe(index, taken)
         self._expected = block.index + len(block.samples)
+        taken = block.taken_at(self._rate)
+        missing = self._missing_before(block, taken)
+        if missing:
+            self._lost += missing
+            # The loss lies somewhere inside this block: the first good sample is the next one's.
+            self._restart(self._expected + self._lost, "the sound card lost samples")
+            return []
+        self._clock.observe(block.index + self._lost, taken)
         return self._cut(block.samples.astype(np.float32) / _INT16_FULL_SCALE)
+
+    def _missing_before(self, block: Block, taken: float) -> int:
+        """Count the samples that the sound card lost, by how late it says that this block is."""
+        if not self._clock.started:
+            return 0
+        late = taken - float(self._clock.time(block.index + self._lost))
+        self._steady = self._steady + 1 if abs(late) < _STEADY_SECONDS else 0
+        is_loss = block.overflowed or (block.has_adc_time and self._was_steady)
+        self._was_steady = self._steady >= _STEADY_BLOCKS
+        return round(late * self._rate) if is_loss and late > _LOSS_SECONDS else 0
 
     def _restart(self, origin: int, reason: str) -> None:
         self._reason = reason

@@ -114,10 +114,10 @@ class CaptureProcess:
         return os.read(self._pipe, _PIPE_BYTES)
 
 
-def _block(head: tuple[int, int, int, float, float, float], data: bytes) -> Block:
-    index, _, flags, adc_time, monotonic, realtime = head
+def _block(head: tuple[int, int, int, float, float], data: bytes) -> Block:
+    index, _, flags, adc_time, arrival = head
     overflowed = bool(flags & _INPUT_OVERFLOW)
-    return Block(index, np.frombuffer(data, "<i2"), overflowed, adc_time, monotonic, realtime)
+    return Block(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)
 
 
 class MicrophoneSource:
@@ -171,7 +171,7 @@ class MicrophoneSource:
             if blocks is None:
                 return "the capture process ended"
             for block in blocks:
-                heard = block.monotonic
+                heard = block.arrival
                 for event in self._framer.add(block):
                     self._watch_silence(event)
                     yield event

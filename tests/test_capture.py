@@ -1,0 +1,218 @@
+"""A microphone is heard to the last sample, whatever happens to it; real PortAudio throughout."""
+
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from conftest import HEARTHLOG
+from logs import features, read
+
+from recorder.features import FRAME_SAMPLES, FeatureExtractor
+from schemas.messages import nanoseconds
+
+RATE = 16_000
+FRAME = 50_000_000
+SECONDS = 1_000_000_000
+
+
+@contextmanager
+def recording(microphone, folder, *options):
+    """Run `hearthlog record` on a microphone; at the end it is asked to stop."""
+    command = [*HEARTHLOG, "record", "--device", microphone.device, "-o", str(folder), *options]
+    process = subprocess.Popen(
+        command, env=microphone.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        yield process
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        process.output, process.errors = process.communicate(timeout=20)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait_for_frames(folder, count, seconds=30):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if folder.exists() and list(folder.rglob("*.mcap*")) and len(features(folder)[0]) >= count:
+            return
+        time.sleep(0.2)
+    pytest.fail(f"not {count} frames in {seconds} s")
+
+
+def sound(seconds=7, seed=3):
+    """Noise that never repeats within itself, as int16."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 3000, RATE * seconds + 311).astype(np.int16)
+
+
+def batch(data, start, count):
+    """Features of `count` frames of the looping data, from sample `start` on."""
+    index = (start + np.arange(count * FRAME_SAMPLES)) % len(data)
+    frames = (data[index].astype(np.float32) / np.float32(32768)).reshape(-1, FRAME_SAMPLES)
+    return FeatureExtractor()(frames)
+
+
+def first_sample(data, values, guess):
+    """Find where in the looping data the second frame began, near `guess`."""
+    for offset in sorted(range(-400, 401), key=abs):
+        if np.array_equal(batch(data, guess - FRAME_SAMPLES + offset, 2)[1], values[1]):
+            return guess - FRAME_SAMPLES + offset
+    pytest.fail("the features are not those of the microphone's samples")
+
+
+def realtime_offset():
+    return time.time_ns() - time.monotonic_ns()
+
+
+@pytest.mark.parametrize("seconds", [60])
+def test_every_sample_of_a_minute_is_heard_and_gives_the_features_of_the_batch(
+    labmic, tmp_path, seconds
+):
+    data = sound()
+    labmic.configure(data=data)
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", seconds * 20, seconds + 30)
+    assert process.returncode == 0, process.errors
+    frames, stamps, values = features(tmp_path / "logs")
+    np.testing.assert_array_equal(frames, np.arange(len(frames)))
+    guess = labmic.index_at(int(stamps[1]) - realtime_offset())
+    start = first_sample(data, values, guess)
+    np.testing.assert_array_equal(values, batch(data, start, len(frames)))
+    true = (start + frames * FRAME_SAMPLES) * SECONDS / RATE + realtime_offset()
+    assert np.abs(stamps - true).max() < 1_000_000
+
+
+def test_stamps_stay_within_a_millisecond_of_a_microphone_that_drifts_by_50_ppm(labmic, tmp_path):
+    data = sound()
+    labmic.configure(ppm=50, data=data)
+    with recording(labmic, tmp_path / "logs"):
+        wait_for_frames(tmp_path / "logs", 30 * 20, 60)
+    frames, stamps, values = features(tmp_path / "logs")
+    guess = labmic.index_at(int(stamps[1]) - realtime_offset())
+    start = first_sample(data, values, guess)
+    np.testing.assert_array_equal(values, batch(data, start, len(frames)))
+    true = (start + frames * FRAME_SAMPLES) * SECONDS / (RATE * (1 + 50e-6)) + realtime_offset()
+    assert np.abs(stamps - true).max() < 1_000_000
+
+
+def test_a_microphone_that_is_unplugged_and_comes_back_leaves_a_gap(labmic, tmp_path):
+    with recording(labmic, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 20)
+        labmic.unplug()
+        time.sleep(5)
+        labmic.restore()
+        wait_for_frames(tmp_path / "logs", len(features(tmp_path / "logs")[0]) + 40)
+    assert process.returncode == 3
+    assert len(process.errors) < 2000
+    frames, stamps, _ = features(tmp_path / "logs")
+    (gap,) = read(tmp_path / "logs", "gap")
+    jump = int(np.flatnonzero(np.diff(frames) > 1)[0])
+    assert gap.frames_lost == frames[jump + 1] - frames[jump] - 1
+    assert nanoseconds(gap.header.stamp) == stamps[jump] + FRAME
+    assert nanoseconds(gap.header.stamp) + nanoseconds(gap.duration) == stamps[jump + 1]
+    assert abs(gap.frames_lost * FRAME - nanoseconds(gap.duration)) < FRAME
+    levels = [s.level for m in read(tmp_path / "logs", "diagnostics") for s in m.status]
+    assert 2 in levels
+    assert levels[-1] == 0
+
+
+def test_a_microphone_that_freezes_is_started_again(labmic, tmp_path):
+    with recording(labmic, tmp_path / "logs"):
+        wait_for_frames(tmp_path / "logs", 20)
+        labmic.freeze()
+        time.sleep(4)
+        labmic.restore()
+        wait_for_frames(tmp_path / "logs", len(features(tmp_path / "logs")[0]) + 40)
+    (gap,) = read(tmp_path / "logs", "gap")
+    assert gap.reason == "the microphone went silent"
+
+
+def test_a_recorder_that_is_killed_loses_a_second_and_the_next_start_says_so(labmic, tmp_path):
+    logs = tmp_path / "logs"
+    with recording(labmic, logs) as process:
+        wait_for_frames(logs, 60)
+        process.kill()
+        killed = time.time_ns()
+        process.wait()
+    (left,) = logs.rglob("*.active")
+    _, stamps, _ = features(left)
+    assert killed - (int(stamps[-1]) + FRAME) < SECONDS
+    with recording(labmic, logs):
+        deadline = time.monotonic() + 20
+        while left.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        wait_for_frames(logs, len(stamps) + 40)
+    assert not list(logs.rglob("*.active"))
+    first, second = sorted(logs.rglob("*.mcap"))
+    np.testing.assert_array_equal(features(first)[1], stamps)
+    (gap,) = read(second, "gap")
+    assert nanoseconds(gap.header.stamp) == stamps[-1] + FRAME
+    _, later, _ = features(second)
+    assert nanoseconds(gap.header.stamp) + nanoseconds(gap.duration) == later[0]
+
+
+def test_a_microphone_at_another_rate_is_resampled(labmic, tmp_path):
+    time_axis = np.arange(48_000 * 2) / 48_000
+    tone = (8000 * np.sin(2 * np.pi * 1000 * time_axis)).astype(np.int16)
+    labmic.configure(rate=48_000, data=tone)
+    with recording(labmic, tmp_path / "logs"):
+        wait_for_frames(tmp_path / "logs", 60)
+    frames, stamps, values = features(tmp_path / "logs")
+    np.testing.assert_array_equal(frames, np.arange(len(frames)))
+    assert np.abs(np.diff(stamps) - FRAME).max() < 100_000
+    assert np.median(values[:, 0]) == pytest.approx((8000 / 32768) ** 2 / 2, rel=0.01)
+    assert np.median(values[:, 7]) * RATE / 2 == pytest.approx(1000, abs=1)
+
+
+def test_a_dead_microphone_that_gives_only_zeros_is_reported(labmic, tmp_path):
+    labmic.configure(data=np.zeros(RATE, np.int16))
+    with recording(labmic, tmp_path / "logs"):
+        wait_for_frames(tmp_path / "logs", 220)
+    found = [s for m in read(tmp_path / "logs", "diagnostics") for s in m.status]
+    assert any(s.level == 2 and "digital silence" in s.message for s in found)
+
+
+def test_sound_of_pulseaudio_is_heard_to_the_last_sample(pulse_microphone, tmp_path):
+    data = sound(5, seed=4)
+    pulse_microphone.play(data)
+    with recording(pulse_microphone, tmp_path / "logs") as process:
+        wait_for_frames(tmp_path / "logs", 200)
+    assert process.returncode == 0, process.errors
+    frames, _, values = features(tmp_path / "logs")
+    np.testing.assert_array_equal(frames, np.arange(len(frames)))
+    energies = values[-60:, 0]
+    cyclic = np.concatenate([data, data]).astype(np.float64) / 32768
+    power = np.concatenate([[0.0], np.cumsum(cyclic**2)])
+    frame_power = (power[FRAME_SAMPLES:] - power[:-FRAME_SAMPLES]) / FRAME_SAMPLES
+    (start,) = [
+        offset
+        for offset in np.flatnonzero(np.isclose(frame_power[: len(data)], energies[0], rtol=1e-6))
+        if np.array_equal(batch(data, int(offset), 3)[1:], values[-60:-57][1:])
+    ]
+    np.testing.assert_array_equal(batch(data, int(start), 60)[1:], values[-60:][1:])
+
+
+def test_an_unknown_microphone_is_refused_with_a_list_of_those_there_are(labmic, hearthlog):
+    result = hearthlog("record", "--device", "Blue Yeti", env=labmic.env)
+    assert result.returncode == 1
+    assert result.stderr == ("hearthlog: no microphone is called 'Blue Yeti'; there are 'labmic'\n")
+
+
+def test_a_microphone_that_is_gone_at_the_start_is_refused(labmic, hearthlog, tmp_path):
+    labmic.unplug()
+    result = hearthlog("record", "--device", "labmic", "-o", tmp_path / "logs", env=labmic.env)
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "logs").exists()
+
+
+def test_devices_lists_microphones_by_name(labmic, hearthlog):
+    result = hearthlog("devices", env=labmic.env)
+    assert result.returncode == 0
+    assert result.stdout.startswith("labmic  ")

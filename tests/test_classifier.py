@@ -1,0 +1,107 @@
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from blobs import blobs, ignore_progress
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.calibration import CalibratedClassifierCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+from threadpoolctl import threadpool_limits
+
+from analyzer.train import group_folds, train_model
+from models.classifier import Classifier
+
+ROWS = 600
+
+
+@cache
+def trained(classes, count=60, spread=1.5):
+    return train_model(*blobs(classes, count, spread=spread), ignore_progress)
+
+
+@cache
+def unseen(classes):
+    rng = np.random.default_rng(7)
+    rows = blobs(classes, 60)[0].statistics
+    chosen = rows[rng.integers(0, len(rows), ROWS)]
+    return (chosen * rng.uniform(0.8, 1.2, chosen.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("classes", "count", "spread"), [(2, 60, 1.5), (3, 60, 1.5), (9, 60, 1.5), (3, 300, 9.0)]
+)
+def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
+    data, _ = blobs(classes, count, spread=spread)
+    model = trained(classes, count, spread)
+    machine = SVC(C=model.description.cost, gamma=model.description.gamma, class_weight="balanced")
+    theirs = CalibratedClassifierCV(
+        make_pipeline(StandardScaler(), machine),
+        method="temperature",
+        ensemble=False,
+        cv=group_folds(data),
+    ).fit(data.statistics.astype(np.float64), data.target)
+    expected = theirs.predict_proba(unseen(classes).astype(np.float64))
+
+    ours = Classifier(model).probabilities(unseen(classes))
+
+    assert ours.dtype == np.float32
+    assert ours.shape == (ROWS, classes)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-6)
+    assert len(np.unique(ours.argmax(axis=1))) == classes
+
+
+def judged(classifier, rows):
+    """Probabilities, and before their rounding to float32 the decisions behind them."""
+    return np.concatenate([classifier.probabilities(rows), classifier._pairs(rows)], axis=1)
+
+
+@given(
+    classes=st.sampled_from([2, 3, 9]),
+    cuts=st.sets(st.integers(1, ROWS - 1), max_size=40),
+)
+def test_a_row_is_judged_the_same_in_any_company(classes, cuts):
+    classifier = Classifier(trained(classes))
+    whole = judged(classifier, unseen(classes))
+    parts = np.split(unseen(classes), sorted(cuts))
+    assert np.array_equal(np.concatenate([judged(classifier, p) for p in parts]), whole)
+
+
+@pytest.mark.parametrize("classes", [2, 3])
+def test_the_number_of_blas_threads_changes_nothing(classes):
+    model = trained(classes, 300, spread=9.0)
+    assert model.support_counts.max() > 256  # more than are multiplied at once
+    classifier = Classifier(model)
+    results = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            results.append(judged(classifier, unseen(classes)))
+    assert np.array_equal(*results)
+
+
+def test_every_row_sums_to_one_however_far_from_what_was_learned():
+    rows = unseen(9) * np.geomspace(1e-30, 1e30, ROWS, dtype=np.float32)[:, np.newaxis]
+    result = Classifier(trained(9)).probabilities(rows)
+    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=1e-6)
+
+
+def test_support_vectors_beyond_all_precision_still_give_probabilities():
+    far = trained(3).support_vectors * np.float32(1e20)
+    result = Classifier(dataclasses.replace(trained(3), support_vectors=far)).probabilities(far)
+    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=1e-6)
+
+
+def test_no_rows_give_no_probabilities():
+    assert Classifier(trained(3)).probabilities(np.empty((0, 42), np.float32)).shape == (0, 3)
+
+
+def test_a_class_without_support_vectors_is_no_obstacle():
+    model = trained(3)
+    counts = model.support_counts.copy()
+    counts[1] += counts[0]
+    counts[0] = 0
+    result = Classifier(dataclasses.replace(model, support_counts=counts)).probabilities(unseen(3))
+    assert np.isfinite(result).all()

@@ -1,0 +1,142 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analyzer.errors import DataError
+from analyzer.manifest import read_manifest
+from analyzer.scenario import BUILTIN, LABELS, load_scenario
+
+HEADER = "path,label,source_group,source,licence\n"
+
+
+def manifest(folder, text, audio=("a.wav", "b.wav")):
+    for name in audio:
+        (folder / name).touch()
+    path = folder / "manifest.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def refusal(path, labels=LABELS):
+    with pytest.raises(DataError) as caught:
+        read_manifest(path, labels)
+    return str(caught.value)
+
+
+def test_clips_are_read_with_paths_beside_the_manifest(tmp_path):
+    path = manifest(tmp_path, HEADER + "a.wav,speech,anna,home,CC0\nb.wav,shower,bath,,\n")
+    first, second = read_manifest(path, LABELS)
+    assert first.path == tmp_path / "a.wav"
+    assert (first.label, first.source_group) == ("speech", "anna")
+    assert (first.source, first.licence) == ("home", "CC0")
+    assert (second.source, second.licence) == ("", "")
+
+
+def test_columns_may_be_in_any_order_and_others_are_ignored(tmp_path):
+    path = manifest(tmp_path, "\ufeffsource_group,note,label,path\nanna,x,speech,a.wav\n")
+    (clip,) = read_manifest(path, LABELS)
+    assert (clip.path.name, clip.label, clip.source_group) == ("a.wav", "speech", "anna")
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "reason"),
+    [
+        ("", None, "empty"),
+        ("\n\n", None, "empty"),
+        (HEADER, None, "no clips"),
+        ("path,label\na.wav,speech\n", 1, "no column source_group"),
+        (HEADER + "a.wav,speech,anna,,\n\nnowhere.wav,speech,anna,,\n", 4, "no such file"),
+        (HEADER + 'a.wav,speech,"anna\nmaria",,\nb.wav,spech,anna,,\n', 4, "'spech'"),
+        (HEADER + "a.wav,speech\n", 2, "2 fields"),
+        (HEADER + "a.wav,speech,,,\n", 2, "source_group is empty"),
+        (HEADER + "a.wav,speech,anna,,\na.wav,music,anna,,\n", 3, "line 2"),
+        (HEADER + 'a.wav,speech,"anna,,\n', 2, "not CSV"),
+        (HEADER + "a" * 200_000 + ",speech,anna,,\n", 2, "not CSV"),
+        (HEADER + "a.wav,speech,anna,,\n\0.wav,speech,anna,,\n", 3, "no such file"),
+        (HEADER + "a" * 5000 + ",speech,anna,,\n", 2, "no such file"),
+        (HEADER + "/dev/zero,speech,anna,,\n", 2, "no such file"),
+        (HEADER + "a.wav,speech,anna,x," + "y" * 301 + "\n", 2, "licence"),
+        (HEADER.encode() + b"a.wav,speech,ann\xe9,,\n", 2, "UTF-8"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(tmp_path, text, line, reason):
+    path = manifest(tmp_path, text)
+    message = refusal(path)
+    assert message.startswith(f"{path}: " if line is None else f"{path}:{line}: ")
+    assert reason in message
+    assert message.isprintable()
+
+
+def test_a_missing_manifest_is_named(tmp_path):
+    assert "no such manifest" in refusal(tmp_path / "manifest.csv")
+
+
+def test_a_manifest_beyond_reason_is_refused_unread(tmp_path):
+    path = tmp_path / "manifest.csv"
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)
+    assert "larger than 64 MB" in refusal(path)
+
+
+@given(raw=st.binary(max_size=200))
+def test_any_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw):
+    path = manifest(tmp_path_factory.mktemp("any"), HEADER.encode() + raw)
+    assert refusal(path).isprintable()
+
+
+def test_bathroom_is_water_silence_and_other_activities():
+    bathroom = BUILTIN["bathroom"]
+    assert list(bathroom.classes) == ["silence", "flushing_water", "shower", "tap_water", "other"]
+    assert bathroom.class_of["coughing"] == "other"
+    assert "other_negative" in bathroom.labels
+    assert "other_negative" not in bathroom.class_of
+
+
+def test_general_is_the_nine_classes_of_the_paper():
+    assert list(BUILTIN["general"].classes) == [
+        *("silence", "speech", "music", "phone_ring", "coughing"),
+        *("crying", "yelling", "laughing", "objects_activity"),
+    ]
+
+
+def test_a_scenario_of_ones_own_may_bring_and_ignore_labels(tmp_path):
+    path = tmp_path / "pets.toml"
+    path.write_text('ignore = ["rain"]\n[classes]\ndog = ["bark", "howl"]\nquiet = ["silence"]\n')
+    scenario = load_scenario(str(path))
+    assert scenario.name == "pets"
+    assert scenario.class_of == {"bark": "dog", "howl": "dog", "silence": "quiet"}
+    assert {"rain", "bark", "speech"} <= scenario.labels
+    assert "cat" not in scenario.labels
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "[classes]"),
+        ("classes = 3", "[classes]"),
+        ('[classes]\ndog = ["bark"]', "[classes]"),
+        ('[classes]\ndog = ["bark"]\ncat = ["bark"]', "'bark'"),
+        ('ignore = ["bark"]\n[classes]\ndog = ["bark"]\ncat = ["mew"]', "'bark'"),
+        ('[classes]\n"../dog" = ["bark"]\ncat = ["mew"]', "class name"),
+        ('[classes]\ndog = []\ncat = ["mew"]', "dog"),
+        ('[classes]\ndog = "bark"\ncat = ["mew"]', "dog"),
+        ('[classes]\ndog = [1]\ncat = ["mew"]', "dog"),
+        ('labels = 1\n[classes]\ndog = ["bark"]\ncat = ["mew"]', "'labels'"),
+        ("[classes", "TOML"),
+        (b"\xff\xfe", "TOML"),
+        ("a = " + "[" * 100_000, "TOML"),
+    ],
+)
+def test_a_scenario_that_makes_no_sense_is_refused(tmp_path, text, reason):
+    path = tmp_path / "home.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(DataError) as caught:
+        load_scenario(str(path))
+    assert str(caught.value).startswith(f"{path}: ")
+    assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["kitchen", "nowhere.toml"])
+def test_a_scenario_that_does_not_exist_is_named(name):
+    with pytest.raises(DataError, match=name):
+        load_scenario(name)

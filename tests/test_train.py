@@ -1,0 +1,253 @@
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import soundfile
+from blobs import SOURCES, blobs, ignore_progress
+from typer import Typer
+from typer.testing import CliRunner
+
+from analyzer.dataset import SEGMENTS_PER_GROUP, build_dataset
+from analyzer.errors import DataError
+from analyzer.manifest import Clip, read_manifest
+from analyzer.scenario import BUILTIN, LABELS, Scenario
+from analyzer.train import calibration_error, group_folds, train_model
+from models.classifier import Classifier
+from models.errors import ModelError
+from models.modelfile import load_model
+from recorder.errors import SourceError
+from recorder.features import FeatureExtractor
+from recorder.statistics import RollingStatistics
+from tools.cli.train import train
+
+RATE = 16_000
+TOML = '[classes]\nsilence = ["silence"]\nmusic = ["music"]\nspeech = ["speech"]\n'
+
+
+def sound(label, seconds, seed=0):
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal(int(seconds * RATE))
+    time = np.arange(len(noise)) / RATE
+    if label == "silence":
+        return 1e-5 * noise
+    if label == "music":
+        return 0.1 * np.sin(2 * np.pi * rng.uniform(300, 2000) * time) + 1e-3 * noise
+    return 0.1 * noise * np.sin(2 * np.pi * 3 * time)
+
+
+def write(folder, name, samples):
+    soundfile.write(folder / name, samples, RATE, subtype="FLOAT")
+    return folder / name
+
+
+def clip(folder, label, samples, group="g"):
+    number = len(list(folder.iterdir()))
+    return Clip(write(folder, f"{number}.wav", samples), label, group, "", "")
+
+
+def dataset(*clips):
+    labels = sorted({c.label for c in clips})
+    scenario = Scenario("test", {label: (label,) for label in labels})
+    return build_dataset(clips, scenario, ignore_progress)
+
+
+@pytest.fixture
+def home(tmp_path):
+    """A folder of 36 clips, three labels from four sources each."""
+    rows = [["path", "label", "source_group", "source", "licence"]]
+    for label in ("silence", "music", "speech"):
+        for number in range(12):
+            name = f"{label}_{number}.wav"
+            write(tmp_path, name, sound(label, 3, number))
+            rows.append([name, label, f"{label}_{number % 4}", "made up", "CC0"])
+    with (tmp_path / "manifest.csv").open("w", newline="") as stream:
+        csv.writer(stream).writerows(rows)
+    (tmp_path / "home.toml").write_text(TOML)
+    return tmp_path
+
+
+def run(*arguments):
+    app = Typer()
+    app.command()(train)
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_segments_are_what_the_recorder_would_see(tmp_path):
+    samples = sound("speech", 3).astype(np.float32)
+    data = dataset(clip(tmp_path, "music", sound("music", 3)), clip(tmp_path, "speech", samples))
+    mean, std = RollingStatistics()(FeatureExtractor()(samples.reshape(-1, 800)))
+    expected = np.concatenate([mean, std], axis=1)[[19, 29, 39, 49, 59]]
+    assert np.array_equal(data.statistics[data.target == data.classes.index("speech")], expected)
+    assert data.clip_seconds == (3.0, 3.0)
+
+
+def test_quiet_stretches_of_a_clip_are_not_its_event_but_all_of_silence_is(tmp_path):
+    loud_then_quiet = np.concatenate([sound("speech", 4), 0.05 * sound("speech", 4)])
+    data = dataset(
+        clip(tmp_path, "speech", loud_then_quiet), clip(tmp_path, "silence", loud_then_quiet)
+    )
+    segments = np.bincount(data.target)
+    assert segments[data.classes.index("silence")] == 15
+    assert segments[data.classes.index("speech")] == 8  # 7 in the loud half, 1 across
+
+
+def test_sound_below_the_floor_teaches_nothing(tmp_path):
+    whisper = clip(tmp_path, "speech", 1e-3 * sound("speech", 3))
+    talk = clip(tmp_path, "speech", sound("speech", 3))
+    data = dataset(whisper, talk, clip(tmp_path, "music", sound("music", 3)))
+    assert data.skipped == {"nowhere above -60 dBFS": 1}
+
+
+def test_a_source_gives_at_most_its_share_evenly_spaced(tmp_path):
+    clips = [clip(tmp_path, "speech", sound("speech", 20, seed)) for seed in range(3)]
+    data = dataset(*clips, clip(tmp_path, "music", sound("music", 60), "other"))
+    assert np.bincount(data.target).tolist() == [SEGMENTS_PER_GROUP, SEGMENTS_PER_GROUP]
+    each = [dataset(c, clip(tmp_path, "music", sound("music", 3))) for c in clips]
+    whole = np.concatenate([one.statistics[one.target == 1] for one in each])
+    place = [int(np.flatnonzero((whole == row).all(axis=1))[0]) for row in data.statistics[-24:]]
+    assert (place[0], place[-1]) == (0, len(whole) - 1)
+    assert set(np.diff(place)) <= {3, 4}
+
+
+def test_clips_too_short_and_of_other_labels_are_counted(tmp_path):
+    clips = [
+        clip(tmp_path, "speech", sound("speech", 2)),
+        clip(tmp_path, "speech", sound("speech", 0.99)),
+        clip(tmp_path, "speech", sound("speech", 0.01)),
+        clip(tmp_path, "silence", sound("silence", 1)),
+        clip(tmp_path, "shower", sound("speech", 2)),
+    ]
+    two = Scenario("two", {"speech": ("speech",), "quiet": ("silence",)})
+    data = build_dataset(clips, two, ignore_progress)
+    assert data.skipped == {"label shower is not in the scenario": 1, "shorter than a second": 2}
+    assert [c.label for c in data.clips] == ["speech", "silence"]
+
+
+def test_a_class_nobody_recorded_is_named(tmp_path):
+    clips = [clip(tmp_path, "speech", sound("speech", 2))]
+    with pytest.raises(DataError, match=r"class silence .* labelled silence"):
+        build_dataset(clips, BUILTIN["general"], ignore_progress)
+
+
+def test_a_clip_that_is_no_audio_is_named(tmp_path):
+    (tmp_path / "x.wav").write_text("no sound")
+    with pytest.raises(SourceError, match=r"x\.wav"):
+        dataset(Clip(tmp_path / "x.wav", "speech", "g", "", ""))
+
+
+def test_folds_never_split_a_source_and_test_every_segment_once():
+    data, _ = blobs(4, 30)
+    folds = group_folds(data)
+    assert len(folds) == 5
+    assert sorted(np.concatenate([unseen for _, unseen in folds])) == list(range(120))
+    for seen, unseen in folds:
+        assert not set(data.group[seen]) & set(data.group[unseen])
+        assert set(data.target[seen]) == set(range(4))
+
+
+def with_sources(data, index, count):
+    group = data.group.copy()
+    group[data.target == index] = index * SOURCES + np.arange((data.target == index).sum()) % count
+    return dataclasses.replace(data, group=group)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_class_of_few_sources_means_fewer_folds(count):
+    data, scenario = blobs(3, 30)
+    few = with_sources(data, 1, count)
+    assert len(group_folds(few)) == count
+    assert train_model(few, scenario, ignore_progress).description.metrics.folds == count
+
+
+def test_a_class_of_one_source_is_refused_with_its_name_and_number():
+    data, scenario = blobs(3, 30)
+    with pytest.raises(DataError, match="class class_1 has 1 source group"):
+        train_model(with_sources(data, 1, 1), scenario, ignore_progress)
+
+
+def test_sources_shared_so_that_nothing_is_left_to_learn_from_are_refused():
+    data, scenario = blobs(3, 30)
+    # Two folds of three sources keep two together, and some class has just these two.
+    group = (data.target + np.arange(len(data.target)) % 2) % 3
+    with pytest.raises(DataError, match="no division into folds"):
+        train_model(dataclasses.replace(data, group=group), scenario, ignore_progress)
+
+
+def test_metrics_agree_with_each_other_and_with_the_data():
+    data, scenario = blobs(4, 30, spread=3.0)
+    about = train_model(data, scenario, ignore_progress).description
+    confusion = np.array(about.metrics.confusion)
+    right = np.diag(confusion)
+    f1 = 2 * right / (confusion.sum(axis=0) + confusion.sum(axis=1))
+    assert confusion.sum(axis=1).tolist() == [30] * 4
+    assert 0.3 < about.metrics.macro_f1 < 0.95
+    assert about.metrics.macro_f1 == pytest.approx(f1.mean())
+    assert [m.f1 for m in about.metrics.classes.values()] == pytest.approx(f1.tolist())
+    assert [a.sources for a in about.training_data.classes.values()] == [SOURCES] * 4
+
+
+def test_labels_without_meaning_are_recognised_at_chance():
+    data, scenario = blobs(2, 60)
+    noise = np.random.default_rng(1).standard_normal(data.statistics.shape).astype(np.float32)
+    model = train_model(dataclasses.replace(data, statistics=noise), scenario, ignore_progress)
+    assert model.description.metrics.macro_f1 < 0.62
+
+
+def test_calibration_error_is_the_gap_of_confidence_and_truth():
+    sure = np.array([[0.9, 0.1]] * 10)
+    assert calibration_error(sure, np.array([0] * 9 + [1])) == pytest.approx(0.0)
+    assert calibration_error(sure, np.ones(10, np.intp)) == pytest.approx(0.9)
+
+
+def test_the_command_makes_a_model_that_knows_its_sounds(home):
+    output = home / "home.safetensors"
+    result = run("--data", home, "--scenario", home / "home.toml", "--output", output)
+    assert result.exit_code == 0, result.output
+    assert "macro F1 1.000" in result.stdout
+    assert "listening to 36 clips" in result.stderr
+    model = load_model(output)
+    assert model.classes == ("silence", "music", "speech")
+    for label in model.classes:
+        samples = sound(label, 1, seed=99).astype(np.float32)
+        mean, std = RollingStatistics()(FeatureExtractor()(samples.reshape(-1, 800)))
+        window = np.concatenate([mean, std], axis=1)[-1:]
+        best = Classifier(model).probabilities(window).argmax()
+        assert model.classes[best] == label
+
+
+def test_the_same_clips_give_the_same_bytes(home):
+    options = ("--data", home / "manifest.csv", "--scenario", home / "home.toml", "--json")
+    first = run(*options, "--output", home / "a.safetensors")
+    second = run(*options, "--output", home / "b.safetensors")
+    assert (home / "a.safetensors").read_bytes() == (home / "b.safetensors").read_bytes()
+    a, b = json.loads(first.stdout), json.loads(second.stdout)
+    assert a["sha256"] == b["sha256"]
+    assert a["metrics"]["macro_f1"] == 1.0
+    assert a["training_data"]["collections"] == [{"name": "made up", "licence": "CC0", "clips": 36}]
+
+
+def test_an_output_that_exists_is_refused_before_anything_is_read(tmp_path):
+    output = tmp_path / "a.safetensors"
+    output.touch()
+    result = run("--data", tmp_path / "nowhere", "--scenario", "general", "--output", output)
+    assert isinstance(result.exception, ModelError)
+    assert "exists already" in str(result.exception)
+
+
+def test_household_sounds_are_told_apart_across_sources(household):
+    per_group: dict[tuple[str, str], int] = {}
+    labels = ("silence", "coughing", "crying", "yelling", "objects_activity")
+    chosen = []
+    for item in read_manifest(household / "manifest.csv", LABELS):
+        key = (item.label, item.source_group)
+        per_group[key] = per_group.get(key, 0) + 1
+        groups = len({group for label, group in per_group if label == item.label})
+        if item.label in labels and per_group[key] <= 2 and groups <= 30:
+            chosen.append(item)
+    scenario = Scenario("five", {label: (label,) for label in labels})
+    data = build_dataset(chosen, scenario, ignore_progress)
+    metrics = train_model(data, scenario, ignore_progress).description.metrics
+    assert metrics.macro_f1 > 0.65
+    assert metrics.expected_calibration_error < 0.25
