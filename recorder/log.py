@@ -13,8 +13,8 @@ from schemas.messages import NANOSECONDS, encode, header
 from schemas.topics import Topic, topic
 from schemas.writer import Attachment, LogWriter
 
-# From a sound to its messages: a block of frames, the capture's latency, and some leeway.
-_DELAY = 0.4 * NANOSECONDS
+# What may lie between a sound and its messages: a block of frames, and the sound card's delay.
+_DELAY = 0.5 * NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ class RollingLog:
         self.finished: list[Path] = []
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
-        self._flush_nanoseconds = max(int(flush_seconds * NANOSECONDS - _DELAY), FRAME_NANOSECONDS)
+        # Half a frame less, for frames are not exactly 50 ms apart on a clock that is corrected.
+        spare = flush_seconds * NANOSECONDS - _DELAY - FRAME_NANOSECONDS / 2
+        self._flush_nanoseconds = max(int(spare), 0)
         self._sync_seconds = max(sync_seconds - flush_seconds, 0.0)
         self._writer: LogWriter | None = None
         self._last = self._until = 0  # no time lies between: the first record opens a file
@@ -77,11 +79,9 @@ class RollingLog:
                 self._roll(record.log_time)
             elif self._flush_at is not None and record.log_time >= self._flush_at:
                 self.flush()
-            assert self._writer is not None
-            self._writer.write(record.topic, record.log_time, record.data)
-            self._last = record.log_time
-            if self._flush_at is None:
-                self._flush_at = record.log_time + self._flush_nanoseconds
+            self._append(record)
+        if self._flush_at is not None and self._last + FRAME_NANOSECONDS >= self._flush_at:
+            self.flush()
         if time.monotonic() - self._synced >= self._sync_seconds:
             self.sync()
 
@@ -98,9 +98,11 @@ class RollingLog:
             self._writer.sync()
         self._synced = time.monotonic()
 
-    def finish(self) -> None:
-        """Complete the file that is open."""
+    def finish(self, records: Sequence[Record] = ()) -> None:
+        """Append the last records to the file that is open, and complete it."""
         if self._writer is not None:
+            for record in records:
+                self._append(record)
             self.finished.append(self._writer.finish())
             self._writer = None
 
@@ -109,6 +111,13 @@ class RollingLog:
         if self._writer is not None:
             self._writer.abandon()
             self._writer = None
+
+    def _append(self, record: Record) -> None:
+        assert self._writer is not None
+        self._writer.write(record.topic, record.log_time, record.data)
+        self._last = record.log_time
+        if self._flush_at is None:
+            self._flush_at = record.log_time + self._flush_nanoseconds
 
     def _roll(self, stamp: int) -> None:
         self.finish()

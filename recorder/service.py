@@ -118,8 +118,7 @@ def record(settings: Settings, source: Source, stop: Flag) -> Recording:
         for event in source.events(stop):
             _count(recording, event)
             log.write(pipeline.push(event))
-        log.write(pipeline.finish())
-        log.finish()
+        log.finish(pipeline.finish())
     except OSError as error:
         log.abandon()
         raise LogError(
@@ -127,7 +126,7 @@ def record(settings: Settings, source: Source, stop: Flag) -> Recording:
             "is kept and completed at the next start"
         ) from error
     except SourceError:
-        log.finish()
+        log.finish(pipeline.finish())
         raise
     return recording
 

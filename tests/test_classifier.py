@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 from blobs import blobs, ignore_progress
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.pipeline import make_pipeline
@@ -59,6 +59,7 @@ def judged(classifier, rows):
     return np.concatenate([classifier.probabilities(rows), classifier._pairs(rows)], axis=1)
 
 
+@settings(deadline=None)
 @given(
     classes=st.sampled_from([2, 3, 9]),
     cuts=st.sets(st.integers(1, ROWS - 1), max_size=40),

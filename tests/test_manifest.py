@@ -1,5 +1,5 @@
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analyzer.errors import DataError
@@ -78,6 +78,7 @@ def test_a_manifest_beyond_reason_is_refused_unread(tmp_path):
     assert "larger than 64 MB" in refusal(path)
 
 
+@settings(deadline=None)
 @given(raw=st.binary(max_size=200))
 def test_any_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw):
     path = manifest(tmp_path_factory.mktemp("any"), HEADER.encode() + raw)

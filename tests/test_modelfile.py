@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from blobs import blobs, ignore_progress
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
@@ -146,18 +146,21 @@ def test_a_file_too_large_is_refused_before_it_is_parsed(tmp_path):
         load_model(path)
 
 
+@settings(deadline=None)
 @given(length=st.integers(0, len(model_bytes()) - 1))
 def test_a_file_cut_short_anywhere_is_refused(length):
     with TemporaryDirectory() as folder:
         refusal(folder, model_bytes()[:length])
 
 
+@settings(deadline=None)
 @given(data=st.binary(max_size=300))
 def test_random_bytes_are_refused(data):
     with TemporaryDirectory() as folder:
         refusal(folder, data)
 
 
+@settings(deadline=None)
 @given(
     changes=st.lists(
         st.tuples(st.integers(0, len(model_bytes()) - 1), st.integers(1, 255)),

@@ -63,6 +63,7 @@ class Framer:
     def __init__(self) -> None:
         self._next_frame = 0
         self._end: int | None = None  # of the last frame, on CLOCK_MONOTONIC
+        self._last_stamp = 0
         self._end_offset = 0  # of that clock to the time of day, then
         self._reason = ""
         self._rate = float(SAMPLE_RATE)
@@ -83,9 +84,9 @@ class Framer:
         return self._clock.ppm
 
     @property
-    def end(self) -> int:
-        """End of the last frame in nanoseconds of UTC; 0 before the first one."""
-        return 0 if self._end is None else self._end + self._end_offset
+    def last_stamp(self) -> int:
+        """Stamp of the last frame in nanoseconds of UTC; 0 before the first one."""
+        return self._last_stamp
 
     def begin(self, rate: int, wall_offset: int, reason: str) -> None:
         """Start anew with another capture process.
@@ -160,6 +161,7 @@ class Framer:
         self._next_frame += count
         self._end = int(times[-1]) + FRAME_NANOSECONDS
         self._end_offset = self._wall_offset
+        self._last_stamp = int(stamps[-1])
         return [found] if gap is None else [gap, found]
 
     def _times(self, count: int) -> NDArray[np.int64]:
@@ -174,4 +176,4 @@ class Framer:
             return None
         lost = max(round((time - self._end) / FRAME_NANOSECONDS), 1)
         self._next_frame += lost
-        return Gap(self.end, time + self._wall_offset, reason, lost)
+        return Gap(self._end + self._end_offset, time + self._wall_offset, reason, lost)

@@ -179,7 +179,7 @@ class MicrophoneSource:
                 return "the microphone went silent"
             self._watch_clock()
             if blocks:  # its frames' time: now would be ahead of them
-                yield from self._report(self._framer.end)
+                yield from self._report(self._framer.last_stamp)
         return "the recorder was stopped"
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:

@@ -13,6 +13,7 @@ from schemas.errors import HearthlogError
 from tools.cli.devices import devices
 from tools.cli.info import info
 from tools.cli.record import record
+from tools.cli.train import train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (record, devices, info):
+for verb in (record, devices, info, train):
     app.command()(verb)
 
 

@@ -1,0 +1,273 @@
+"""Logs on one time axis: a Rerun recording of labels, probabilities and features.
+
+The only module that knows Rerun, much of which is marked unstable. Writing a recording sends
+nothing: Rerun's usage statistics, and the port it opens to the network, are its viewer's.
+"""
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from analyzer.errors import DataError
+from analyzer.tracks import Rows, Spans, Tracks, read_tracks
+from schemas import messages
+
+APPLICATION = "hearthlog"
+TIMELINE = "time"
+
+_ROWS_AT_ONCE = 72_000  # an hour of frames
+_PROBABILITIES, _LEVEL, _HEAT_MAP = "probabilities", "level", "heat_map"
+_HEAT_COLUMNS = 600
+_HEAT_PERCENTILES = (2, 98)
+_HEAT_MARKER = 6.0
+_QUIETEST = 1e-10  # of a mean square: -100 dB
+# The viewer keeps the range that linked time axes share under this name.
+_SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
+
+_SILENCE, _NOT_HEARD, _BRIGHT = (84, 96, 106), (200, 40, 40), (235, 215, 140)
+_COLOURS = (
+    (66, 135, 214), (240, 150, 55), (87, 172, 89), (214, 84, 92), (150, 111, 201),
+    (164, 120, 96), (226, 128, 190), (190, 190, 70), (60, 190, 200), (245, 205, 90),
+    (120, 200, 150), (200, 100, 60),
+)  # fmt: skip
+_DARK_TO_BRIGHT = np.array(  # through purple and red, as matplotlib's magma
+    [(0, 0, 4), (59, 15, 112), (140, 41, 129), (222, 73, 104), (254, 159, 109), (252, 253, 191)]
+)
+
+Colour = tuple[int, int, int]
+Int64 = NDArray[np.int64]
+Float32 = NDArray[np.float32]
+
+
+def save_timeline(logs: Iterable[Path], output: Path) -> None:
+    """Write what some logs hold into one Rerun recording (`.rrd`).
+
+    On the timeline `time` (UTC) it has, under the name of each topic: labels, segments and gaps
+    as lanes of states, the probabilities of all classes, the energy in dB, and a heat map of all
+    features; and a blueprint that shows them on one linked time axis.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    output : Path
+        Must not exist.
+
+    Raises
+    ------
+    LogError
+        If one of the logs cannot be read.
+    DataError
+        If there is nothing to show, or the recording cannot be written.
+    """
+    check_output(output)
+    tracks = read_tracks(logs)
+    start, end = tracks.range
+    if start == end:
+        raise DataError("no features, labels, segments or gaps in these logs: nothing to show")
+    temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
+    try:
+        _write(tracks, temporary)
+        output.hardlink_to(temporary)  # unlike a rename, never over another file
+    except OSError as error:
+        raise DataError(f"{output}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_output(output: Path) -> None:
+    """Raise DataError unless a recording can be saved under this name."""
+    if output.suffix != ".rrd":
+        raise DataError(f"{output}: the name of a Rerun recording must end in .rrd")
+    if os.path.lexists(output):
+        raise DataError(f"{output}: exists already; choose another name, or delete it first")
+    if not output.parent.is_dir():
+        raise DataError(f"{output}: there is no folder {output.parent}; create it first")
+    if not os.access(output.parent, os.W_OK):
+        raise DataError(f"{output}: the folder cannot be written to")
+
+
+def _write(tracks: Tracks, path: Path) -> None:
+    rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+    start, end = tracks.range
+    recording = rr.RecordingStream(APPLICATION)
+    recording.save(path, default_blueprint=_Blueprint(_layout(tracks), start, end))
+    recording.send_recording_name(f"{_time(start):.16} to {_time(end):.16}")
+    colours = _colours(tracks)
+    for topic, rows in tracks.rows[messages.LABEL].items():
+        _log_states(recording, topic, *_label_changes(rows), colours)
+        _log_lines(recording, f"{topic}/{_PROBABILITIES}", rows, colours)
+    for topic, spans in tracks.spans[messages.SEGMENT].items():
+        _log_states(recording, topic, *_span_changes(spans), colours)
+    for topic, spans in tracks.spans[messages.GAP].items():
+        reasons = dict.fromkeys(spans.texts, _NOT_HEARD)
+        _log_states(recording, topic, *_span_changes(spans), reasons)
+    for topic, rows in tracks.rows[messages.FEATURES].items():
+        if "energy" in rows.names:
+            _log_lines(recording, f"{topic}/{_LEVEL}", _level(rows), {"energy": _BRIGHT})
+        _log_heat_map(recording, f"{topic}/{_HEAT_MAP}", rows)
+    recording.flush()
+    recording.disconnect()
+
+
+class _Blueprint(rrb.Blueprint):
+    """A blueprint whose linked time axes begin with a given range, which Rerun has no word for."""
+
+    def __init__(self, layout: rrb.Container, start: int, end: int) -> None:
+        super().__init__(layout, rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+        bounds = [rr.encodings.TimeRangeBoundary.absolute(nanos=time) for time in (start, end)]
+        self._range = rr.encodings.TimeRange(*bounds)
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        super()._log_to_stream(stream)
+        stream.log(_SHARED_AXIS, rrb.TimeAxis(view_range=self._range))
+
+
+def _layout(tracks: Tracks) -> rrb.Vertical:
+    axis = rrb.TimeAxis(link="LinkToGlobal")
+    topics = [*tracks.rows[messages.LABEL], *(t for kind in tracks.spans.values() for t in kind)]
+    views: list[rrb.View] = []
+    shares: list[float] = []
+    if topics:
+        views.append(rrb.StateTimelineView(contents=topics, name="What was heard", time_view=axis))
+        shares.append(0.5 + 0.5 * len(topics))
+    for topic in tracks.rows[messages.LABEL]:
+        entity = f"{topic}/{_PROBABILITIES}"
+        scale = rrb.ScalarAxis(range=(0.0, 1.0))
+        name = f"Probability of each class ({topic})"
+        views.append(rrb.TimeSeriesView(origin=entity, name=name, axis_x=axis, axis_y=scale))
+        shares.append(3)
+    for topic, rows in tracks.rows[messages.FEATURES].items():
+        if "energy" in rows.names:
+            entity = f"{topic}/{_LEVEL}"
+            name = f"Level in dB of full scale ({topic})"
+            legend = rrb.PlotLegend(visible=False)
+            views.append(
+                rrb.TimeSeriesView(origin=entity, name=name, axis_x=axis, plot_legend=legend)
+            )
+            shares.append(1.5)
+        entity = f"{topic}/{_HEAT_MAP}"
+        name = f"Features, low (dark) to high (bright): {rows.names[0]} on top, {rows.names[-1]} at the bottom ({topic})"
+        scale = rrb.ScalarAxis(range=(-len(rows.names), 1.0))
+        views.append(
+            rrb.TimeSeriesView(
+                origin=entity,
+                name=name,
+                axis_x=axis,
+                axis_y=scale,
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+        )
+        shares.append(3)
+    return rrb.Vertical(*views, row_shares=shares)
+
+
+def _colours(tracks: Tracks) -> dict[str, Colour]:
+    """Give every label a colour."""
+    names = [name for rows in tracks.rows[messages.LABEL].values() for name in rows.names]
+    names += [text for spans in tracks.spans[messages.SEGMENT].values() for text in spans.texts]
+    colours = cycle(_COLOURS)
+    return {n: _SILENCE if n == "silence" else next(colours) for n in dict.fromkeys(names)}
+
+
+def _label_changes(rows: Rows) -> tuple[Int64, list[str | None]]:
+    """Run-length encode the labels; None is where nothing was labelled."""
+    begins = np.union1d(rows.breaks, np.flatnonzero(np.diff(rows.labels, prepend=-2)))
+    stops = np.append(rows.breaks, len(rows.times)) - 1
+    after = np.append(rows.times[rows.breaks], np.iinfo(np.int64).max)
+    # Of equal times the later row wins, so the ends come first.
+    times = np.concatenate([np.minimum(rows.ends[stops], after), rows.times[begins]])
+    states = [*[None] * len(stops), *(rows.names[i] for i in rows.labels[begins])]
+    order = np.argsort(times, kind="stable")
+    return times[order], [states[i] for i in order]
+
+
+def _span_changes(spans: Spans) -> tuple[Int64, list[str | None]]:
+    order = np.argsort(spans.starts, kind="stable")
+    starts, ends = np.array(spans.starts)[order], np.array(spans.ends)[order]
+    ends = np.minimum(ends, np.append(starts[1:], np.iinfo(np.int64).max))
+    states = [*[None] * len(ends), *(spans.texts[i] for i in order)]
+    times = np.concatenate([ends, starts])
+    order = np.argsort(times, kind="stable")
+    return times[order], [states[i] for i in order]
+
+
+def _log_states(
+    recording: rr.RecordingStream,
+    entity: str,
+    times: Int64,
+    states: list[str | None],
+    colours: Mapping[str, Colour],
+) -> None:
+    about = rr.StateConfiguration(
+        values=list(colours), labels=list(colours), colors=list(colours.values())
+    )
+    recording.log(entity, about, static=True)
+    column = rr.StateChange.columns(state=pa.array(states, pa.string()))
+    recording.send_columns(entity, [_time_column(times)], column)
+
+
+def _log_lines(
+    recording: rr.RecordingStream, entity: str, rows: Rows, colours: Mapping[str, Colour]
+) -> None:
+    about = rr.SeriesLines(
+        names=rows.names,
+        colors=[colours[name] for name in rows.names],
+        aggregation_policy="average",
+    )
+    recording.log(entity, about, static=True)
+    width = len(rows.names)
+    # A row of NaN ends the lines where frames are missing.
+    times = np.insert(rows.times, rows.breaks, rows.ends[rows.breaks - 1])
+    values = np.insert(rows.values, rows.breaks, np.nan, axis=0)
+    for start in range(0, len(times), _ROWS_AT_ONCE):
+        part = values[start : start + _ROWS_AT_ONCE]
+        column = rr.Scalars.columns(scalars=part.reshape(-1)).partition([width] * len(part))
+        recording.send_columns(entity, [_time_column(times[start : start + len(part)])], column)
+
+
+def _level(rows: Rows) -> Rows:
+    energy = rows.values[:, [rows.names.index("energy")]]
+    return replace(
+        rows, names=("energy",), values=10.0 * np.log10(np.maximum(energy, _QUIETEST))
+    )
+
+
+def _log_heat_map(recording: rr.RecordingStream, entity: str, rows: Rows) -> None:
+    """Log a mean of each feature over a share of the time, as squares of its colour."""
+    count = len(rows.names)
+    share = (rows.times - rows.times[0]) / max(rows.times[-1] - rows.times[0], 1)
+    first = np.unique((share * _HEAT_COLUMNS).astype(np.int64), return_index=True)[1]
+    size = np.diff(first, append=len(share))
+    means = np.add.reduceat(np.nan_to_num(rows.values), first) / size[:, np.newaxis]
+    middle = rows.times[first + size // 2]
+    low, high = np.percentile(means, _HEAT_PERCENTILES, axis=0)
+    shade = np.clip((means - low) / np.maximum(high - low, np.finfo(np.float32).tiny), 0.0, 1.0)
+    grid = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
+    colours = np.stack([np.interp(shade, grid, c) for c in _DARK_TO_BRIGHT.T], axis=-1)
+    about = rr.SeriesPoints(
+        names=rows.names, markers=["square"] * count, marker_sizes=[_HEAT_MARKER] * count
+    )
+    recording.log(entity, about, static=True)
+    heights = np.tile(-np.arange(count, dtype=np.float64), len(means))
+    pixels = colours.round().astype(np.uint8).reshape(-1, 3)
+    columns = [
+        *rr.Scalars.columns(scalars=heights).partition([count] * len(means)),
+        *rr.SeriesPoints.columns(colors=pixels).partition([count] * len(means)),
+    ]
+    recording.send_columns(entity, [_time_column(middle)], columns)
+
+
+def _time_column(times: Int64) -> rr.TimeColumn:
+    return rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))
+
+
+def _time(stamp: int) -> str:
+    return str(np.datetime64(stamp, "ns"))
