@@ -24,6 +24,8 @@ APPLICATION = "hearthlog"
 TIMELINE = "time"
 
 _ROWS_AT_ONCE = 72_000  # an hour of frames
+_ENERGY = "energy"
+_LANE_HEIGHT, _PLOT_HEIGHT = 0.7, 3.0
 _PROBABILITIES, _LEVEL, _HEAT_MAP = "probabilities", "level", "heat_map"
 _HEAT_COLUMNS = 600
 _HEAT_PERCENTILES = (2, 98)
@@ -110,8 +112,8 @@ def _write(tracks: Tracks, path: Path) -> None:
         reasons = dict.fromkeys(spans.texts, _NOT_HEARD)
         _log_states(recording, topic, *_span_changes(spans), reasons)
     for topic, rows in tracks.rows[messages.FEATURES].items():
-        if "energy" in rows.names:
-            _log_lines(recording, f"{topic}/{_LEVEL}", _level(rows), {"energy": _BRIGHT})
+        if _ENERGY in rows.names:
+            _log_lines(recording, f"{topic}/{_LEVEL}", _level(rows), {_ENERGY: _BRIGHT})
         _log_heat_map(recording, f"{topic}/{_HEAT_MAP}", rows)
     recording.flush()
     recording.disconnect()
@@ -121,7 +123,8 @@ class _Blueprint(rrb.Blueprint):
     """A blueprint whose linked time axes begin with a given range, which Rerun has no word for."""
 
     def __init__(self, layout: rrb.Container, start: int, end: int) -> None:
-        super().__init__(layout, rrb.TimePanel(timeline=TIMELINE), collapse_panels=True)
+        panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="paused")
+        super().__init__(layout, panel, collapse_panels=True)
         bounds = [rr.encodings.TimeRangeBoundary.absolute(nanos=time) for time in (start, end)]
         self._range = rr.encodings.TimeRange(*bounds)
 
@@ -131,42 +134,40 @@ class _Blueprint(rrb.Blueprint):
 
 
 def _layout(tracks: Tracks) -> rrb.Vertical:
+    """Show everything, one above the other."""
     axis = rrb.TimeAxis(link="LinkToGlobal")
-    topics = [*tracks.rows[messages.LABEL], *(t for kind in tracks.spans.values() for t in kind)]
-    views: list[rrb.View] = []
-    shares: list[float] = []
-    if topics:
-        views.append(rrb.StateTimelineView(contents=topics, name="What was heard", time_view=axis))
-        shares.append(0.5 + 0.5 * len(topics))
+    lanes = [*tracks.rows[messages.LABEL], *(t for topics in tracks.spans.values() for t in topics)]
+    views = [(_LANE_HEIGHT * (1 + len(lanes)), _lanes(lanes, axis))] if lanes else []
     for topic in tracks.rows[messages.LABEL]:
-        entity = f"{topic}/{_PROBABILITIES}"
-        scale = rrb.ScalarAxis(range=(0.0, 1.0))
-        name = f"Probability of each class ({topic})"
-        views.append(rrb.TimeSeriesView(origin=entity, name=name, axis_x=axis, axis_y=scale))
-        shares.append(3)
+        name = f"{topic}: probability of each class"
+        views.append((_PLOT_HEIGHT, _plot(f"{topic}/{_PROBABILITIES}", name, axis, (0.0, 1.0))))
     for topic, rows in tracks.rows[messages.FEATURES].items():
-        if "energy" in rows.names:
-            entity = f"{topic}/{_LEVEL}"
-            name = f"Level in dB of full scale ({topic})"
-            legend = rrb.PlotLegend(visible=False)
-            views.append(
-                rrb.TimeSeriesView(origin=entity, name=name, axis_x=axis, plot_legend=legend)
-            )
-            shares.append(1.5)
-        entity = f"{topic}/{_HEAT_MAP}"
-        name = f"Features, low (dark) to high (bright): {rows.names[0]} on top, {rows.names[-1]} at the bottom ({topic})"
-        scale = rrb.ScalarAxis(range=(-len(rows.names), 1.0))
-        views.append(
-            rrb.TimeSeriesView(
-                origin=entity,
-                name=name,
-                axis_x=axis,
-                axis_y=scale,
-                plot_legend=rrb.PlotLegend(visible=False),
-            )
-        )
-        shares.append(3)
-    return rrb.Vertical(*views, row_shares=shares)
+        if _ENERGY in rows.names:
+            name = f"{topic}: level in dB"
+            views.append((_PLOT_HEIGHT / 2, _plot(f"{topic}/{_LEVEL}", name, axis)))
+        first, last, bottom = rows.names[0], rows.names[-1], len(rows.names) - 0.5
+        name = f"{topic}: {first} (top) to {last} (bottom), from low (dark) to high (bright)"
+        plot = _plot(f"{topic}/{_HEAT_MAP}", name, axis, (bottom, -0.5))
+        views.append((_PLOT_HEIGHT, plot))
+    return rrb.Vertical(*(v for _, v in views), row_shares=[height for height, _ in views])
+
+
+def _lanes(topics: list[str], axis: rrb.TimeAxis) -> rrb.View:
+    return rrb.StateTimelineView(contents=topics, name="labels and segments", time_view=axis)
+
+
+def _plot(
+    entity: str, name: str, axis: rrb.TimeAxis, scale: tuple[float, float] | None = None
+) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin=entity,
+        name=name,
+        axis_x=axis,
+        axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
+        plot_legend=rrb.PlotLegend(
+            "LeftTop", visible=entity.endswith(_PROBABILITIES)
+        ),
+    )
 
 
 def _colours(tracks: Tracks) -> dict[str, Colour]:
@@ -234,9 +235,9 @@ def _log_lines(
 
 
 def _level(rows: Rows) -> Rows:
-    energy = rows.values[:, [rows.names.index("energy")]]
+    energy = rows.values[:, [rows.names.index(_ENERGY)]]
     return replace(
-        rows, names=("energy",), values=10.0 * np.log10(np.maximum(energy, _QUIETEST))
+        rows, names=(_ENERGY,), values=10.0 * np.log10(np.maximum(energy, _QUIETEST))
     )
 
 
@@ -256,7 +257,7 @@ def _log_heat_map(recording: rr.RecordingStream, entity: str, rows: Rows) -> Non
         names=rows.names, markers=["square"] * count, marker_sizes=[_HEAT_MARKER] * count
     )
     recording.log(entity, about, static=True)
-    heights = np.tile(-np.arange(count, dtype=np.float64), len(means))
+    heights = np.tile(np.arange(count, dtype=np.float64), len(means))
     pixels = colours.round().astype(np.uint8).reshape(-1, 3)
     columns = [
         *rr.Scalars.columns(scalars=heights).partition([count] * len(means)),

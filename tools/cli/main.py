@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from schemas.errors import HearthlogError
+from tools.cli.demo import demo
 from tools.cli.devices import devices
 from tools.cli.info import info
 from tools.cli.record import record
@@ -21,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (record, devices, info, train):
+for verb in (record, devices, info, train, demo):
     app.command()(verb)
 
 

@@ -63,7 +63,7 @@ def record(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     if files:
-        begin = _start_time(start, files[0])
+        begin = start_time(start, files[0])
         recording = record_files(settings, files, begin, stop, realtime=realtime)
     elif start is not None or realtime:
         raise typer.BadParameter("--start and --realtime go with files")
@@ -82,8 +82,8 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in options.items() if value is not None}
 
 
-def _start_time(text: str | None, file: Path) -> int:
-    """Return nanoseconds of UTC."""
+def start_time(text: str | None, file: Path) -> int:
+    """Read the time of a file's first sample, in nanoseconds of UTC."""
     if text is None:
         return file.stat().st_mtime_ns if file.exists() else 0
     try:
