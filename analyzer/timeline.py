@@ -25,11 +25,12 @@ TIMELINE = "time"
 
 _ROWS_AT_ONCE = 72_000  # an hour of frames
 _ENERGY = "energy"
-_LANE_HEIGHT, _PLOT_HEIGHT = 0.7, 3.0
+_LANES_HEIGHT, _LANE_HEIGHT, _PLOT_HEIGHT = 80, 42, 300  # about pixels, on a screen of 1080
 _PROBABILITIES, _LEVEL, _HEAT_MAP = "probabilities", "level", "heat_map"
-_HEAT_COLUMNS = 600
+_HEAT_COLUMNS = 1000
 _HEAT_PERCENTILES = (2, 98)
-_HEAT_MARKER = 6.0
+_HEAT_WIDTH = 12.0
+_TINY = np.finfo(np.float64).tiny
 _QUIETEST = 1e-10  # of a mean square: -100 dB
 # The viewer keeps the range that linked time axes share under this name.
 _SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
@@ -137,23 +138,24 @@ def _layout(tracks: Tracks) -> rrb.Vertical:
     """Show everything, one above the other."""
     axis = rrb.TimeAxis(link="LinkToGlobal")
     lanes = [*tracks.rows[messages.LABEL], *(t for topics in tracks.spans.values() for t in topics)]
-    views = [(_LANE_HEIGHT * (1 + len(lanes)), _lanes(lanes, axis))] if lanes else []
+    views = [(_LANES_HEIGHT + _LANE_HEIGHT * len(lanes), _lanes(lanes, axis))] if lanes else []
     for topic in tracks.rows[messages.LABEL]:
         name = f"{topic}: probability of each class"
         views.append((_PLOT_HEIGHT, _plot(f"{topic}/{_PROBABILITIES}", name, axis, (0.0, 1.0))))
     for topic, rows in tracks.rows[messages.FEATURES].items():
         if _ENERGY in rows.names:
             name = f"{topic}: level in dB"
-            views.append((_PLOT_HEIGHT / 2, _plot(f"{topic}/{_LEVEL}", name, axis)))
-        first, last, bottom = rows.names[0], rows.names[-1], len(rows.names) - 0.5
-        name = f"{topic}: {first} (top) to {last} (bottom), from low (dark) to high (bright)"
-        plot = _plot(f"{topic}/{_HEAT_MAP}", name, axis, (bottom, -0.5))
+            views.append((_PLOT_HEIGHT // 2, _plot(f"{topic}/{_LEVEL}", name, axis)))
+        top = len(rows.names) - 1
+        ends = f"0 ({rows.names[0]}) to {top} ({rows.names[-1]})"
+        name = f"{topic}: {ends}, each from its low values (dark) to its high ones (bright)"
+        plot = _plot(f"{topic}/{_HEAT_MAP}", name, axis, (-0.5, top + 0.5))
         views.append((_PLOT_HEIGHT, plot))
     return rrb.Vertical(*(v for _, v in views), row_shares=[height for height, _ in views])
 
 
 def _lanes(topics: list[str], axis: rrb.TimeAxis) -> rrb.View:
-    return rrb.StateTimelineView(contents=topics, name="labels and segments", time_view=axis)
+    return rrb.StateTimelineView(contents=topics, name="labels, segments, gaps", time_view=axis)
 
 
 def _plot(
@@ -164,9 +166,7 @@ def _plot(
         name=name,
         axis_x=axis,
         axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
-        plot_legend=rrb.PlotLegend(
-            "LeftTop", visible=entity.endswith(_PROBABILITIES)
-        ),
+        plot_legend=rrb.PlotLegend(visible=entity.endswith(_PROBABILITIES)),
     )
 
 
@@ -235,35 +235,58 @@ def _log_lines(
 
 
 def _level(rows: Rows) -> Rows:
-    energy = rows.values[:, [rows.names.index(_ENERGY)]]
-    return replace(
-        rows, names=(_ENERGY,), values=10.0 * np.log10(np.maximum(energy, _QUIETEST))
-    )
+    energy = np.maximum(rows.values[:, [rows.names.index(_ENERGY)]], np.float32(_QUIETEST))
+    return replace(rows, names=(_ENERGY,), values=np.float32(10.0) * np.log10(energy))
 
 
 def _log_heat_map(recording: rr.RecordingStream, entity: str, rows: Rows) -> None:
-    """Log a mean of each feature over a share of the time, as squares of its colour."""
+    """Log the mean of each feature over every share of the time, as the colour of a thick line."""
     count = len(rows.names)
-    share = (rows.times - rows.times[0]) / max(rows.times[-1] - rows.times[0], 1)
-    first = np.unique((share * _HEAT_COLUMNS).astype(np.int64), return_index=True)[1]
-    size = np.diff(first, append=len(share))
-    means = np.add.reduceat(np.nan_to_num(rows.values), first) / size[:, np.newaxis]
-    middle = rows.times[first + size // 2]
+    first, means = _means(rows)
     low, high = np.percentile(means, _HEAT_PERCENTILES, axis=0)
-    shade = np.clip((means - low) / np.maximum(high - low, np.finfo(np.float32).tiny), 0.0, 1.0)
+    shade = np.clip((means - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
     grid = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
-    colours = np.stack([np.interp(shade, grid, c) for c in _DARK_TO_BRIGHT.T], axis=-1)
-    about = rr.SeriesPoints(
-        names=rows.names, markers=["square"] * count, marker_sizes=[_HEAT_MARKER] * count
+    colours = np.stack([np.interp(shade, grid, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
+    heights = np.tile(np.arange(count, dtype=np.float64), (len(first), 1))
+
+    # A row of NaN ends the lines where frames are missing, and where all end.
+    stops = np.append(rows.breaks, len(rows.times))
+    place = np.searchsorted(first, stops)
+    times = np.insert(rows.times[first], place, rows.ends[stops - 1])
+    heights = np.insert(heights, place, np.nan, axis=0).reshape(-1)
+    colours = np.insert(colours, place, colours[place - 1], axis=0)
+
+    about = rr.SeriesLines(
+        names=rows.names,
+        widths=[_HEAT_WIDTH] * count,
+        interpolation_mode="StepAfter",
+        aggregation_policy="off",
     )
     recording.log(entity, about, static=True)
-    heights = np.tile(np.arange(count, dtype=np.float64), len(means))
     pixels = colours.round().astype(np.uint8).reshape(-1, 3)
+    lengths = [count] * len(times)
     columns = [
-        *rr.Scalars.columns(scalars=heights).partition([count] * len(means)),
-        *rr.SeriesPoints.columns(colors=pixels).partition([count] * len(means)),
+        *rr.Scalars.columns(scalars=heights).partition(lengths),
+        *rr.SeriesLines.columns(colors=pixels).partition(lengths),
     ]
-    recording.send_columns(entity, [_time_column(middle)], columns)
+    recording.send_columns(entity, [_time_column(times)], columns)
+
+
+def _means(rows: Rows) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Divide the time into equal shares, and further where frames are missing.
+
+    Returns
+    -------
+    first : np.ndarray [shape=(m,)]
+        Index of the first frame of every share that has frames.
+    means : np.ndarray [shape=(m, k)], float64
+    """
+    span = max(rows.times[-1] - rows.times[0], 1)
+    share = ((rows.times - rows.times[0]) / span * _HEAT_COLUMNS).astype(np.int64)
+    first = np.union1d(np.flatnonzero(np.diff(share, prepend=-1)), rows.breaks)
+    size = np.diff(first, append=len(share))
+    sums = np.add.reduceat(np.nan_to_num(rows.values.astype(np.float64)), first)
+    return first, sums / size[:, np.newaxis]
 
 
 def _time_column(times: Int64) -> rr.TimeColumn:

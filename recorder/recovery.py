@@ -53,25 +53,37 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
 def _recover(active: Path) -> list[Recovered]:
     path = active.with_name(active.name.removesuffix(ACTIVE_SUFFIX) + SUFFIX)
     copy = active.with_name(path.name + ".recovering")
-    with copy.open("wb") as stream:
-        log = _Copy(stream)
-        log.read(active)
-        if log.count:
-            log.finish(path.name)
+    try:
+        with copy.open("wb") as stream:
+            log = _Copy(stream)
+            log.read(active)
+            if log.count:
+                log.finish(path.name)
+            stream.flush()
             os.fsync(stream.fileno())
-    if log.count:
-        _check(copy, log.count)
-        if path.exists():
-            raise LogError(f"{path}: exists beside {active.name}; move one of them away")
-        copy.rename(path)
-    else:
-        copy.unlink()
+        _put_in_place(copy, path, log.count)
+    except OSError as error:
+        copy.unlink(missing_ok=True)
+        what = error.strerror or str(error)
+        raise LogError(f"{active}: cannot be completed ({what}); it is left as it is") from error
     if log.damage or not log.count:
         active.rename(active.with_name(path.name + ".damaged"))
     else:
         active.unlink()
     sync_folder(path.parent)
     return [Recovered(path, log.end, log.damage)] if log.count else []
+
+
+def _put_in_place(copy: Path, path: Path, count: int) -> None:
+    if not count:
+        copy.unlink()
+        return
+    _check(copy, count)
+    if not path.exists():
+        copy.rename(path)
+        return
+    copy.unlink()
+    _check(path, count)  # else an earlier start got as far as this, and no further
 
 
 class _Copy:
@@ -139,7 +151,7 @@ class _Copy:
 def _check(path: Path, expected: int) -> None:
     count = sum(isinstance(record, Message) for record in read_records(path))
     if count != expected:
-        raise LogError(f"{path}: recovered {count} messages of {expected}; the disk may be failing")
+        raise LogError(f"{path}: holds {count} messages of {expected} that were recovered")
 
 
 @contextmanager

@@ -86,7 +86,7 @@ class _AfterKill:
                 start, self._end = self._end, 0
                 now = int(event.stamps[0])
                 lost = max(round((now - start) / FRAME_NANOSECONDS), 0)
-                yield Gap(start, now, "the recorder was killed", lost)
+                yield Gap(start, now, "the recorder was not running", lost)
             yield event
 
 
@@ -121,9 +121,10 @@ def record(settings: Settings, source: Source, stop: Flag) -> Recording:
         log.finish(pipeline.finish())
     except OSError as error:
         log.abandon()
+        kept = "; what was recorded is kept and completed at the next start"
         raise LogError(
-            f"{settings.output}: cannot be written ({error.strerror or error}); what was recorded "
-            "is kept and completed at the next start"
+            f"{settings.output}: cannot be written ({error.strerror or error})"
+            + (kept if recording.frames else "")
         ) from error
     except SourceError:
         log.finish(pipeline.finish())

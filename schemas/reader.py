@@ -46,8 +46,9 @@ def read_records(path: Path) -> Iterator[McapRecord]:
             for record in reader.records:
                 yield from _opened(record)
                 offset = stream.tell()
-        except EndOfFile:
-            return
+        except EndOfFile as error:
+            if offset == 0:
+                raise LogError(f"{path}: is no MCAP file (it ends at once)") from error
         except Exception as error:  # the decompressors raise what they like
             what = str(error) or type(error).__name__
             place = "is no MCAP file" if offset == 0 else f"damaged at byte {offset}"

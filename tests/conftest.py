@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 
+from analyzer.dataset import build_dataset
+from analyzer.manifest import read_manifest
+from analyzer.scenario import load_scenario
+from analyzer.train import train_model
+from models.modelfile import save_model
 from recorder.features import FRAME_SAMPLES
 from recorder.sources.files import read_audio
+from tools.home import write_day, write_training_set
 
 __all__ = ["labmic", "labmic_plugin", "pulse_daemon", "pulse_microphone"]
 
@@ -49,3 +55,23 @@ def hearthlog():
         )
 
     return run
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory) -> Path:
+    """A model of the general scenario, trained on simulated sounds."""
+    folder = tmp_path_factory.mktemp("model")
+    scenario = load_scenario("general")
+    manifest = write_training_set(folder / "clips", clips_per_class=5, seed=11)
+    data = build_dataset(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
+    path = folder / "simulated.safetensors"
+    save_model(train_model(data, scenario, lambda *_: None), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def day(tmp_path_factory) -> Path:
+    """Three minutes of a simulated home, as FLAC."""
+    path = tmp_path_factory.mktemp("day") / "day.flac"
+    write_day(path, minutes=3, seed=12)
+    return path

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from recorder.features import FEATURE_NAMES
 from schemas.files import find_logs
 from schemas.messages import nanoseconds
 from schemas.reader import LogReader
@@ -25,5 +26,5 @@ def features(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (
         np.array([m.frame for m in found], np.int64),
         np.array([nanoseconds(m.header.stamp) for m in found], np.int64),
-        np.array([m.values for m in found], np.float32),
+        np.array([m.values for m in found], np.float32).reshape(-1, len(FEATURE_NAMES)),
     )

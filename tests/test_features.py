@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pyAudioAnalysis import ShortTermFeatures as peer
+from pyAudioAnalysis import ShortTermFeatures
 from scipy.fftpack import fft
 
 from recorder.features import (
@@ -27,13 +27,13 @@ def of_peer(frames):
         spectrum = np.abs(fft(frame))[: FRAME_SAMPLES // 2] / (FRAME_SAMPLES // 2)
         values.append(
             [
-                peer.energy(frame),
-                peer.zero_crossing_rate(frame),
-                peer.energy_entropy(frame),
-                *peer.spectral_centroid_spread(spectrum, RATE),
-                peer.spectral_entropy(spectrum),
-                peer.spectral_flux(spectrum, spectrum if before is None else before),
-                peer.spectral_rolloff(spectrum, 0.90),
+                ShortTermFeatures.energy(frame),
+                ShortTermFeatures.zero_crossing_rate(frame),
+                ShortTermFeatures.energy_entropy(frame),
+                *ShortTermFeatures.spectral_centroid_spread(spectrum, RATE),
+                ShortTermFeatures.spectral_entropy(spectrum),
+                ShortTermFeatures.spectral_flux(spectrum, spectrum if before is None else before),
+                ShortTermFeatures.spectral_rolloff(spectrum, 0.90),
             ]
         )
         before = spectrum

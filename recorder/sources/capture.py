@@ -40,17 +40,22 @@ class Format:
 
 
 def main() -> None:
-    """Capture from the device named by the first argument until killed or left alone."""
+    """Capture from the device named by the argument until killed or left alone.
+
+    Without an argument, list the devices.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # the sound libraries print as they like
     try:
         sounddevice = load_portaudio()
-        device = find_device(list_devices(sounddevice), sys.argv[1])
-        _capture(sounddevice, device, output)
+        devices = list_devices(sounddevice)
+        if len(sys.argv) == 1:
+            output.write(json.dumps([asdict(device) for device in devices]).encode())
+        else:
+            _capture(sounddevice, find_device(devices, sys.argv[1]), output)
     except SourceError as error:
         output.write(json.dumps({"error": str(error)}).encode() + b"\n")
-        sys.exit(1)
     except BrokenPipeError:
         pass
     # A stream of a device that is gone never closes.

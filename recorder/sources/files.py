@@ -1,6 +1,7 @@
 """Audio files as one stream of samples at 16 kHz, mono."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +31,26 @@ def read_audio(path: Path) -> Iterator[Float32]:
     Raises
     ------
     SourceError
-        If the file is missing, is no audio, or ends in the middle of its data.
+        If the file is missing, or is no audio.
     """
+    with _opened(path) as audio:
+        yield from _resampled(_mono_blocks(audio), audio.samplerate)
+
+
+def check_audio(path: Path) -> None:
+    """Look whether a file can be read as audio.
+
+    Raises
+    ------
+    SourceError
+        If not.
+    """
+    with _opened(path):
+        pass
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
     try:
@@ -41,7 +60,7 @@ def read_audio(path: Path) -> Iterator[Float32]:
                 raise SourceError(message)
             if audio.frames == 0:
                 raise SourceError(f"{path}: holds no audio")
-            yield from _resampled(_mono_blocks(audio), audio.samplerate)
+            yield audio
     except soundfile.LibsndfileError as error:
         reason = error.error_string.rstrip(".")
         raise SourceError(f"{path}: cannot be read as audio ({reason})") from error

@@ -16,10 +16,14 @@ import numpy as np
 
 from recorder.errors import SourceError
 from recorder.sources.capture import BLOCK, Format
+from recorder.sources.devices import Device
 from recorder.sources.framing import Block, Framer
 from recorder.stream import Event, Frames, Gap, Health
 from schemas.messages import NANOSECONDS
 
+_CAPTURE = [sys.executable, "-m", "recorder.sources.capture"]
+_HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
+_CRASHES = "PortAudio crashed: check ALSA's configuration"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: what the recorder may be late by
 _START_SECONDS = 10.0
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
@@ -33,6 +37,32 @@ _STEP_SECONDS = 0.25
 _INPUT_OVERFLOW = 2  # paInputOverflow
 
 OK, WARNING, ERROR = 0, 1, 2  # of diagnostic_msgs
+
+
+def query_devices() -> list[Device]:
+    """List the microphones.
+
+    Raises
+    ------
+    SourceError
+        If PortAudio is missing, cannot start, hangs or crashes.
+    """
+    try:
+        answer = subprocess.run(  # noqa: S603  our own module
+            _CAPTURE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_START_SECONDS,
+            check=False,
+        ).stdout
+    except subprocess.TimeoutExpired as error:
+        raise SourceError(_HANGS) from error
+    if not answer:
+        raise SourceError(_CRASHES)
+    found = json.loads(answer)
+    if "error" in found:
+        raise SourceError(found["error"])
+    return [Device(**device) for device in found]
 
 
 class CaptureProcess:
@@ -51,7 +81,7 @@ class CaptureProcess:
 
     def __init__(self, device: str) -> None:
         self._process = subprocess.Popen(  # noqa: S603  our own module
-            [sys.executable, "-m", "recorder.sources.capture", device],
+            [*_CAPTURE, device],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,
@@ -96,10 +126,10 @@ class CaptureProcess:
         deadline = time.monotonic() + _START_SECONDS
         while b"\n" not in self._held:
             if not self._wait(deadline - time.monotonic()):
-                raise SourceError("the microphone cannot be opened: PortAudio does not answer")
+                raise SourceError(_HANGS)
             data = self._read()
             if not data:
-                raise SourceError("the microphone cannot be opened: PortAudio crashed")
+                raise SourceError(_CRASHES)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)

@@ -8,8 +8,9 @@ from threading import Event as Flag
 import numpy as np
 from numpy.typing import NDArray
 
+from recorder.errors import SourceError
 from recorder.features import FRAME_SAMPLES
-from recorder.sources.files import read_audio
+from recorder.sources.files import check_audio, read_audio
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
 from schemas.messages import NANOSECONDS
 
@@ -31,9 +32,16 @@ class FileSource:
         Time of the first sample in nanoseconds of UTC.
     realtime : bool
         Hand on each frame only when its time has come since the first one.
+
+    Raises
+    ------
+    SourceError
+        If one of the files is missing, or is no audio.
     """
 
     def __init__(self, paths: Sequence[Path], start: int, *, realtime: bool = False) -> None:
+        for path in paths:
+            check_audio(path)
         self.device = " ".join(path.name for path in paths)
         self._paths = paths
         self._start = start
@@ -45,7 +53,7 @@ class FileSource:
         Raises
         ------
         SourceError
-            If a file cannot be read.
+            If a file turns out to be damaged, or if all together are shorter than a frame.
         """
         began = time.monotonic()
         first = 0
@@ -60,6 +68,9 @@ class FileSource:
                 yield Health(int(frames.stamps[0]), 0, "reading", {"device": self.device})
             yield frames
             first += len(samples)
+        if first == 0:
+            files = ", ".join(str(path) for path in self._paths)
+            raise SourceError(f"{files}: shorter than one frame of 50 ms")
 
     def _stamps(self, first: int, count: int) -> NDArray[np.int64]:
         return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS

@@ -11,9 +11,9 @@ def devices(
     *, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
 ) -> None:
     """List the microphones by the names that `hearthlog record --device` takes."""
-    from recorder.sources.devices import list_devices, load_portaudio
+    from recorder.sources.microphone import query_devices
 
-    found = list_devices(load_portaudio())
+    found = query_devices()
     if as_json:
         print(json.dumps([asdict(device) for device in found], indent=2))
         return

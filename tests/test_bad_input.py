@@ -1,0 +1,267 @@
+"""Bad input gets one line that says what is wrong, the right exit status, and loses nothing."""
+
+import shutil
+import subprocess
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from logs import features
+
+from models.modelfile import load_model, save_model
+from schemas.reader import LogReader
+
+
+@pytest.fixture
+def refused(hearthlog):
+    """Run a command that must fail with one line on stderr, and return that line."""
+
+    def run(*arguments, status=1, env=None):
+        result = hearthlog(*arguments, env=env)
+        assert result.returncode == status, result
+        assert result.stdout == ""
+        assert result.stderr.startswith("hearthlog: ")
+        assert result.stderr.count("\n") == 1
+        return result.stderr.removeprefix("hearthlog: ").rstrip()
+
+    return run
+
+
+@pytest.fixture
+def sound(tmp_path):
+    path = tmp_path / "sound.wav"
+    soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 48_000), 16_000)
+    return path
+
+
+@contextmanager
+def small_disk(folder, size="1m"):
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only root can mount a small disk")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "{}: cannot be read as audio (Format not recognised)"),
+        (b"no sound at all" * 99, "{}: cannot be read as audio (Format not recognised)"),
+        (None, "{}: no such file"),
+    ],
+    ids=["empty", "text", "missing"],
+)
+def test_a_file_that_is_no_audio(refused, tmp_path, content, message):
+    path = tmp_path / "bad.wav"
+    if content is not None:
+        path.write_bytes(content)
+    assert refused("record", path, "-o", tmp_path / "logs") == message.format(path)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_an_audio_file_without_samples(refused, tmp_path):
+    path = tmp_path / "silent.wav"
+    soundfile.write(path, np.empty(0), 16_000)
+    assert refused("record", path, "-o", tmp_path / "logs") == f"{path}: holds no audio"
+
+
+def test_a_bad_second_file_is_refused_before_the_first_is_recorded(refused, day, tmp_path):
+    logs = tmp_path / "logs"
+    assert "no such file" in refused("record", day, tmp_path / "missing.wav", "-o", logs)
+    assert not logs.exists()
+
+
+def test_a_sound_shorter_than_a_second_has_features_and_no_labels(hearthlog, tmp_path, model_file):
+    path = tmp_path / "short.wav"
+    soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 15_999), 16_000)
+    result = hearthlog("record", path, "--model", model_file, "-o", tmp_path / "logs")
+    assert result.returncode == 0
+    (log,) = (tmp_path / "logs").rglob("*.mcap")
+    topics = [item.topic for item in LogReader(log).messages()]
+    assert topics.count("/mic/features") == 19
+    assert "/mic/label" not in topics
+
+
+def test_a_sound_shorter_than_a_frame(refused, tmp_path):
+    path = tmp_path / "click.wav"
+    soundfile.write(path, np.ones(799), 16_000)
+    message = refused("record", path, "-o", tmp_path / "logs")
+    assert message == f"{path}: shorter than one frame of 50 ms"
+
+
+def test_a_file_of_nan_and_infinity_in_8_channels_at_192_khz(hearthlog, tmp_path):
+    samples = np.random.default_rng(0).normal(0, 0.1, (192_000 * 2, 8)).astype(np.float32)
+    samples[1000:1100] = np.nan
+    samples[2000:2100, 3] = np.inf
+    path = tmp_path / "wild.wav"
+    soundfile.write(path, samples, 192_000, subtype="FLOAT")
+    result = hearthlog("record", path, "-o", tmp_path / "logs")
+    assert (result.returncode, result.stderr) == (0, "")
+    _, _, values = features(tmp_path / "logs")
+    assert len(values) in (39, 40)
+    assert np.isfinite(values).all()
+
+
+def test_a_log_that_exists_is_never_overwritten(refused, hearthlog, sound, tmp_path):
+    options = ("record", sound, "-o", tmp_path / "logs", "--start", "2026-03-01T07:00:00")
+    assert hearthlog(*options).returncode == 0
+    (log,) = (tmp_path / "logs").rglob("*.mcap")
+    before = log.read_bytes()
+    expected = f"{log}: exists already; move it away or record into another folder"
+    assert refused(*options) == expected
+    assert log.read_bytes() == before
+
+
+def test_an_output_folder_that_is_a_file(refused, sound, tmp_path):
+    path = tmp_path / "file"
+    path.write_text("mine")
+    assert refused("record", sound, "-o", path) == f"{path}: cannot be written (Not a directory)"
+    assert path.read_text() == "mine"
+
+
+def test_an_output_folder_that_is_read_only(refused, sound, tmp_path):
+    with small_disk(tmp_path / "disk") as disk:
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        expected = f"{disk}: cannot be written (Read-only file system)"
+        assert refused("record", sound, "-o", disk) == expected
+
+
+def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
+    refused, hearthlog, sound, tmp_path
+):
+    long = tmp_path / "long.wav"
+    soundfile.write(long, np.random.default_rng(0).normal(0, 0.1, 16_000 * 300), 16_000)
+    with small_disk(tmp_path / "disk") as disk:
+        message = refused("record", long, "-o", disk)
+        assert message == (
+            f"{disk}: cannot be written (No space left on device); what was recorded is kept and "
+            "completed at the next start"
+        )
+        (left,) = disk.rglob("*.mcap.active")
+        kept = features(left)[0]
+        assert len(kept) > 2000
+        still_full = refused("record", sound, "-o", disk)
+        assert still_full == (
+            f"{left}: cannot be completed (No space left on device); it is left as it is"
+        )
+        assert sorted(path.name for path in left.parent.iterdir()) == [left.name]
+        subprocess.run(["mount", "-o", "remount,size=8m", str(disk)], check=True)
+        start = ("--start", "2030-01-01")
+        assert hearthlog("record", sound, "-o", disk, *start).returncode == 0
+        np.testing.assert_array_equal(features(left.with_suffix(""))[0], kept)
+
+
+def test_a_model_that_is_missing(refused, sound, tmp_path):
+    path = tmp_path / "none.safetensors"
+    assert str(path) in refused("record", sound, "--model", path, "-o", tmp_path / "logs")
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("length", [0, 7, 100, -1])
+def test_a_model_that_is_truncated(refused, sound, model_file, tmp_path, length):
+    path = tmp_path / "cut.safetensors"
+    path.write_bytes(model_file.read_bytes()[:length])
+    assert str(path) in refused("record", sound, "--model", path, "-o", tmp_path / "logs")
+
+
+def test_a_model_of_another_feature_set(refused, sound, model_file, tmp_path):
+    path = tmp_path / "other.safetensors"
+    path.write_bytes(model_file.read_bytes().replace(b"auros21", b"auros99"))
+    message = refused("record", sound, "--model", path, "-o", tmp_path / "logs")
+    assert "auros99" in message
+
+
+def test_no_portaudio(refused, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import ctypes.util\nctypes.util.find_library = lambda name: None\n"
+    )
+    env = {"PYTHONPATH": str(tmp_path)}
+    expected = "PortAudio is missing: install it (Debian: apt install libportaudio2)"
+    assert refused("record", "-o", tmp_path / "logs", env=env) == expected
+    assert refused("devices", env=env) == expected
+
+
+def test_an_alsa_configuration_that_is_missing(refused, tmp_path):
+    env = {"ALSA_CONFIG_PATH": str(tmp_path / "none.conf")}
+    for command in (("record", "-o", tmp_path / "logs"), ("devices",)):
+        assert refused(*command, env=env).startswith("PortAudio c")
+
+
+def test_no_microphone(refused, labmic, tmp_path):
+    Path(labmic.env["ALSA_CONFIG_PATH"]).write_text("</usr/share/alsa/alsa.conf>\n")
+    message = refused("record", "-o", tmp_path / "logs", env=labmic.env)
+    assert message == "no microphone found: connect one and check `hearthlog devices`"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('nodee = "flat"', "unknown key 'nodee'"),
+        ("node = ", "cannot be read as TOML"),
+        ('node = "a/b"', "node: node name 'a/b'"),
+        ('[[microphone]]\nname = "Bad Room"', "microphone.0.name: microphone name 'Bad Room'"),
+        ("[[microphone]]\nnoise = 1", "unknown key 'microphone.0.noise'"),
+        ("flush_seconds = -1", "flush_seconds: Input should be greater"),
+    ],
+)
+def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, words):
+    path = tmp_path / "hearthlog.toml"
+    path.write_text(content)
+    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs")
+    assert words in message
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("record", "--realtime"),
+        ("record", "x.wav", "--start", "yesterday"),
+        ("record", "--what"),
+        ("listen",),
+    ],
+)
+def test_wrong_use_has_exit_status_2(hearthlog, arguments):
+    assert hearthlog(*arguments).returncode == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF", b"\x89MCAP0\r\n"])
+def test_info_of_what_is_no_log(refused, tmp_path, content):
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    assert refused("info", path).startswith(f"{path}: is no MCAP file")
+
+
+def test_info_of_an_empty_folder(refused, tmp_path):
+    assert refused("info", tmp_path) == f"{tmp_path}: no log (*.mcap) in this folder"
+
+
+def test_info_of_a_damaged_log(refused, hearthlog, sound, tmp_path):
+    assert hearthlog("record", sound, "-o", tmp_path / "logs").returncode == 0
+    (log,) = (tmp_path / "logs").rglob("*.mcap")
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    assert refused("info", damaged).startswith(f"{damaged}: damaged at byte ")
+
+
+def test_a_model_is_never_overwritten_by_training(refused, model_file, tmp_path):
+    copy = tmp_path / "mine.safetensors"
+    shutil.copy(model_file, copy)
+    message = refused(
+        "train", "--data", tmp_path / "x.csv", "--scenario", "general", "--output", copy
+    )
+    assert str(copy) in message
+    assert copy.read_bytes() == model_file.read_bytes()
+
+
+def test_a_saved_model_is_read_back_as_it_was(model_file, tmp_path):
+    save_model(load_model(model_file), tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == model_file.read_bytes()

@@ -1,0 +1,227 @@
+"""Audio files become labelled logs: every frame, in order, and the same every time."""
+
+import itertools
+import signal
+import subprocess
+import time
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+from logs import features, read
+
+from models.classifier import Classifier
+from models.modelfile import load_model
+from recorder.features import FRAME_SAMPLES, FeatureExtractor
+from recorder.pipeline import Pipeline
+from recorder.sources.files import read_audio
+from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from schemas.messages import nanoseconds
+from schemas.reader import LogReader
+
+START = int(datetime(2026, 3, 1, 7, tzinfo=UTC).timestamp()) * 1_000_000_000
+
+
+def noise(seconds, seed=1):
+    return np.random.default_rng(seed).normal(0, 0.1, int(seconds * 16_000)).astype(np.float32)
+
+
+def as_frames(samples):
+    return samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+
+
+@pytest.fixture
+def recorded(hearthlog, tmp_path):
+    """Record files, see that it went well, and return the folder."""
+
+    def run(*arguments, env=None):
+        logs = tmp_path / f"logs{len(list(tmp_path.iterdir()))}"
+        result = hearthlog("record", *arguments, "-o", logs, env=env)
+        assert (result.returncode, result.stderr) == (0, "")
+        return logs
+
+    return run
+
+
+def test_a_file_gives_features_and_statistics_at_every_frame_and_labels_after_a_second(
+    day, model_file, recorded
+):
+    logs = recorded(day, "--model", model_file, "--start", "2026-03-01T07:00:00")
+    frames, stamps, values = features(logs)
+    samples = np.concatenate(list(read_audio(day)))
+    np.testing.assert_array_equal(values, FeatureExtractor()(as_frames(samples)))
+    np.testing.assert_array_equal(frames, np.arange(len(values)))
+    np.testing.assert_array_equal(stamps, START + frames * FRAME_NANOSECONDS)
+    assert [m.frame for m in read(logs, "statistics")] == frames.tolist()
+    assert [m.frame for m in read(logs, "label")] == frames[19:].tolist()
+
+
+def test_a_label_is_the_class_of_the_highest_probability(day, model_file, recorded):
+    logs = recorded(day, "--model", model_file)
+    (info,) = read(logs, "info")
+    labels = read(logs, "label")
+    assert len({m.label for m in labels}) > 3
+    for message in labels:
+        best = int(np.argmax(message.probabilities))
+        assert message.label == info.labels[best]
+        assert message.confidence == message.probabilities[best]
+        assert np.isnan(message.novelty)
+        assert message.probabilities.sum() == pytest.approx(1, abs=1e-6)
+
+
+def test_segments_are_the_successive_equal_labels(day, model_file, recorded):
+    logs = recorded(day, "--model", model_file)
+    labels = read(logs, "label")
+    runs = [list(run) for _, run in itertools.groupby(labels, key=lambda m: m.label)]
+    segments = read(logs, "segment")
+    assert [s.label for s in segments] == [run[0].label for run in runs]
+    for segment, run in zip(segments, runs, strict=True):
+        assert nanoseconds(segment.header.stamp) == nanoseconds(run[0].header.stamp)
+        assert nanoseconds(segment.duration) == len(run) * FRAME_NANOSECONDS
+        assert segment.confidence == pytest.approx(np.mean([m.confidence for m in run]), rel=1e-6)
+
+
+def test_the_same_input_gives_the_same_bytes(day, model_file, recorded):
+    options = (day, "--model", model_file, "--start", "2026-03-01T07:59:00")
+    first, second = recorded(*options), recorded(*options, env={"OPENBLAS_NUM_THREADS": "2"})
+    paths = [sorted(folder.rglob("*.mcap")) for folder in (first, second)]
+    assert len(paths[0]) == 2
+    for one, other in zip(*paths, strict=True):
+        assert one.relative_to(first) == other.relative_to(second)
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_files_begin_at_the_full_hour_and_each_says_what_it_is(day, model_file, recorded):
+    logs = recorded(day, "--model", model_file, "--start", "2026-03-01T06:59:00+00:00")
+    early, late = sorted(logs.rglob("*.mcap"))
+    assert early.relative_to(logs).as_posix() == "2026/03/01/home_20260301T065900Z.mcap"
+    assert late.relative_to(logs).as_posix() == "2026/03/01/home_20260301T070000Z.mcap"
+    assert features(early)[1].max() < START
+    assert features(late)[1].min() == START
+    np.testing.assert_array_equal(features(logs)[0], np.arange(3 * 60 * 20))
+    for log in (early, late):
+        reader = LogReader(log)
+        assert next(reader.messages()).topic == "/mic/info"
+        assert reader.metadata["hearthlog"]["model_sha256"] == load_model(model_file).sha256
+        assert set(reader.attachments) == {"configuration.json", "model_card.md"}
+
+
+def test_several_files_in_a_row_are_one_sound(tmp_path, recorded):
+    sound = noise(5.33)
+    for number, part in enumerate(np.split(sound, [7_001, 30_000])):
+        soundfile.write(tmp_path / f"{number}.wav", part, 16_000, subtype="FLOAT")
+    logs = recorded(*(tmp_path / f"{number}.wav" for number in range(3)))
+    np.testing.assert_array_equal(features(logs)[2], FeatureExtractor()(as_frames(sound)))
+
+
+@pytest.mark.parametrize(("rate", "channels"), [(8_000, 1), (44_100, 2), (192_000, 8)])
+def test_any_rate_and_channel_count_is_heard_as_16_khz_mono(tmp_path, recorded, rate, channels):
+    tone = 0.5 * np.sin(2 * np.pi * 1000 * np.arange(3 * rate) / rate)
+    soundfile.write(tmp_path / "tone.wav", np.stack([tone] * channels, axis=1), rate)
+    _, _, values = features(recorded(tmp_path / "tone.wav"))
+    assert len(values) in (59, 60)
+    np.testing.assert_allclose(values[5:-5, 0], 0.125, rtol=1e-3)
+    np.testing.assert_allclose(values[5:-5, 7], 1000 / 8000, atol=1e-6)
+
+
+def test_statistics_can_be_logged_less_often(tmp_path, recorded):
+    soundfile.write(tmp_path / "noise.wav", noise(3), 16_000)
+    logs = recorded(tmp_path / "noise.wav", env={"HEARTHLOG_STATISTICS_EVERY": "7"})
+    assert [m.frame for m in read(logs, "statistics")] == list(range(0, 60, 7))
+
+
+def test_diagnostics_come_at_least_every_ten_seconds(day, recorded):
+    stamps = [nanoseconds(m.header.stamp) for m in read(recorded(day), "diagnostics")]
+    assert len(stamps) == 18
+    assert np.diff(stamps).max() <= 10_000_000_000
+
+
+def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model_file, recorded):
+    logs = recorded(day, "--model", model_file)
+    frames, stamps, values = features(logs)
+    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    again = []
+    for start in range(0, len(frames), 33):
+        block = slice(start, start + 33)
+        again += pipeline.push_features(values[block], int(frames[start]), stamps[block])
+    again += pipeline.finish()
+    (log,) = logs.rglob("*.mcap")
+    for kind in ("statistics", "label", "segment"):
+        topic = f"/mic/{kind}"
+        recorded_bytes = [item.data for item in LogReader(log).messages([topic])]
+        assert [record.data for record in again if record.topic == topic] == recorded_bytes
+
+
+def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_second(model_file):
+    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    frames = as_frames(noise(2))
+    stamps = START + np.arange(40) * FRAME_NANOSECONDS
+    before = pipeline.push(Frames(0, frames, stamps))
+    end = int(stamps[-1]) + FRAME_NANOSECONDS
+    gap = Gap(end, end + 7 * FRAME_NANOSECONDS, "test", 7)
+    closing = pipeline.push(gap)
+    after = pipeline.push(Frames(47, frames, stamps + 47 * FRAME_NANOSECONDS))
+    assert [record.topic for record in closing] == ["/mic/segment", "/mic/gap"]
+    assert [record.log_time for record in closing] == [gap.start, gap.end]
+    labels = [[r for r in records if r.topic == "/mic/label"] for records in (before, after)]
+    assert [len(found) for found in labels] == [21, 21]
+    statistics = [[r.data[20:] for r in x if r.topic == "/mic/statistics"] for x in (before, after)]
+    payload = [[data[12:] for data in found] for found in statistics]
+    assert payload[0] == payload[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_completes_the_log(tmp_path, number):
+    soundfile.write(tmp_path / "noise.wav", noise(60), 16_000)
+    logs = tmp_path / "logs"
+    process = start_realtime(tmp_path / "noise.wav", logs)
+    wait_for_log(logs, 1.5)
+    process.send_signal(number)
+    assert process.wait(timeout=10) == 0
+    (log,) = logs.rglob("*.mcap*")
+    reader = LogReader(log)
+    assert sum(m.topic == "/mic/features" for m in reader.messages()) >= 20
+    assert reader.complete
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.7, 2.9, 4.1])
+def test_killed_at_any_moment_at_most_a_second_is_lost_and_the_next_start_completes_the_log(
+    tmp_path, hearthlog, seconds
+):
+    sound = noise(60)
+    soundfile.write(tmp_path / "noise.wav", sound, 16_000, subtype="FLOAT")
+    logs = tmp_path / "logs"
+    process = start_realtime(tmp_path / "noise.wav", logs)
+    began = wait_for_log(logs, seconds)
+    process.kill()
+    heard = time.time() - began
+    process.wait()
+    (left,) = logs.rglob("*.mcap.active")
+    kept = features(left)[2]
+    assert len(kept) * 0.05 > heard - 1.0
+    content = [(m.topic, m.log_time, m.data) for m in LogReader(left).messages()]
+    other = tmp_path / "other.wav"
+    soundfile.write(other, noise(2), 16_000)
+    assert hearthlog("record", other, "-o", logs, "--start", "2030-01-01").returncode == 0
+    assert not left.exists()
+    reader = LogReader(left.with_suffix(""))
+    assert [(m.topic, m.log_time, m.data) for m in reader.messages()] == content
+    assert reader.complete
+    np.testing.assert_array_equal(kept, FeatureExtractor()(as_frames(sound))[: len(kept)])
+
+
+def start_realtime(file, logs):
+    return subprocess.Popen([*HEARTHLOG, "record", str(file), "-o", str(logs), "--realtime"])
+
+
+def wait_for_log(logs, seconds):
+    """Wait until the log is open, and so many seconds more; return when it was opened."""
+    deadline = time.monotonic() + 20
+    while not list(logs.rglob("*.active")):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    began = time.time()
+    time.sleep(seconds)
+    return began
