@@ -1,5 +1,6 @@
 """Read logs message by message, finished ones, those being written and those cut short."""
 
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,9 +47,12 @@ def read_records(path: Path) -> Iterator[McapRecord]:
             for record in reader.records:
                 yield from _opened(record)
                 offset = stream.tell()
-        except EndOfFile as error:
+        except (EndOfFile, struct.error) as error:
+            # The reader says the latter of a length of which the last bytes are missing.
             if offset == 0:
                 raise LogError(f"{path}: is no MCAP file (it ends at once)") from error
+            if stream.read(1):
+                raise LogError(f"{path}: damaged at byte {offset} ({error})") from error
         except Exception as error:  # the decompressors raise what they like
             what = str(error) or type(error).__name__
             place = "is no MCAP file" if offset == 0 else f"damaged at byte {offset}"

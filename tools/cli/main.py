@@ -14,6 +14,7 @@ from tools.cli.demo import demo
 from tools.cli.devices import devices
 from tools.cli.info import info
 from tools.cli.record import record
+from tools.cli.review import review
 from tools.cli.train import train
 
 app = typer.Typer(
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (record, devices, info, train, demo):
+for verb in (record, devices, info, train, review, demo):
     app.command()(verb)
 
 

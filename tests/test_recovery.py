@@ -1,0 +1,117 @@
+"""What a killed recorder leaves is completed whatever its length, and nothing else is touched."""
+
+import random
+import shutil
+
+import numpy as np
+import pytest
+from logs import features
+
+from recorder.recovery import recover_active
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.errors import LogError
+from schemas.files import active_path
+from schemas.reader import LogReader
+from schemas.topics import topics_of
+from schemas.writer import LogWriter
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory, day, model_file):
+    """A finished log of three minutes."""
+    from threading import Event  # noqa: PLC0415
+
+    from recorder.config import load_settings  # noqa: PLC0415
+    from recorder.service import record_files  # noqa: PLC0415
+
+    folder = tmp_path_factory.mktemp("whole")
+    settings = load_settings(None, {"output": folder, "model": model_file}, {})
+    (path,) = record_files(settings, [day], 10**18, Event(), realtime=False).logs
+    return path
+
+
+def content(path):
+    return [(m.topic, m.log_time, m.data) for m in LogReader(path).messages()]
+
+
+def left_behind(log, folder, data):
+    path = folder / log.name
+    active_path(path).write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_log_cut_anywhere_is_completed_with_all_that_is_whole(log, tmp_path, seed):
+    data = log.read_bytes()
+    length = random.Random(seed).randrange(20_000, len(data))
+    path = left_behind(log, tmp_path, data[:length])
+    kept = content(active_path(path))
+    (recovered,) = recover_active(tmp_path, "home")
+    assert recovered.path == path
+    assert recovered.end == features(path)[1][-1] + FRAME_NANOSECONDS
+    assert content(path) == kept == content(log)[: len(kept)]
+    reader = LogReader(path)
+    list(reader.messages())
+    assert reader.complete
+    assert set(reader.metadata) >= {"hearthlog", "rosbag2"}
+    assert set(reader.attachments) == {"configuration.json", "model_card.md"}
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("length", [0, 3, 60, 700])
+def test_a_log_without_a_message_is_kept_under_another_name(log, tmp_path, length):
+    path = left_behind(log, tmp_path, log.read_bytes()[:length])
+    assert recover_active(tmp_path, "home") == []
+    assert [p.name for p in tmp_path.iterdir()] == [path.name + ".damaged"]
+
+
+def test_of_a_damaged_log_the_whole_chunks_are_recovered_and_the_original_kept(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0x55
+    path = left_behind(log, tmp_path, data)
+    (recovered,) = recover_active(tmp_path, "home")
+    assert "damaged at byte" in recovered.damage
+    kept = content(path)
+    assert kept == content(log)[: len(kept)]
+    assert len(kept) > 1000
+    assert path.with_name(path.name + ".damaged").read_bytes() == bytes(data)
+
+
+def test_a_recovery_that_was_itself_cut_short_is_done_again(log, tmp_path):
+    path = left_behind(log, tmp_path, log.read_bytes()[:90_000])
+    path.with_name(path.name + ".recovering").write_bytes(b"half of it")
+    assert len(recover_active(tmp_path, "home")) == 1
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_recovery_that_only_lacked_its_last_step_is_ended(log, tmp_path):
+    path = left_behind(log, tmp_path, log.read_bytes()[:90_000])
+    shutil.copy(active_path(path), tmp_path / "again")
+    recover_active(tmp_path, "home")
+    done = path.read_bytes()
+    (tmp_path / "again").rename(active_path(path))
+    recover_active(tmp_path, "home")
+    assert path.read_bytes() == done
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_log_that_was_finished_under_the_same_name_is_not_overwritten(log, tmp_path):
+    path = left_behind(log, tmp_path, log.read_bytes()[:90_000])
+    path.write_bytes(log.read_bytes())
+    with pytest.raises(LogError, match="of"):
+        recover_active(tmp_path, "home")
+    assert path.read_bytes() == log.read_bytes()
+    assert active_path(path).exists()
+
+
+def test_a_log_that_is_being_written_is_left_alone(tmp_path):
+    writer = LogWriter(tmp_path / "home_20260301T000000Z.mcap", topics_of("mic", ["a"], None), {})
+    assert recover_active(tmp_path, "home") == []
+    assert writer.finish().exists()
+
+
+def test_logs_of_other_nodes_are_left_alone(log, tmp_path):
+    path = left_behind(log, tmp_path, log.read_bytes()[:90_000])
+    assert recover_active(tmp_path, "kitchen") == []
+    assert active_path(path).exists()
+    assert np.size(features(active_path(path))[0]) > 0
