@@ -1,0 +1,109 @@
+"""Features of sound: ours, and those of the libraries of the field."""
+
+from collections.abc import Callable
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from tools.bench.table import Row, Table, Target
+from tools.bench.timing import best_of
+from tools.bench.workload import Workload
+
+_SECONDS = 120.0
+_REPEATS = 5
+_SINGLE_FRAMES = 2000
+_FAST = Target(10_000)
+_FASTER_THAN_THE_PAPERS_LIBRARY = Target(50)
+
+Float32 = NDArray[np.float32]
+Peer = Callable[[Float32], Callable[[], object]]
+
+
+def measure(work: Workload) -> Table:
+    """Measure ours and theirs on the same samples."""
+    frames = work.frames(_SECONDS)
+    single = frames[:_SINGLE_FRAMES]
+    seconds = frames.size / SAMPLE_RATE
+    runs = {
+        "all": lambda: FeatureExtractor()(frames),
+        "200": lambda: _in_blocks(frames, 200),
+        "10": lambda: _in_blocks(frames, 10),
+        "1": lambda: _in_blocks(single, 1),
+    }
+    missing: dict[str, str] = {}
+    for name, (_, _, prepare) in _PEERS.items():
+        try:
+            runs[name] = prepare(frames.ravel())
+        except ImportError as error:
+            missing[name] = f"not installed ({error})"
+    best = best_of(runs, _REPEATS)
+    speed = {name: seconds / best[name] for name in best if name != "1"}
+    unit = "x real time"
+    rows = [
+        Row("hearthlog, 21 values, in one call", speed["all"], unit, target=_FAST),
+        Row("hearthlog, 200 frames a call", speed["200"], unit, note="as from a file"),
+        Row("hearthlog, 10 frames a call", speed["10"], unit, note="as from a microphone"),
+        Row("hearthlog, frame by frame", 1e6 * best["1"] / len(single), "us a frame"),
+    ]
+    for name, (what, target, _) in _PEERS.items():
+        if name in missing:
+            rows.append(Row(name, None, target=target, note=missing[name]))
+        else:
+            title = f"{name} {version(name)}"
+            ratio = speed["all"] / speed[name]
+            rows.append(Row(title, speed[name], unit, ratio, target, what))
+    return Table(f"features: {seconds:.0f} s of sound, CPU time", rows)
+
+
+def _in_blocks(frames: Float32, size: int) -> None:
+    extract = FeatureExtractor()
+    for start in range(0, len(frames), size):
+        extract(frames[start : start + size])
+
+
+def _pyaudioanalysis(samples: Float32) -> Callable[[], object]:
+    from pyAudioAnalysis import ShortTermFeatures  # noqa: PLC0415  a peer may be missing
+
+    return lambda: ShortTermFeatures.feature_extraction(
+        samples, SAMPLE_RATE, FRAME_SAMPLES, FRAME_SAMPLES
+    )
+
+
+def _librosa(samples: Float32) -> Callable[[], object]:
+    import librosa  # noqa: PLC0415  a peer may be missing
+
+    steps = {"hop_length": FRAME_SAMPLES, "center": False}
+    feature = librosa.feature
+
+    def run() -> None:
+        spectrum = np.abs(librosa.stft(samples, n_fft=FRAME_SAMPLES, **steps))
+        mel = feature.melspectrogram(S=spectrum**2, sr=SAMPLE_RATE, n_mels=32)
+        feature.mfcc(S=librosa.power_to_db(mel), n_mfcc=13)
+        feature.spectral_centroid(S=spectrum, sr=SAMPLE_RATE)
+        feature.spectral_rolloff(S=spectrum, sr=SAMPLE_RATE, roll_percent=0.9)
+        feature.zero_crossing_rate(samples, frame_length=FRAME_SAMPLES, **steps)
+
+    run()  # it imports its parts, and compiles some, when they are first used
+    return run
+
+
+def _opensmile(samples: Float32) -> Callable[[], object]:
+    import opensmile  # noqa: PLC0415  a peer may be missing
+
+    smile = opensmile.Smile(
+        opensmile.FeatureSet.eGeMAPSv02, opensmile.FeatureLevel.LowLevelDescriptors
+    )
+    return lambda: smile.process_signal(samples, SAMPLE_RATE)
+
+
+_PEERS: dict[str, tuple[str, Target | None, Peer]] = {
+    "pyAudioAnalysis": (
+        "34 values a frame, among them the 21",
+        _FASTER_THAN_THE_PAPERS_LIBRARY,
+        _pyaudioanalysis,
+    ),
+    "librosa": ("16 of the 21 from one spectrum: computes less", None, _librosa),
+    "opensmile": ("eGeMAPS: 25 other values every 10 ms", None, _opensmile),
+}

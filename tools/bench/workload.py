@@ -1,0 +1,144 @@
+"""The sound and the model that the measurements share; each is made when first asked for."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import soundfile
+from numpy.typing import NDArray
+
+from analyzer.dataset import Dataset, build_dataset
+from analyzer.manifest import read_manifest
+from analyzer.scenario import BUILTIN, Scenario
+from analyzer.train import train_model
+from models.modelfile import Model, save_model
+from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from recorder.sources.files import read_audio
+from tools.bench.timing import BenchError
+from tools.home import write_day, write_training_set
+from tools.sounds import LABELS
+
+_MOST_SECONDS = 3600
+_SEED = 1
+# Simulated sounds hardly overlap, and would need a third of the support vectors that real ones do.
+_OVERLAP = 0.5  # standard deviations
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass
+class Workload:
+    """What is measured.
+
+    Parameters
+    ----------
+    folder : Path
+        An empty one, for files on the way.
+    audio : Path or None
+        Folder of recordings to use instead of the simulated home; with a `manifest.csv` in it the
+        model is trained from them too.
+    minutes : float
+        Length of the simulated day.
+    clips_per_class : int
+        Size of the simulated training set.
+    """
+
+    folder: Path
+    audio: Path | None = None
+    minutes: float = 60.0
+    clips_per_class: int = 40
+
+    @cached_property
+    def samples(self) -> NDArray[np.int16]:
+        """Up to an hour of sound at 16 kHz, mono, in whole frames.
+
+        Raises
+        ------
+        BenchError
+            If there is less than a second of it.
+        SourceError
+            If a recording cannot be read.
+        """
+        if self.audio is None:
+            day = self.folder / "day.flac"
+            write_day(day, self.minutes, _SEED + 1)
+            samples, _ = soundfile.read(day, dtype="int16")
+        else:
+            samples = _recordings(self.audio)
+        return samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES]
+
+    @property
+    def seconds(self) -> float:
+        """Length of the sound."""
+        return len(self.samples) / SAMPLE_RATE
+
+    def frames(self, seconds: float) -> Float32:
+        """Return the first seconds as frames of shape (n, 800) in full scale."""
+        chosen = self.samples[: round(seconds * SAMPLE_RATE)]
+        return (chosen / np.float32(32768)).reshape(-1, FRAME_SAMPLES)
+
+    @cached_property
+    def wav(self) -> Path:
+        """The sound as a file."""
+        return self.write_wav("sound.wav", self.seconds)
+
+    def write_wav(self, name: str, seconds: float) -> Path:
+        """Write the first seconds of the sound to a file of this name."""
+        path = self.folder / name
+        samples = self.samples[: round(seconds * SAMPLE_RATE)]
+        soundfile.write(path, samples, SAMPLE_RATE, "PCM_16", format="WAV")
+        return path
+
+    @cached_property
+    def training(self) -> tuple[Dataset, Scenario]:
+        """Segments that the model is trained from, and its classes.
+
+        Raises
+        ------
+        DataError
+            If the manifest of the recordings is not one of a home.
+        """
+        if self.audio is not None and (self.audio / "manifest.csv").exists():
+            scenario = BUILTIN["general"]
+            clips = read_manifest(self.audio / "manifest.csv", scenario.labels)
+            return build_dataset(clips, scenario, _ignore_progress), scenario
+        manifest = write_training_set(self.folder / "clips", self.clips_per_class, _SEED)
+        scenario = Scenario("simulated", {label: (label,) for label in LABELS})
+        clips = read_manifest(manifest, scenario.labels)
+        data = build_dataset(clips, scenario, _ignore_progress)
+        noise = np.random.default_rng(_SEED).standard_normal(data.statistics.shape)
+        blurred = data.statistics + _OVERLAP * noise * data.statistics.std(axis=0)
+        return dataclasses.replace(data, statistics=blurred.astype(np.float32)), scenario
+
+    @cached_property
+    def model(self) -> Model:
+        """A model of realistic size; its labels of simulated sound are not to be trusted."""
+        return train_model(*self.training, _ignore_progress)
+
+    @cached_property
+    def model_file(self) -> Path:
+        """The same as a file."""
+        path = self.folder / "bench.safetensors"
+        save_model(self.model, path)
+        return path
+
+
+def _recordings(folder: Path) -> NDArray[np.int16]:
+    blocks: list[NDArray[np.int16]] = []
+    missing = _MOST_SECONDS * SAMPLE_RATE
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in {".flac", ".wav"}):
+        for block in read_audio(path):
+            scaled = np.clip(np.rint(block * 32768), -32768, 32767).astype(np.int16)
+            blocks.append(scaled[:missing])
+            missing -= len(blocks[-1])
+        if missing == 0:
+            break
+    if sum(map(len, blocks)) < SAMPLE_RATE:
+        raise BenchError(f"{folder}: holds no second of sound in files *.flac or *.wav")
+    return np.concatenate(blocks)
+
+
+def _ignore_progress(_done: int, _total: int) -> None:
+    """Take a report of progress: nothing here takes long."""
