@@ -1,5 +1,7 @@
 """`hearthlog demo`: the whole way from sound to a timeline, on a simulated home."""
 
+import shutil
+import sys
 import time
 from pathlib import Path
 from threading import Event as Flag
@@ -59,8 +61,8 @@ def demo(
     _say(f"5. hearthlog review {logs} --output {timeline}")
     save_timeline(sorted(logs.rglob("*.mcap")), timeline)
 
-    _say("Look at it:           rerun " + str(timeline))
-    print("Record a microphone:  hearthlog record --model " + str(model))
+    _say(f"Look at it:           {_command('rerun')} {timeline}")
+    print(f"Record a microphone:  {_command('hearthlog')} record --model {model}")
 
 
 def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) -> float:
@@ -81,6 +83,14 @@ def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) ->
     meant = np.searchsorted([end for _, end, _ in truth], middle, side="right")
     agree = [m.label == truth[min(i, len(truth) - 1)][2] for m, i in zip(found, meant, strict=True)]
     return float(np.mean(agree))
+
+
+def _command(name: str) -> str:
+    """Name a command as the user can type it: it may be in an environment that is not active."""
+    if shutil.which(name):
+        return name
+    path = Path(sys.executable).with_name(name)
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
 def _say(text: str) -> None:
