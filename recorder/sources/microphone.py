@@ -1,13 +1,7 @@
 """A microphone that is heard for years: its capture process, watched and started again."""
 
-import fcntl
 import itertools
-import json
 import math
-import os
-import select
-import subprocess
-import sys
 import time
 from collections.abc import Generator, Iterator
 from threading import Event as Flag
@@ -15,139 +9,20 @@ from threading import Event as Flag
 import numpy as np
 
 from recorder.errors import SourceError
-from recorder.sources.capture import BLOCK, Format
-from recorder.sources.devices import Device
-from recorder.sources.framing import Block, Framer
+from recorder.sources.framing import Framer
+from recorder.sources.process import CaptureProcess
 from recorder.stream import Event, Frames, Gap, Health
 from schemas.messages import NANOSECONDS
 
-_CAPTURE = [sys.executable, "-m", "recorder.sources.capture"]
-_HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
-_CRASHES = "PortAudio crashed: check ALSA's configuration"
-_PIPE_BYTES = 1 << 20  # 32 s of sound: what the recorder may be late by
-_START_SECONDS = 10.0
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _STALE_SECONDS = 3.0
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)
 _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
-
 _SILENT_FRAMES = 200  # ten seconds
 _STEP_SECONDS = 0.25
-_INPUT_OVERFLOW = 2  # paInputOverflow
 
-OK, WARNING, ERROR = 0, 1, 2  # of diagnostic_msgs
-
-
-def query_devices() -> list[Device]:
-    """List the microphones.
-
-    Raises
-    ------
-    SourceError
-        If PortAudio is missing, cannot start, hangs or crashes.
-    """
-    try:
-        answer = subprocess.run(  # noqa: S603  our own module
-            _CAPTURE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            timeout=_START_SECONDS,
-            check=False,
-        ).stdout
-    except subprocess.TimeoutExpired as error:
-        raise SourceError(_HANGS) from error
-    if not answer:
-        raise SourceError(_CRASHES)
-    found = json.loads(answer)
-    if "error" in found:
-        raise SourceError(found["error"])
-    return [Device(**device) for device in found]
-
-
-class CaptureProcess:
-    """One life of the capture process.
-
-    Parameters
-    ----------
-    device : str
-        As `hearthlog devices` lists it, or empty for the default one.
-
-    Raises
-    ------
-    SourceError
-        If the device cannot be opened, in the words of the capture process.
-    """
-
-    def __init__(self, device: str) -> None:
-        self._process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, device],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
-            bufsize=0,
-        )
-        assert self._process.stdout is not None
-        self._pipe = self._process.stdout.fileno()
-        fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        os.set_blocking(self._pipe, False)
-        self._held = b""
-        try:
-            self.format = self._read_format()
-        except SourceError:
-            self.kill()
-            raise
-
-    def blocks(self, timeout: float) -> list[Block] | None:
-        """Return the blocks that have come, after waiting for one; None if the process ended."""
-        if not self._wait(timeout):
-            return []
-        data = self._read()
-        if not data:
-            return None
-        self._held += data
-        found = []
-        while len(self._held) >= BLOCK.size:
-            head = BLOCK.unpack_from(self._held)
-            end = BLOCK.size + 2 * head[1]
-            if len(self._held) < end:
-                break
-            found.append(_block(head, self._held[BLOCK.size : end]))
-            self._held = self._held[end:]
-        return found
-
-    def kill(self) -> None:
-        """End the process, however sick it is."""
-        self._process.kill()
-        self._process.wait()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-
-    def _read_format(self) -> Format:
-        deadline = time.monotonic() + _START_SECONDS
-        while b"\n" not in self._held:
-            if not self._wait(deadline - time.monotonic()):
-                raise SourceError(_HANGS)
-            data = self._read()
-            if not data:
-                raise SourceError(_CRASHES)
-            self._held += data
-        line, self._held = self._held.split(b"\n", 1)
-        answer = json.loads(line)
-        if "error" in answer:
-            raise SourceError(answer["error"])
-        return Format(**answer)
-
-    def _wait(self, timeout: float) -> bool:
-        return bool(select.select([self._pipe], [], [], max(timeout, 0.0))[0])
-
-    def _read(self) -> bytes:
-        return os.read(self._pipe, _PIPE_BYTES)
-
-
-def _block(head: tuple[int, int, int, float, float], data: bytes) -> Block:
-    index, _, flags, adc_time, arrival = head
-    overflowed = bool(flags & _INPUT_OVERFLOW)
-    return Block(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)
+_OK, _ERROR = 0, 2  # of diagnostic_msgs
 
 
 class MicrophoneSource:
@@ -165,7 +40,8 @@ class MicrophoneSource:
         self.device = self._capture.format.device
         self._framer = Framer()
         self._silent_frames = 0
-        self._health = (OK, "starting")
+        self._frames_lost = 0
+        self._health = (_OK, "starting")
         self._last_health = self._health
         self._reported = -math.inf
         self._wall_offset = _wall_offset()
@@ -181,7 +57,7 @@ class MicrophoneSource:
                 self.close()
                 if stop.is_set():
                     return
-                self._health = (ERROR, reason)
+                self._health = (_ERROR, reason)
                 yield from self._report(self._now())
 
     def close(self) -> None:
@@ -203,7 +79,7 @@ class MicrophoneSource:
             for block in blocks:
                 heard = block.arrival
                 for event in self._framer.add(block):
-                    self._watch_silence(event)
+                    self._watch(event)
                     yield event
             if time.monotonic() - heard > _STALE_SECONDS and not blocks:
                 return "the microphone went silent"
@@ -217,24 +93,24 @@ class MicrophoneSource:
             try:
                 self._capture = CaptureProcess(self._wanted)
             except SourceError as error:
-                self._health = (ERROR, str(error))
+                self._health = (_ERROR, str(error))
             else:
                 return
             yield from self._report(self._now())
             if stop.wait(pause):
                 return
 
-    def _watch_silence(self, event: Frames | Gap) -> None:
+    def _watch(self, event: Frames | Gap) -> None:
         if isinstance(event, Gap):
-            self._health = (WARNING, event.reason)
+            self._frames_lost += event.frames_lost
             return
         heard = np.flatnonzero(event.samples.any(axis=1))
         zeros = len(event.samples) - 1 - heard[-1] if len(heard) else len(event.samples)
         self._silent_frames = int(zeros) if len(heard) else self._silent_frames + int(zeros)
         if self._silent_frames >= _SILENT_FRAMES:
-            self._health = (ERROR, "the microphone gives digital silence: is it muted or dead?")
+            self._health = (_ERROR, "the microphone gives digital silence: is it muted or dead?")
         else:
-            self._health = (OK, "listening")
+            self._health = (_OK, "listening")
 
     def _watch_clock(self) -> None:
         offset = _wall_offset()
@@ -252,7 +128,11 @@ class MicrophoneSource:
         if self._health != self._last_health or now - self._reported >= _HEALTH_SECONDS:
             level, summary = self._last_health = self._health
             self._reported = now
-            values = {"device": self.device, "clock_ppm": f"{self._framer.ppm:.1f}"}
+            values = {
+                "device": self.device,
+                "frames_lost": str(self._frames_lost),
+                "clock_ppm": f"{self._framer.ppm:.1f}",
+            }
             yield Health(stamp, level, summary, values)
 
 

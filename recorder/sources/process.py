@@ -1,0 +1,134 @@
+"""The capture process as the recorder sees it: started, read, and killed however sick it is."""
+
+import fcntl
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from recorder.errors import SourceError
+from recorder.sources.capture import BLOCK, Format
+from recorder.sources.devices import Device
+from recorder.sources.framing import Block
+
+_CAPTURE = [sys.executable, "-m", "recorder.sources.capture"]
+_HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
+_CRASHES = "PortAudio crashed: check ALSA's configuration"
+_PIPE_BYTES = 1 << 20  # 32 s of sound: what the recorder may be late by
+_START_SECONDS = 10.0
+_INPUT_OVERFLOW = 2  # paInputOverflow
+
+
+def query_devices() -> list[Device]:
+    """List the microphones.
+
+    Raises
+    ------
+    SourceError
+        If PortAudio is missing, cannot start, hangs or crashes.
+    """
+    try:
+        answer = subprocess.run(  # noqa: S603  our own module
+            _CAPTURE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=_START_SECONDS,
+            check=False,
+        ).stdout
+    except subprocess.TimeoutExpired as error:
+        raise SourceError(_HANGS) from error
+    if not answer:
+        raise SourceError(_CRASHES)
+    found = json.loads(answer)
+    if "error" in found:
+        raise SourceError(found["error"])
+    return [Device(**device) for device in found]
+
+
+class CaptureProcess:
+    """One life of the capture process.
+
+    Parameters
+    ----------
+    device : str
+        As `hearthlog devices` lists it, or empty for the default one.
+
+    Raises
+    ------
+    SourceError
+        If the device cannot be opened, in the words of the capture process.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._process = subprocess.Popen(  # noqa: S603  our own module
+            [*_CAPTURE, device],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
+            bufsize=0,
+        )
+        assert self._process.stdout is not None
+        self._pipe = self._process.stdout.fileno()
+        fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        os.set_blocking(self._pipe, False)
+        self._held = b""
+        try:
+            self.format = self._read_format()
+        except SourceError:
+            self.kill()
+            raise
+
+    def blocks(self, timeout: float) -> list[Block] | None:
+        """Return the blocks that have come, after waiting for one; None if the process ended."""
+        if not self._wait(timeout):
+            return []
+        data = self._read()
+        if not data:
+            return None
+        self._held += data
+        found = []
+        while len(self._held) >= BLOCK.size:
+            head = BLOCK.unpack_from(self._held)
+            end = BLOCK.size + 2 * head[1]
+            if len(self._held) < end:
+                break
+            found.append(_block(head, self._held[BLOCK.size : end]))
+            self._held = self._held[end:]
+        return found
+
+    def kill(self) -> None:
+        """End the process, however sick it is."""
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def _read_format(self) -> Format:
+        deadline = time.monotonic() + _START_SECONDS
+        while b"\n" not in self._held:
+            if not self._wait(deadline - time.monotonic()):
+                raise SourceError(_HANGS)
+            data = self._read()
+            if not data:
+                raise SourceError(_CRASHES)
+            self._held += data
+        line, self._held = self._held.split(b"\n", 1)
+        answer = json.loads(line)
+        if "error" in answer:
+            raise SourceError(answer["error"])
+        return Format(**answer)
+
+    def _wait(self, timeout: float) -> bool:
+        return bool(select.select([self._pipe], [], [], max(timeout, 0.0))[0])
+
+    def _read(self) -> bytes:
+        return os.read(self._pipe, _PIPE_BYTES)
+
+
+def _block(head: tuple[int, int, int, float, float], data: bytes) -> Block:
+    index, _, flags, adc_time, arrival = head
+    overflowed = bool(flags & _INPUT_OVERFLOW)
+    return Block(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)

@@ -1,0 +1,69 @@
+"""The log rolls with the clock, and what was written is on the disk soon enough."""
+
+import numpy as np
+import pytest
+from logs import features
+
+from recorder.log import LogDescription, RollingLog
+from recorder.pipeline import Pipeline
+from recorder.service import Settings, _describe
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.files import find_logs
+from schemas.messages import NANOSECONDS
+from schemas.reader import LogReader
+
+HOUR = 3600 * NANOSECONDS
+START = 490_000 * HOUR
+VALUES = np.random.default_rng(0).random((2000, 21)).astype(np.float32)
+
+
+class Nowhere:
+    device = "test"
+
+
+@pytest.fixture
+def description(tmp_path) -> LogDescription:
+    return _describe(Settings(output=tmp_path), Nowhere(), None)
+
+
+def records(first, count, start):
+    stamps = start + np.arange(count) * FRAME_NANOSECONDS
+    return Pipeline("mic").push_features(VALUES[:count], first, stamps)
+
+
+def test_files_begin_at_multiples_of_their_duration(description, tmp_path):
+    log = RollingLog(description, 60, 1.0, 5.0)
+    log.write(records(0, 2000, START + 50 * NANOSECONDS))
+    log.finish()
+    names = [path.name.partition("T")[2] for path in find_logs(tmp_path)]
+    assert [name[2:6] for name in names] == ["0050", "0100", "0200"]
+    np.testing.assert_array_equal(features(tmp_path)[0], np.arange(2000))
+
+
+def test_where_time_runs_backwards_another_file_begins(description):
+    log = RollingLog(description, 3600, 1.0, 5.0)
+    log.write(records(0, 40, START + 100 * NANOSECONDS))
+    log.write(records(40, 40, START + 10 * NANOSECONDS))
+    log.finish()
+    late, early = log.finished
+    assert features(late)[0].tolist() == list(range(40))
+    assert features(early)[0].tolist() == list(range(40, 80))
+
+
+@pytest.mark.parametrize("block", [10, 200])
+def test_nothing_older_than_half_a_second_waits_to_be_written(description, tmp_path, block):
+    log = RollingLog(description, 3600, 1.0, 5.0)
+    for first in range(0, 600, block):
+        log.write(records(first, block, START + first * FRAME_NANOSECONDS))
+        on_disk = len(features(tmp_path)[0])
+        assert first + block - on_disk < 10
+    log.finish()
+
+
+def test_a_file_says_what_it_is_from_its_first_message_on(description, tmp_path):
+    log = RollingLog(description, 3600, 1.0, 5.0)
+    log.write(records(0, 1, START))
+    (active,) = tmp_path.rglob("*.active")
+    assert [item.topic for item in LogReader(active).messages()] == ["/mic/info"]
+    log.abandon()
+    assert active.exists()
