@@ -4,4 +4,4 @@ from schemas.errors import HearthlogError
 
 
 class DataError(HearthlogError):
-    """Labelled data cannot be learned from as it is."""
+    """Logs or labelled sounds cannot be used, or what is made of them cannot be written."""

@@ -27,9 +27,9 @@ _ROWS_AT_ONCE = 72_000  # an hour of frames
 _ENERGY = "energy"
 _LANES_HEIGHT, _LANE_HEIGHT, _PLOT_HEIGHT = 80, 42, 300  # about pixels, on a screen of 1080
 _PROBABILITIES, _LEVEL, _HEAT_MAP = "probabilities", "level", "heat_map"
-_HEAT_COLUMNS = 1000
+_HEAT_COLUMNS = 2000
 _HEAT_PERCENTILES = (2, 98)
-_HEAT_WIDTH = 12.0
+_HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
 _TINY = np.finfo(np.float64).tiny
 _QUIETEST = 1e-10  # of a mean square: -100 dB
 # The viewer keeps the range that linked time axes share under this name.
@@ -102,6 +102,7 @@ def _write(tracks: Tracks, path: Path) -> None:
     start, end = tracks.range
     recording = rr.RecordingStream(APPLICATION)
     recording.save(path, default_blueprint=_Blueprint(_layout(tracks), start, end))
+    recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{_time(start):.16} to {_time(end):.16}")
     colours = _colours(tracks)
     for topic, rows in tracks.rows[messages.LABEL].items():
@@ -116,7 +117,10 @@ def _write(tracks: Tracks, path: Path) -> None:
         if _ENERGY in rows.names:
             _log_lines(recording, f"{topic}/{_LEVEL}", _level(rows), {_ENERGY: _BRIGHT})
         _log_heat_map(recording, f"{topic}/{_HEAT_MAP}", rows)
-    recording.flush()
+    try:
+        recording.flush()
+    except RuntimeError as error:  # all that comes of a full disk
+        raise OSError(f"{error}; is the disk full?") from error
     recording.disconnect()
 
 
@@ -191,11 +195,12 @@ def _label_changes(rows: Rows) -> tuple[Int64, list[str | None]]:
 
 
 def _span_changes(spans: Spans) -> tuple[Int64, list[str | None]]:
+    """Begin each span with its text, and end it with None unless the next one follows at once."""
     order = np.argsort(spans.starts, kind="stable")
     starts, ends = np.array(spans.starts)[order], np.array(spans.ends)[order]
-    ends = np.minimum(ends, np.append(starts[1:], np.iinfo(np.int64).max))
-    states = [*[None] * len(ends), *(spans.texts[i] for i in order)]
-    times = np.concatenate([ends, starts])
+    last = np.flatnonzero(ends < np.append(starts[1:], np.iinfo(np.int64).max))
+    times = np.concatenate([ends[last], starts])
+    states = [*[None] * len(last), *(spans.texts[i] for i in order)]
     order = np.argsort(times, kind="stable")
     return times[order], [states[i] for i in order]
 
@@ -240,36 +245,25 @@ def _level(rows: Rows) -> Rows:
 
 
 def _log_heat_map(recording: rr.RecordingStream, entity: str, rows: Rows) -> None:
-    """Log the mean of each feature over every share of the time, as the colour of a thick line."""
+    """Log the mean of each feature over every share of the time, as the colour of a square."""
     count = len(rows.names)
     first, means = _means(rows)
     low, high = np.percentile(means, _HEAT_PERCENTILES, axis=0)
     shade = np.clip((means - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
     grid = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
     colours = np.stack([np.interp(shade, grid, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
-    heights = np.tile(np.arange(count, dtype=np.float64), (len(first), 1))
-
-    # A row of NaN ends the lines where frames are missing, and where all end.
-    stops = np.append(rows.breaks, len(rows.times))
-    place = np.searchsorted(first, stops)
-    times = np.insert(rows.times[first], place, rows.ends[stops - 1])
-    heights = np.insert(heights, place, np.nan, axis=0).reshape(-1)
-    colours = np.insert(colours, place, colours[place - 1], axis=0)
-
-    about = rr.SeriesLines(
-        names=rows.names,
-        widths=[_HEAT_WIDTH] * count,
-        interpolation_mode="StepAfter",
-        aggregation_policy="off",
+    about = rr.SeriesPoints(
+        names=rows.names, markers=["square"] * count, marker_sizes=[_HEAT_SQUARE] * count
     )
     recording.log(entity, about, static=True)
+    heights = np.tile(np.arange(count, dtype=np.float64), len(first))
     pixels = colours.round().astype(np.uint8).reshape(-1, 3)
-    lengths = [count] * len(times)
+    lengths = [count] * len(first)
     columns = [
         *rr.Scalars.columns(scalars=heights).partition(lengths),
-        *rr.SeriesLines.columns(colors=pixels).partition(lengths),
+        *rr.SeriesPoints.columns(colors=pixels).partition(lengths),
     ]
-    recording.send_columns(entity, [_time_column(times)], columns)
+    recording.send_columns(entity, [_time_column(rows.times[first])], columns)
 
 
 def _means(rows: Rows) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -9,11 +9,13 @@ from typing import Any
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.serde import SerdeError
 
 from schemas.errors import LogError
 from schemas.messages import decode
 
 _RECORD_LIMIT = 256 << 20  # bytes; ours are below 2 MiB
+_TAIL_LIMIT = 64 << 10  # a longer one was not left by a writer that was killed between two flushes
 
 
 @dataclass(frozen=True)
@@ -26,8 +28,17 @@ class LogMessage:
     data: bytes
 
     def decode(self) -> Any:
-        """Decode the message, if its type is one of ROS 2's or ours."""
-        return decode(self.data, self.type)
+        """Decode the message, if its type is one of ROS 2's or ours.
+
+        Raises
+        ------
+        LogError
+            If it is of another type, or its bytes are not of its type.
+        """
+        try:
+            return decode(self.data, self.type)
+        except (SerdeError, KeyError) as error:
+            raise LogError(f"{self.topic}: no message of type {self.type} ({error})") from error
 
 
 def read_records(path: Path) -> Iterator[McapRecord]:
@@ -51,7 +62,8 @@ def read_records(path: Path) -> Iterator[McapRecord]:
             # The reader says the latter of a length of which the last bytes are missing.
             if offset == 0:
                 raise LogError(f"{path}: is no MCAP file (it ends at once)") from error
-            if stream.read(1):
+            rest = path.stat().st_size - offset
+            if stream.read(1) or rest > _TAIL_LIMIT:
                 raise LogError(f"{path}: damaged at byte {offset} ({error})") from error
         except Exception as error:  # the decompressors raise what they like
             what = str(error) or type(error).__name__

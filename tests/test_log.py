@@ -36,7 +36,7 @@ def test_files_begin_at_multiples_of_their_duration(description, tmp_path):
     log.write(records(0, 2000, START + 50 * NANOSECONDS))
     log.finish()
     names = [path.name.partition("T")[2] for path in find_logs(tmp_path)]
-    assert [name[2:6] for name in names] == ["0050", "0100", "0200"]
+    assert names == ["160050Z.mcap", "160100Z.mcap", "160200Z.mcap"]
     np.testing.assert_array_equal(features(tmp_path)[0], np.arange(2000))
 
 

@@ -1,7 +1,9 @@
 """What a killed recorder leaves is completed whatever its length, and nothing else is touched."""
 
+import json
 import random
 import shutil
+import struct
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from schemas.files import active_path
 from schemas.reader import LogReader
 from schemas.topics import topics_of
 from schemas.writer import LogWriter
+
+CHUNK = 0x06
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,10 @@ def test_a_log_cut_anywhere_is_completed_with_all_that_is_whole(log, tmp_path, s
     reader = LogReader(path)
     list(reader.messages())
     assert reader.complete
-    assert set(reader.metadata) >= {"hearthlog", "rosbag2"}
+    assert "hearthlog" in reader.metadata
+    about = json.loads(reader.metadata["rosbag2"]["serialized_metadata"])
+    assert about["message_count"] == len(kept)
+    assert sum(t["message_count"] for t in about["topics_with_message_count"]) == len(kept)
     assert set(reader.attachments) == {"configuration.json", "model_card.md"}
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
@@ -75,6 +82,28 @@ def test_of_a_damaged_log_the_whole_chunks_are_recovered_and_the_original_kept(l
     assert kept == content(log)[: len(kept)]
     assert len(kept) > 1000
     assert path.with_name(path.name + ".damaged").read_bytes() == bytes(data)
+
+
+def test_a_length_that_swallows_the_rest_is_damage_and_no_end(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    lengths = [start + 1 for start, opcode in records(data) if opcode == CHUNK]
+    data[lengths[len(lengths) // 2] + 2] ^= 0x70  # seven megabytes more
+    path = left_behind(log, tmp_path, data)
+    (recovered,) = recover_active(tmp_path, "home")
+    assert "damaged at byte" in recovered.damage
+    kept = content(path)
+    assert kept == content(log)[: len(kept)]
+    assert len(kept) > 1000
+    assert path.with_name(path.name + ".damaged").read_bytes() == bytes(data)
+
+
+def records(data):
+    """Offset and opcode of the records of a file, those inside chunks left out."""
+    offset = 8
+    while offset < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        yield offset, opcode
+        offset += 9 + length
 
 
 def test_a_recovery_that_was_itself_cut_short_is_done_again(log, tmp_path):

@@ -42,7 +42,7 @@ class FileSource:
     def __init__(self, paths: Sequence[Path], start: int, *, realtime: bool = False) -> None:
         for path in paths:
             check_audio(path)
-        self.device = " ".join(path.name for path in paths)
+        self.device = _name(paths)
         self._paths = paths
         self._start = start
         self._realtime = realtime
@@ -89,3 +89,10 @@ class FileSource:
         rest = len(held) - len(held) % FRAME_SAMPLES
         if rest:
             yield held[:rest].reshape(-1, FRAME_SAMPLES)
+
+
+def _name(paths: Sequence[Path]) -> str:
+    """Name the files in a few words: every diagnostic message repeats them."""
+    if len(paths) == 1:
+        return paths[0].name
+    return f"{paths[0].name} … {paths[-1].name} ({len(paths)} files)"

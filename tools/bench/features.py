@@ -12,7 +12,6 @@ from tools.bench.timing import best_of
 from tools.bench.workload import Workload
 
 _SECONDS = 120.0
-_REPEATS = 5
 _SINGLE_FRAMES = 2000
 _FAST = Target(10_000)
 _FASTER_THAN_THE_PAPERS_LIBRARY = Target(50)
@@ -26,7 +25,7 @@ def measure(work: Workload) -> Table:
     frames = work.frames(_SECONDS)
     single = frames[:_SINGLE_FRAMES]
     seconds = frames.size / SAMPLE_RATE
-    runs = {
+    runs: dict[str, Callable[[], object]] = {
         "all": lambda: FeatureExtractor()(frames),
         "200": lambda: _in_blocks(frames, 200),
         "10": lambda: _in_blocks(frames, 10),
@@ -38,14 +37,14 @@ def measure(work: Workload) -> Table:
             runs[name] = prepare(frames.ravel())
         except ImportError as error:
             missing[name] = f"not installed ({error})"
-    best = best_of(runs, _REPEATS)
+    best = best_of(runs)
     speed = {name: seconds / best[name] for name in best if name != "1"}
     unit = "x real time"
     rows = [
         Row("hearthlog, 21 values, in one call", speed["all"], unit, target=_FAST),
         Row("hearthlog, 200 frames a call", speed["200"], unit, note="as from a file"),
         Row("hearthlog, 10 frames a call", speed["10"], unit, note="as from a microphone"),
-        Row("hearthlog, frame by frame", 1e6 * best["1"] / len(single), "us a frame"),
+        Row("hearthlog, frame by frame", 1e6 * best["1"] / len(single), "µs a frame"),
     ]
     for name, (what, target, _) in _PEERS.items():
         if name in missing:
@@ -74,16 +73,19 @@ def _pyaudioanalysis(samples: Float32) -> Callable[[], object]:
 def _librosa(samples: Float32) -> Callable[[], object]:
     import librosa  # noqa: PLC0415  a peer may be missing
 
-    steps = {"hop_length": FRAME_SAMPLES, "center": False}
     feature = librosa.feature
 
     def run() -> None:
-        spectrum = np.abs(librosa.stft(samples, n_fft=FRAME_SAMPLES, **steps))
+        spectrum = np.abs(
+            librosa.stft(samples, n_fft=FRAME_SAMPLES, hop_length=FRAME_SAMPLES, center=False)
+        )
         mel = feature.melspectrogram(S=spectrum**2, sr=SAMPLE_RATE, n_mels=32)
         feature.mfcc(S=librosa.power_to_db(mel), n_mfcc=13)
         feature.spectral_centroid(S=spectrum, sr=SAMPLE_RATE)
         feature.spectral_rolloff(S=spectrum, sr=SAMPLE_RATE, roll_percent=0.9)
-        feature.zero_crossing_rate(samples, frame_length=FRAME_SAMPLES, **steps)
+        feature.zero_crossing_rate(
+            samples, frame_length=FRAME_SAMPLES, hop_length=FRAME_SAMPLES, center=False
+        )
 
     run()  # it imports its parts, and compiles some, when they are first used
     return run

@@ -1,5 +1,6 @@
 """Time that can be compared on a machine that others use too."""
 
+import itertools
 import os
 import resource
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from schemas.errors import HearthlogError
 
+_TURN_SECONDS = 0.5
 HEARTHLOG = [sys.executable, "-m", "tools.cli.main"]
 
 
@@ -18,23 +20,31 @@ class BenchError(HearthlogError):
     """A measurement cannot be made."""
 
 
-def best_of(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Measure the CPU time, in seconds and over all threads, of the quickest of several runs.
+def best_of(runs: Mapping[str, Callable[[], object]], turns: int = 5) -> dict[str, float]:
+    """Measure the CPU time of each run, in seconds and over all threads, in its best turn.
 
-    CPU time, because a long run meets other people's work more often than a short one; in turns,
-    because what slows the core itself then slows all alike.
+    CPU time and turns of at least half a second, because a long run meets other people's work
+    more often than a short one; one after the other, because what slows the core slows all alike.
     """
     best = dict.fromkeys(runs, float("inf"))
-    for _ in range(repeats):
+    for _ in range(turns):
         for name, run in runs.items():
-            began = time.process_time()
-            run()
-            best[name] = min(best[name], time.process_time() - began)
+            best[name] = min(best[name], _mean_time(run))
     return best
 
 
-def best_of_processes(arguments: Sequence[str | Path], repeats: int) -> tuple[float, float]:
-    """Run `hearthlog` several times, each time on one core, and each time on the next one.
+def _mean_time(run: Callable[[], object]) -> float:
+    began = time.process_time()
+    count, used = 0, 0.0
+    while used < _TURN_SECONDS:
+        run()
+        count += 1
+        used = time.process_time() - began
+    return used / count
+
+
+def best_of_processes(commands: Sequence[Sequence[str | Path]]) -> tuple[float, float]:
+    """Run `hearthlog` with each of these arguments, each time on one core, and on the next one.
 
     Returns
     -------
@@ -46,10 +56,10 @@ def best_of_processes(arguments: Sequence[str | Path], repeats: int) -> tuple[fl
     BenchError
         If the command fails, with what it said.
     """
-    cores = sorted(os.sched_getaffinity(0))
+    cores = itertools.cycle(sorted(os.sched_getaffinity(0)))
     elapsed = cpu = float("inf")
-    for repeat in range(repeats):
-        with _on_core(cores[repeat % len(cores)]):
+    for arguments, core in zip(commands, cores, strict=False):
+        with _on_core(core):
             began, used = time.perf_counter(), _cpu_of_children()
             hearthlog(arguments)
             elapsed = min(elapsed, time.perf_counter() - began)

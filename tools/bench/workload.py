@@ -77,7 +77,7 @@ class Workload:
     def frames(self, seconds: float) -> Float32:
         """Return the first seconds as frames of shape (n, 800) in full scale."""
         chosen = self.samples[: round(seconds * SAMPLE_RATE)]
-        return (chosen / np.float32(32768)).reshape(-1, FRAME_SAMPLES)
+        return (chosen.astype(np.float32) / np.float32(32768)).reshape(-1, FRAME_SAMPLES)
 
     @cached_property
     def wav(self) -> Path:

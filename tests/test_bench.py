@@ -1,0 +1,108 @@
+"""The benchmark runs to its end on a little sound; how fast is not for a test to say."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from tools.bench import features, timing
+from tools.bench.labmic import make_microphone
+from tools.bench.table import Row, Table, Target
+from tools.bench.workload import Workload
+from tools.home import write_training_set
+
+
+def bench(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "tools.bench", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def figures(output):
+    """The measured column of printed tables, by what stands before it."""
+    lines = [line.split("  ") for line in output.splitlines() if line.startswith("  ")]
+    cells = [[cell.strip() for cell in line if cell.strip()] for line in lines]
+    return {row[0]: float(row[1].replace(",", "")) for row in cells if row[0] != "measured"}
+
+
+def test_recordings_of_a_folder_are_recorded_and_the_log_is_accounted_for_byte_by_byte(tmp_path):
+    write_training_set(tmp_path, 3, seed=1)
+
+    done = bench("size", "recording", "--audio", tmp_path)
+
+    assert done.returncode == 0, done.stderr
+    found = figures(done.stdout)
+    assert all(math.isfinite(value) and value > 0 for value in found.values())
+    parts = sum(value for name, value in found.items() if name.startswith("/"))
+    parts += found["index of messages"] + found["the rest"]
+    assert parts == pytest.approx(found["the whole log"], rel=0.01)
+    assert {"/mic/features", "/mic/statistics", "/mic/label", "hearthlog record"} <= set(found)
+
+
+def test_every_peer_that_is_installed_gets_a_speed_and_a_ratio(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    rows = features.measure(Workload(tmp_path, minutes=0.1)).rows
+    assert len(rows) == 7
+    assert all(math.isfinite(row.value) and row.value > 0 for row in rows)
+    assert rows[4].ratio == pytest.approx(rows[0].value / rows[4].value)
+
+
+def test_a_peer_that_is_missing_is_named_and_the_others_are_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    monkeypatch.setitem(sys.modules, "opensmile", None)
+    rows = {
+        row.what.split()[0]: row for row in features.measure(Workload(tmp_path, minutes=0.1)).rows
+    }
+    assert rows["opensmile"].value is None
+    assert rows["opensmile"].note.startswith("not installed")
+    assert rows["librosa"].value > 0
+
+
+def test_the_simulated_sound_comes_in_whole_frames(tmp_path):
+    work = Workload(tmp_path, minutes=0.0501)
+    assert len(work.samples) == 3 * SAMPLE_RATE
+    assert work.frames(1.0).shape == (SAMPLE_RATE // FRAME_SAMPLES, FRAME_SAMPLES)
+
+
+def test_without_a_compiler_there_is_no_microphone_and_the_reason_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(timing.BenchError, match=r"no microphone to record: gcc, .*missing"):
+        make_microphone(tmp_path, np.zeros(SAMPLE_RATE, np.int16))
+
+
+@pytest.mark.parametrize(
+    ("row", "verdict"),
+    [
+        (Row("", 3.0, target=Target(2.0)), "met"),
+        (Row("", 1.0, target=Target(2.0)), "MISSED"),
+        (Row("", 3.0, target=Target(2.0, at_most=True)), "MISSED"),
+        (Row("", 3.0, ratio=1.0, target=Target(2.0)), "MISSED"),
+        (Row("", None, target=Target(2.0)), ""),
+        (Row("", 3.0), ""),
+    ],
+)
+def test_a_missed_target_is_said(row, verdict):
+    assert row.verdict == verdict
+    assert verdict in str(Table("", [row]))
+
+
+def test_an_unknown_measurement_is_refused_and_the_known_ones_are_listed():
+    done = bench("speed")
+    assert done.returncode == 2
+    assert "features, recording, live, inference, size" in " ".join(done.stderr.split())
+
+
+def test_a_folder_without_sound_is_one_clear_line(tmp_path):
+    done = bench("features", "--audio", tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].endswith(
+        "holds no second of sound in files *.flac or *.wav"
+    )
+    assert "Traceback" not in done.stderr

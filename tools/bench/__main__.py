@@ -1,0 +1,55 @@
+"""`python -m tools.bench [NAME ...]`: measure, side by side and in one run."""
+
+import os
+
+# Before numpy is imported: "one core" is to be true for everyone.
+os.environ.update(
+    dict.fromkeys(
+        ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+    )
+)
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from schemas.errors import HearthlogError
+from tools.bench import features, inference, live, recording, size
+from tools.bench.workload import Workload
+
+MEASUREMENTS = {
+    module.__name__.rpartition(".")[2]: module.measure
+    for module in (features, recording, live, inference, size)
+}
+
+
+def bench(
+    names: Annotated[
+        list[str] | None, typer.Argument(help=f"Of {', '.join(MEASUREMENTS)}; all by default.")
+    ] = None,
+    audio: Annotated[
+        Path | None,
+        typer.Option(help="Folder of recordings to use instead of the simulated home."),
+    ] = None,
+) -> None:
+    """Measure hearthlog against its peers and its targets."""
+    chosen = names or list(MEASUREMENTS)
+    if unknown := [name for name in chosen if name not in MEASUREMENTS]:
+        raise typer.BadParameter(f"{unknown[0]}: known are {', '.join(MEASUREMENTS)}")
+    source = "the simulated home" if audio is None else audio
+    with tempfile.TemporaryDirectory(prefix="hearthlog-bench-") as folder:
+        work = Workload(Path(folder), audio)
+        typer.echo(f"hearthlog bench: sound of {source}", err=True)
+        for number, name in enumerate(chosen, start=1):
+            typer.echo(f"hearthlog bench: {number} of {len(chosen)}, {name} ...", err=True)
+            print(f"{MEASUREMENTS[name](work)}\n", flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(bench)
+    except HearthlogError as error:
+        sys.exit(f"hearthlog bench: {error}")
