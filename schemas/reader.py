@@ -3,18 +3,32 @@
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 from rosbags.serde import SerdeError
 
 from schemas.errors import LogError
 from schemas.messages import decode
 
 _RECORD_LIMIT = 256 << 20  # bytes; ours are below 2 MiB
+_HEAD = struct.Struct("<BQ")  # opcode and length
+_READ = {  # the others index these
+    Opcode.HEADER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.ATTACHMENT,
+    Opcode.METADATA,
+    Opcode.FOOTER,
+}
 _TAIL_LIMIT = 64 << 10  # a longer one was not left by a writer that was killed between two flushes
 
 
@@ -52,26 +66,38 @@ def read_records(path: Path) -> Iterator[McapRecord]:
         If this is no MCAP file, or if it is damaged before its end.
     """
     with path.open("rb") as stream:
-        reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
-        offset = 0
-        try:
-            for record in reader.records:
-                yield from _opened(record)
-                offset = stream.tell()
-        except (EndOfFile, struct.error) as error:
-            # The reader says the latter of a length of which the last bytes are missing.
-            if offset == 0:
-                raise LogError(f"{path}: is no MCAP file (it ends at once)") from error
-            rest = path.stat().st_size - offset
-            if stream.read(1) or rest > _TAIL_LIMIT:
-                raise LogError(f"{path}: damaged at byte {offset} ({error})") from error
-        except Exception as error:  # the decompressors raise what they like
-            what = str(error) or type(error).__name__
-            place = "is no MCAP file" if offset == 0 else f"damaged at byte {offset}"
-            raise LogError(f"{path}: {place} ({what})") from error
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise LogError(f"{path}: is no MCAP file")
+        while True:
+            offset = stream.tell()
+            try:
+                content = _next_record(stream, path.stat().st_size - offset)
+                records = [] if content is None else _parsed(content)
+            except Exception as error:  # the decompressors raise what they like
+                what = str(error) or type(error).__name__
+                raise LogError(f"{path}: damaged at byte {offset} ({what})") from error
+            yield from records
+            if content is None or content[0] == Opcode.FOOTER:
+                return
 
 
-def _opened(record: McapRecord) -> list[McapRecord]:
+def _next_record(stream: BinaryIO, rest: int) -> bytes | None:
+    """Read one record as it is; None at the end of what was written."""
+    head = stream.read(_HEAD.size)
+    length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else _RECORD_LIMIT
+    if len(head) + length > rest:
+        if rest > _TAIL_LIMIT:
+            raise McapError("a record claims to be longer than the file")
+        return None
+    if length > _RECORD_LIMIT:
+        raise McapError("a record claims to be too large")
+    return head + stream.read(length)
+
+
+def _parsed(content: bytes) -> list[McapRecord]:
+    if content[0] not in _READ:
+        return []
+    record = next(StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True).records)
     if not isinstance(record, Chunk):
         return [record]
     if record.uncompressed_size > _RECORD_LIMIT:
