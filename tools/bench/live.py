@@ -99,7 +99,7 @@ def _live(work: Workload) -> list[Row]:
         Row("memory (PSS), all processes", sum(megabytes), "MB", target=_MEMORY),
     ]
     rows += [Row(f"  {n}", m, "MB") for n, m in zip(names, megabytes, strict=True)]
-    return [*rows, Row("the bare microphone", bare_megabytes, "MB")]
+    return [*rows, Row("the bare microphone, memory", bare_megabytes, "MB")]
 
 
 @contextmanager

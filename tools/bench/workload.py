@@ -23,7 +23,7 @@ from tools.sounds import LABELS
 _MOST_SECONDS = 3600
 _SEED = 1
 # Simulated sounds hardly overlap, and would need a third of the support vectors that real ones do.
-_OVERLAP = 0.5  # standard deviations
+_OVERLAP = 0.75  # standard deviations
 
 Float32 = NDArray[np.float32]
 
