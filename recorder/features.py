@@ -38,7 +38,7 @@ _TINY = np.finfo(np.float64).eps
 _SANE_SAMPLE = 1e3  # full scale is 1
 _SANE_ENERGY = _SANE_SAMPLE**2
 _POWER_FLOOR = 1e-7  # about -70 dBFS: below it a spectrum tells of the codec, not of the sound
-_FRAMES_AT_ONCE = 256  # more would leave a core's cache, fewer cost more in calls
+_FRAMES_AT_ONCE = 384  # more would leave a core's cache, fewer cost more in calls
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -118,7 +118,7 @@ def zero_crossing_rate(frames: Float32) -> Float64:
     """Sign changes per step from sample to sample, 0 to 1 (a step to or from 0 counts half)."""
     sign = (frames > 0).view(np.int8) - (frames < 0).view(np.int8)
     steps = sign[:, 1:] - sign[:, :-1]
-    return np.abs(steps, out=steps).sum(axis=1, dtype=np.int32) / (2.0 * (FRAME_SAMPLES - 1))
+    return np.abs(steps, out=steps).sum(axis=1, dtype=np.int16) / (2.0 * (FRAME_SAMPLES - 1))
 
 
 def mel_bank() -> Float64:

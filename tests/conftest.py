@@ -16,7 +16,7 @@ from analyzer.train import train_model
 from models.modelfile import save_model
 from recorder.features import FRAME_SAMPLES
 from recorder.sources.files import read_audio
-from tools.home import write_day, write_training_set
+from tools.home.simulate import write_day, write_training_set
 
 __all__ = ["labmic", "labmic_plugin", "pulse_daemon", "pulse_microphone"]
 

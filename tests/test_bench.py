@@ -12,7 +12,7 @@ from tools.bench import features, timing
 from tools.bench.labmic import make_microphone
 from tools.bench.table import Row, Table, Target
 from tools.bench.workload import Workload
-from tools.home import write_training_set
+from tools.home.simulate import write_training_set
 
 
 def bench(*arguments):

@@ -12,8 +12,8 @@ from sklearn.svm import SVC
 
 from recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
 from recorder.statistics import WINDOW_FRAMES, RollingStatistics
-from tools.home import _perform, _plan_day, write_day, write_training_set
-from tools.sounds import LABELS, SimulationError, synthesize
+from tools.home.simulate import _perform, _plan_day, write_day, write_training_set
+from tools.home.sounds import LABELS, SimulationError, synthesize
 
 GENERAL = {
     "silence",

@@ -26,8 +26,8 @@ from recorder.sources.devices import Device, find_device, list_devices, load_por
 BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
-_BLOCK_SECONDS = 0.5  # every waking costs more than the sound it brings
-_LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
+BLOCK_SECONDS = 0.5  # every waking costs more than the sound it brings
+LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
 _QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
 
 
@@ -100,11 +100,11 @@ def _open(sounddevice: ModuleType, device: Device, hear: Any) -> tuple[Any, int,
             try:
                 stream = sounddevice.RawInputStream(
                     samplerate=rate,
-                    blocksize=int(rate * _BLOCK_SECONDS),
+                    blocksize=int(rate * BLOCK_SECONDS),
                     device=device.index,
                     channels=channels,
                     dtype="int16",
-                    latency=_LATENCY_SECONDS,
+                    latency=LATENCY_SECONDS,
                     callback=hear,
                 )
             except sounddevice.PortAudioError as error:

@@ -72,8 +72,8 @@ def _live(work: Workload) -> list[Row]:
     env = make_microphone(work.folder, samples)
     logs = work.folder / "logs-live"
     recorder = ["record", "--device", DEVICE, "--model", work.model_file, "--output", logs]
-    block = round(capture._BLOCK_SECONDS * SAMPLE_RATE)  # noqa: SLF001  the same as the recorder's
-    latency = capture._LATENCY_SECONDS  # noqa: SLF001  likewise
+    block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
+    latency = capture.LATENCY_SECONDS
     bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
         ours = stack.enter_context(_running([*HEARTHLOG, *recorder], env))

@@ -17,8 +17,8 @@ from models.modelfile import Model, save_model
 from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
 from recorder.sources.files import read_audio
 from tools.bench.timing import BenchError
-from tools.home import write_day, write_training_set
-from tools.sounds import LABELS
+from tools.home.simulate import write_day, write_training_set
+from tools.home.sounds import LABELS
 
 _MOST_SECONDS = 3600
 _SEED = 1

@@ -27,8 +27,8 @@ def demo(
     from tools.cli.info import info
     from tools.cli.record import start_time
     from tools.cli.train import train
-    from tools.home import write_day, write_training_set
-    from tools.sounds import LABELS
+    from tools.home.simulate import write_day, write_training_set
+    from tools.home.sounds import LABELS
 
     if output.exists():
         raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
@@ -61,7 +61,7 @@ def demo(
     _say(f"5. hearthlog review {logs} --output {timeline}")
     save_timeline(sorted(logs.rglob("*.mcap")), timeline)
 
-    _say(f"Look at it:           {_command('rerun')} {timeline}")
+    _say(f"Look at it:           {_command('rerun')} --bind 127.0.0.1 {timeline}")
     print(f"Record a microphone:  {_command('hearthlog')} record --model {model}")
 
 

@@ -10,7 +10,7 @@ import soundfile
 from numpy.typing import NDArray
 
 from recorder.features import SAMPLE_RATE
-from tools.sounds import LABELS, RoomTone, SimulationError, dry_sound, generator, synthesize
+from tools.home.sounds import LABELS, RoomTone, SimulationError, dry_sound, generator, synthesize
 
 _SOURCE = "hearthlog simulated home"
 _CLIP_SECONDS = (3.0, 5.0)

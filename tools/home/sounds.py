@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from recorder.features import SAMPLE_RATE
 from schemas.errors import HearthlogError
-from tools.waveforms import (
+from tools.home.waveforms import (
     Range,
     Train,
     band_noise,

@@ -1,0 +1,1 @@
+"""A simulated home, for those who have no microphone at hand."""
