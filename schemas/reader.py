@@ -15,6 +15,7 @@ from mcap.writer import MCAP0_MAGIC
 from rosbags.serde import SerdeError
 
 from schemas.errors import LogError
+from schemas.files import ACTIVE_SUFFIX
 from schemas.messages import decode
 
 _RECORD_LIMIT = 256 << 20  # bytes; ours are below 2 MiB
@@ -66,7 +67,10 @@ def read_records(path: Path) -> Iterator[McapRecord]:
         If this is no MCAP file, or if it is damaged before its end.
     """
     with path.open("rb") as stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        magic = stream.read(len(MCAP0_MAGIC))
+        if path.name.endswith(ACTIVE_SUFFIX) and MCAP0_MAGIC.startswith(magic):
+            pass  # at first a writer has written less than that
+        elif magic != MCAP0_MAGIC:
             raise LogError(f"{path}: is no MCAP file")
         while True:
             offset = stream.tell()

@@ -22,17 +22,16 @@ SECONDS = 1_000_000_000
 def recording(microphone, folder, *options):
     """Run `hearthlog record` on a microphone; at the end it is asked to stop."""
     command = [*HEARTHLOG, "record", "--device", microphone.device, "-o", str(folder), *options]
-    process = subprocess.Popen(
+    with subprocess.Popen(
         command, env=microphone.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        yield process
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-        process.output, process.errors = process.communicate(timeout=20)
-    finally:
-        process.kill()
-        process.wait()
+    ) as process:
+        try:
+            yield process
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+            process.output, process.errors = process.communicate(timeout=20)
+        finally:
+            process.kill()
 
 
 def wait_for_frames(folder, count, seconds=30):

@@ -72,6 +72,12 @@ def test_a_log_without_a_message_is_kept_under_another_name(log, tmp_path, lengt
     assert [p.name for p in tmp_path.iterdir()] == [path.name + ".damaged"]
 
 
+@pytest.mark.parametrize("length", [0, 5, 8])
+def test_a_log_that_has_just_been_opened_has_no_messages_yet(log, tmp_path, length):
+    path = left_behind(log, tmp_path, log.read_bytes()[:length])
+    assert content(active_path(path)) == []
+
+
 def test_of_a_damaged_log_the_whole_chunks_are_recovered_and_the_original_kept(log, tmp_path):
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0x55
