@@ -44,7 +44,7 @@ class Settings(BaseSettings):
     output: Path = Path("logs")
     model: Path | None = None
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds a file
-    flush_seconds: float = Field(default=1.0, ge=0.5, le=3600)  # at most lost by a killed process
+    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
     sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut
     statistics_every: int = Field(default=1, ge=1)  # frames
     microphone: list[Microphone] = Field(default=[Microphone()], min_length=1, max_length=1)

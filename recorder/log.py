@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from recorder.pipeline import Record
-from recorder.stream import FRAME_NANOSECONDS
 from schemas.files import log_path
 from schemas.messages import NANOSECONDS, encode, header
 from schemas.topics import Topic, topic
 from schemas.writer import Attachment, LogWriter
 
-# What may lie between a sound and its messages: a block of frames, and the sound card's delay.
-_DELAY = 0.5 * NANOSECONDS
+# What may lie between a sound and its being written: a block of frames, and the capture's delay.
+_DELAY_SECONDS = 0.9
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,8 @@ class RollingLog:
         self.finished: list[Path] = []
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
-        # Half a frame less, for frames are not exactly 50 ms apart on a clock that is corrected.
-        spare = flush_seconds * NANOSECONDS - _DELAY - FRAME_NANOSECONDS / 2
-        self._flush_nanoseconds = max(int(spare), 0)
-        self._sync_seconds = max(sync_seconds - flush_seconds, 0.0)
+        self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
+        self._sync_seconds = sync_seconds - _DELAY_SECONDS
         self._writer: LogWriter | None = None
         self._last = self._until = 0  # no time lies between: the first record opens a file
         self._flush_at: int | None = None
@@ -77,10 +74,8 @@ class RollingLog:
         for record in records:
             if not self._last <= record.log_time < self._until:
                 self._roll(record.log_time)
-            elif self._flush_at is not None and record.log_time >= self._flush_at:
-                self.flush()
             self._append(record)
-        if self._flush_at is not None and self._last + FRAME_NANOSECONDS >= self._flush_at:
+        if self._flush_at is not None and self._last >= self._flush_at:
             self.flush()
         if time.monotonic() - self._synced >= self._sync_seconds:
             self.sync()

@@ -50,14 +50,23 @@ def test_where_time_runs_backwards_another_file_begins(description):
     assert features(early)[0].tolist() == list(range(40, 80))
 
 
-@pytest.mark.parametrize("block", [10, 200])
-def test_nothing_older_than_half_a_second_waits_to_be_written(description, tmp_path, block):
+@pytest.mark.parametrize("block", [12, 200])
+def test_every_block_is_written_when_it_comes(description, tmp_path, block):
     log = RollingLog(description, 3600, 1.0, 5.0)
     for first in range(0, 600, block):
         log.write(records(first, block, START + first * FRAME_NANOSECONDS))
-        on_disk = len(features(tmp_path)[0])
-        assert first + block - on_disk < 10
+        assert len(features(tmp_path)[0]) == first + block
     log.finish()
+
+
+def test_blocks_wait_for_others_if_more_may_be_lost(description, tmp_path):
+    log = RollingLog(description, 3600, 5.0, 60.0)
+    behind = []
+    for first in range(0, 600, 12):
+        log.write(records(first, 12, START + first * FRAME_NANOSECONDS))
+        behind.append(first + 12 - len(features(tmp_path)[0]))
+    log.finish()
+    assert 3.5 * 20 < max(behind) < 4.1 * 20
 
 
 def test_a_file_says_what_it_is_from_its_first_message_on(description, tmp_path):

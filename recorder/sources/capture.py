@@ -26,7 +26,7 @@ from recorder.sources.devices import Device, find_device, list_devices, load_por
 BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
-BLOCK_SECONDS = 0.5  # every waking costs more than the sound it brings
+BLOCK_SECONDS = 0.6  # every waking costs more than the sound it brings
 LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
 _QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
 

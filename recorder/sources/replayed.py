@@ -14,7 +14,7 @@ from recorder.sources.files import check_audio, read_audio
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
 from schemas.messages import NANOSECONDS
 
-_REALTIME_FRAMES = 4
+_REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
 
 Float32 = NDArray[np.float32]

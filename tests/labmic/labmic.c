@@ -25,8 +25,8 @@
 #include <time.h>
 #include <unistd.h>
 
-/* A poll wakes the reader this often: well under any period a test asks for. */
-#define TICK_NANOSECONDS 5000000
+/* A poll wakes the reader so often in a period; a sound card does it once. */
+#define TICKS_PER_PERIOD 4
 
 enum condition { NORMAL, UNPLUGGED, FROZEN };
 
@@ -80,9 +80,10 @@ static int16_t sample_at(const labmic_t *mic, uint64_t index)
     return (int16_t)((int)(index % 65536) - 32768);
 }
 
-static void set_tick(const snd_pcm_ioplug_t *io, long nanoseconds)
+static void set_tick(const snd_pcm_ioplug_t *io, long long nanoseconds)
 {
-    struct itimerspec tick = {{0, nanoseconds}, {0, nanoseconds}};
+    struct timespec time = {nanoseconds / 1000000000, nanoseconds % 1000000000};
+    struct itimerspec tick = {time, time};
     timerfd_settime(io->poll_fd, 0, &tick, NULL);
 }
 
@@ -98,7 +99,7 @@ static int mic_start(snd_pcm_ioplug_t *io)
         return -ENODEV;
     mic->first = index_now(mic);
     mic->running = 1;
-    set_tick(io, TICK_NANOSECONDS);
+    set_tick(io, 1000000000LL * io->period_size / io->rate / TICKS_PER_PERIOD);
     return 0;
 }
 

@@ -43,10 +43,13 @@ def main() -> None:
     """Run the command line; an error is one line, and exit status 1."""
     try:
         app()
-    except HearthlogError as error:
+    except (HearthlogError, ModuleNotFoundError) as error:
         if _debug["on"]:
             raise
-        print(f"hearthlog: {error}", file=sys.stderr)
+        message = str(error)
+        if isinstance(error, ModuleNotFoundError):
+            message = f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
+        print(f"hearthlog: {message}", file=sys.stderr)
         sys.exit(1)
 
 
