@@ -30,7 +30,9 @@ for verb in (record, devices, info, train, review, demo):
 @app.callback()
 def options(
     *,
-    debug: Annotated[bool, typer.Option(help="Show where in the code an error came from.")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show where in the code an error came from.")
+    ] = False,
 ) -> None:
     """Listen to a home: sound to features and labels, in logs that anyone can open."""
     _debug["on"] = debug
