@@ -74,4 +74,5 @@ def day(tmp_path_factory) -> Path:
     """Three minutes of a simulated home, as FLAC."""
     path = tmp_path_factory.mktemp("day") / "day.flac"
     write_day(path, minutes=3, seed=12)
+    os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
     return path

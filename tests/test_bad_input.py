@@ -1,5 +1,6 @@
 """Bad input gets one line that says what is wrong, the right exit status, and loses nothing."""
 
+import os
 import shutil
 import subprocess
 from contextlib import contextmanager
@@ -33,6 +34,7 @@ def refused(hearthlog):
 def sound(tmp_path):
     path = tmp_path / "sound.wav"
     soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 48_000), 16_000)
+    os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
     return path
 
 
@@ -80,7 +82,8 @@ def test_a_bad_second_file_is_refused_before_the_first_is_recorded(refused, day,
 def test_a_sound_shorter_than_a_second_has_features_and_no_labels(hearthlog, tmp_path, model_file):
     path = tmp_path / "short.wav"
     soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 15_999), 16_000)
-    result = hearthlog("record", path, "--model", model_file, "-o", tmp_path / "logs")
+    options = ("-o", tmp_path / "logs", "--start", "2026-03-01")
+    result = hearthlog("record", path, "--model", model_file, *options)
     assert result.returncode == 0
     (log,) = (tmp_path / "logs").rglob("*.mcap")
     topics = [item.topic for item in LogReader(log).messages()]
@@ -138,7 +141,7 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
     long = tmp_path / "long.wav"
     soundfile.write(long, np.random.default_rng(0).normal(0, 0.1, 16_000 * 300), 16_000)
     with small_disk(tmp_path / "disk") as disk:
-        message = refused("record", long, "-o", disk)
+        message = refused("record", long, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert message == (
             f"{disk}: cannot be written (No space left on device); what was recorded is kept and "
             "completed at the next start"

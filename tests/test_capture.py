@@ -19,9 +19,11 @@ SECONDS = 1_000_000_000
 
 
 @contextmanager
-def recording(microphone, folder, *options):
+def recording(microphone, folder):
     """Run `hearthlog record` on a microphone; at the end it is asked to stop."""
-    command = [*HEARTHLOG, "record", "--device", microphone.device, "-o", str(folder), *options]
+    # One file a day, or an hour that ends just now would make two.
+    command = [*HEARTHLOG, "record", "--device", microphone.device, "-o", str(folder)]
+    command += ["--max-bag-duration", "86400"]
     with subprocess.Popen(
         command, env=microphone.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

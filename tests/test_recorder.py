@@ -213,7 +213,8 @@ def test_killed_at_any_moment_at_most_a_second_is_lost_and_the_next_start_comple
 
 
 def start_realtime(file, logs):
-    return subprocess.Popen([*HEARTHLOG, "record", str(file), "-o", str(logs), "--realtime"])
+    options = ["-o", str(logs), "--realtime", "--start", "2026-03-01T07:00:00"]
+    return subprocess.Popen([*HEARTHLOG, "record", str(file), *options])
 
 
 def wait_for_log(logs, seconds):
