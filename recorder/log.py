@@ -1,12 +1,14 @@
 """The log that is being recorded: one file after another, aligned to the clock."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from recorder.pipeline import Record
+from schemas.errors import LogError
 from schemas.files import log_path
 from schemas.messages import NANOSECONDS, encode, header
 from schemas.topics import Topic, topic
@@ -70,15 +72,21 @@ class RollingLog:
         """Append records, in the order of their log times.
 
         Where time runs backwards, because the clock was set, another file begins.
+
+        Raises
+        ------
+        LogError
+            If the disk refuses; what was written stays, for the next start to complete.
         """
-        for record in records:
-            if not self._last <= record.log_time < self._until:
-                self._roll(record.log_time)
-            self._append(record)
-        if self._flush_at is not None and self._last >= self._flush_at:
-            self.flush()
-        if time.monotonic() - self._synced >= self._sync_seconds:
-            self.sync()
+        with self._keeping_what_was_written():
+            for record in records:
+                if not self._last <= record.log_time < self._until:
+                    self._roll(record.log_time)
+                self._append(record)
+            if self._flush_at is not None and self._last >= self._flush_at:
+                self.flush()
+            if time.monotonic() - self._synced >= self._sync_seconds:
+                self.sync()
 
     def flush(self) -> None:
         """Hand what was written to the operating system."""
@@ -94,17 +102,36 @@ class RollingLog:
         self._synced = time.monotonic()
 
     def finish(self, records: Sequence[Record] = ()) -> None:
-        """Append the last records to the file that is open, and complete it."""
-        if self._writer is not None:
-            for record in records:
-                self._append(record)
-            self.finished.append(self._writer.finish())
-            self._writer = None
+        """Append the last records to the file that is open, and complete it.
 
-    def abandon(self) -> None:
-        """Leave the open file as it is, for the next start to complete."""
+        Raises
+        ------
+        LogError
+            If the disk refuses; what was written stays, for the next start to complete.
+        """
+        with self._keeping_what_was_written():
+            if self._writer is not None:
+                for record in records:
+                    self._append(record)
+            self._finish_file()
+
+    @contextmanager
+    def _keeping_what_was_written(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            kept = ""
+            if self._writer is not None:
+                self._writer.abandon()
+                self._writer = None
+                kept = "; what was recorded is kept and completed at the next start"
+            what = error.strerror or str(error)
+            root = self._description.root
+            raise LogError(f"{root}: cannot be written ({what}){kept}") from error
+
+    def _finish_file(self) -> None:
         if self._writer is not None:
-            self._writer.abandon()
+            self.finished.append(self._writer.finish())
             self._writer = None
 
     def _append(self, record: Record) -> None:
@@ -115,7 +142,7 @@ class RollingLog:
             self._flush_at = record.log_time + self._flush_nanoseconds
 
     def _roll(self, stamp: int) -> None:
-        self.finish()
+        self._finish_file()
         about = self._description
         path = log_path(about.root, about.node, stamp)
         self._writer = LogWriter(path, about.topics, about.metadata, about.attachments, stamp)

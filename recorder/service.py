@@ -13,16 +13,14 @@ from models.classifier import Classifier
 from models.modelfile import Model, load_model
 from recorder import features
 from recorder.config import Settings
-from recorder.errors import SourceError
 from recorder.log import LogDescription, RollingLog
 from recorder.pipeline import Pipeline
-from recorder.recovery import recover_active
+from recorder.recovery import Recovered, recover_active
 from recorder.sources.microphone import MicrophoneSource
 from recorder.sources.replayed import FileSource
 from recorder.statistics import WINDOW_FRAMES
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
 from schemas import messages
-from schemas.errors import LogError
 from schemas.messages import header, message
 from schemas.topics import topics_of
 from schemas.writer import Attachment
@@ -41,9 +39,13 @@ class Source(Protocol):
 
 @dataclass
 class Recording:
-    """What was recorded: finished logs, frames heard, and gaps between them."""
+    """What was recorded: finished logs, frames heard, and gaps between them.
+
+    `recovered` are the logs of an earlier recorder that were completed first.
+    """
 
     logs: list[Path]
+    recovered: list[Recovered]
     frames: int = 0
     frames_lost: int = 0
     gaps: int = 0
@@ -52,9 +54,20 @@ class Recording:
 def record_files(
     settings: Settings, paths: Sequence[Path], start: int, stop: Flag, *, realtime: bool
 ) -> Recording:
-    """Record audio files as if a microphone had heard them from `start` on."""
-    recover_active(settings.output, settings.node)
-    return record(settings, FileSource(paths, start, realtime=realtime), stop)
+    """Record audio files as if a microphone had heard them from `start` on.
+
+    Raises
+    ------
+    SourceError
+        If one of them is no audio.
+    ModelError
+        If the model cannot be used.
+    LogError
+        If the log cannot be written; what was written stays, for the next start to complete.
+    """
+    source = FileSource(paths, start, realtime=realtime)
+    recovered = recover_active(settings.output, settings.node)
+    return _record(settings, source, stop, recovered)
 
 
 def record_microphone(settings: Settings, stop: Flag) -> Recording:
@@ -64,12 +77,14 @@ def record_microphone(settings: Settings, stop: Flag) -> Recording:
     ------
     SourceError
         If it cannot be heard at the start.
+    ModelError, LogError
+        As `record_files`.
     """
     source = MicrophoneSource(settings.microphone[0].device)
     with closing(source):  # it hears, and its pipe holds, while older logs are completed
         recovered = recover_active(settings.output, settings.node)
         end = max((log.end for log in recovered), default=0)
-        return record(settings, _AfterKill(source, end) if end else source, stop)
+        return _record(settings, _AfterKill(source, end) if end else source, stop, recovered)
 
 
 class _AfterKill:
@@ -90,18 +105,9 @@ class _AfterKill:
             yield event
 
 
-def record(settings: Settings, source: Source, stop: Flag) -> Recording:
-    """Record a source until it ends or `stop` is set.
-
-    Raises
-    ------
-    SourceError
-        If the source cannot be heard.
-    ModelError
-        If the model cannot be used.
-    LogError
-        If the log cannot be written; what was written stays, for the next start to complete.
-    """
+def _record(
+    settings: Settings, source: Source, stop: Flag, recovered: list[Recovered]
+) -> Recording:
     model = None if settings.model is None else load_model(settings.model)
     microphone = settings.microphone[0].name
     pipeline = Pipeline(
@@ -113,22 +119,13 @@ def record(settings: Settings, source: Source, stop: Flag) -> Recording:
         settings.flush_seconds,
         settings.sync_seconds,
     )
-    recording = Recording(log.finished)
+    recording = Recording(log.finished, recovered)
     try:
         for event in source.events(stop):
             _count(recording, event)
             log.write(pipeline.push(event))
+    finally:
         log.finish(pipeline.finish())
-    except OSError as error:
-        log.abandon()
-        kept = "; what was recorded is kept and completed at the next start"
-        raise LogError(
-            f"{settings.output}: cannot be written ({error.strerror or error})"
-            + (kept if recording.frames else "")
-        ) from error
-    except SourceError:
-        log.finish(pipeline.finish())
-        raise
     return recording
 
 

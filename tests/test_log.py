@@ -74,5 +74,4 @@ def test_a_file_says_what_it_is_from_its_first_message_on(description, tmp_path)
     log.write(records(0, 1, START))
     (active,) = tmp_path.rglob("*.active")
     assert [item.topic for item in LogReader(active).messages()] == ["/mic/info"]
-    log.abandon()
-    assert active.exists()
+    log.finish()

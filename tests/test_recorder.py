@@ -226,3 +226,20 @@ def wait_for_log(logs, seconds):
     began = time.time()
     time.sleep(seconds)
     return began
+
+
+def test_a_damaged_log_of_an_earlier_recorder_is_reported_with_status_3(
+    day, tmp_path, hearthlog, recorded
+):
+    (log,) = recorded(day).rglob("*.mcap")
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    left = tmp_path / "logs" / "home_20260301T000000Z.mcap.active"
+    left.parent.mkdir()
+    left.write_bytes(data)
+    soundfile.write(tmp_path / "noise.wav", noise(2), 16_000)
+    result = hearthlog("record", tmp_path / "noise.wav", "-o", left.parent)
+    assert result.returncode == 3
+    completed, damage = result.stderr.splitlines()
+    assert completed == f"hearthlog: completed {left.with_suffix('')}, which was left unfinished"
+    assert "damaged at byte" in damage

@@ -47,7 +47,8 @@ def record(
 ) -> None:
     """Record sound to a labelled log, from a microphone or from files.
 
-    SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps.
+    SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps, or a log
+    left by an earlier recorder was damaged.
     """
     from recorder.config import load_settings
     from recorder.service import record_files, record_microphone
@@ -71,10 +72,16 @@ def record(
         recording = record_microphone(settings, stop)
     for log in recording.logs:
         print(log)
+    damaged = [old for old in recording.recovered if old.damage]
+    for old in recording.recovered:
+        typer.echo(f"hearthlog: completed {old.path}, which was left unfinished", err=True)
+    for old in damaged:
+        typer.echo(f"hearthlog: {old.damage}; the original is kept as *.damaged", err=True)
     if recording.gaps:
         typer.echo(
             f"hearthlog: {recording.gaps} gaps, {recording.frames_lost} frames not heard", err=True
         )
+    if damaged or recording.gaps:
         raise typer.Exit(3)
 
 
