@@ -134,11 +134,17 @@ def _usage(process: subprocess.Popen[bytes]) -> dict[int, _Usage]:
     try:
         root = psutil.Process(process.pid)
         return {
-            one.pid: _Usage(sum(one.cpu_times()[:2]), one.memory_full_info().pss)
+            one.pid: _Usage(_seconds_on_cpu(one.pid), one.memory_full_info().pss)
             for one in (root, *root.children(recursive=True))
         }
-    except psutil.Error as error:
+    except (psutil.Error, OSError) as error:
         raise BenchError(f"a process ended while it was measured ({error})") from error
+
+
+def _seconds_on_cpu(pid: int) -> float:
+    """Add up what the scheduler counted for each thread; other figures are sampled at ticks."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
 
 def _imports(work: Workload) -> Row:
