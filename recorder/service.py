@@ -45,7 +45,7 @@ class Recording:
     """
 
     logs: list[Path]
-    recovered: list[Recovered]
+    recovered: Sequence[Recovered]
     frames: int = 0
     frames_lost: int = 0
     gaps: int = 0
@@ -67,7 +67,7 @@ def record_files(
     """
     source = FileSource(paths, start, realtime=realtime)
     recovered = recover_active(settings.output, settings.node)
-    return _record(settings, source, stop, recovered)
+    return record(settings, source, stop, recovered)
 
 
 def record_microphone(settings: Settings, stop: Flag) -> Recording:
@@ -84,7 +84,7 @@ def record_microphone(settings: Settings, stop: Flag) -> Recording:
     with closing(source):  # it hears, and its pipe holds, while older logs are completed
         recovered = recover_active(settings.output, settings.node)
         end = max((log.end for log in recovered), default=0)
-        return _record(settings, _AfterKill(source, end) if end else source, stop, recovered)
+        return record(settings, _AfterKill(source, end) if end else source, stop, recovered)
 
 
 class _AfterKill:
@@ -105,9 +105,10 @@ class _AfterKill:
             yield event
 
 
-def _record(
-    settings: Settings, source: Source, stop: Flag, recovered: list[Recovered]
+def record(
+    settings: Settings, source: Source, stop: Flag, recovered: Sequence[Recovered] = ()
 ) -> Recording:
+    """Record a source until it ends or `stop` is set; raises as `record_files`."""
     model = None if settings.model is None else load_model(settings.model)
     microphone = settings.microphone[0].name
     pipeline = Pipeline(
