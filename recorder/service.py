@@ -51,21 +51,18 @@ class Recording:
     gaps: int = 0
 
 
-def record_files(
-    settings: Settings, paths: Sequence[Path], start: int, stop: Flag, *, realtime: bool
-) -> Recording:
-    """Record audio files as if a microphone had heard them from `start` on.
+def record_files(settings: Settings, source: FileSource, stop: Flag) -> Recording:
+    """Record audio files as if a microphone had heard them.
 
     Raises
     ------
     SourceError
-        If one of them is no audio.
+        If one of them turns out to be damaged.
     ModelError
         If the model cannot be used.
     LogError
         If the log cannot be written; what was written stays, for the next start to complete.
     """
-    source = FileSource(paths, start, realtime=realtime)
     recovered = recover_active(settings.output, settings.node)
     return record(settings, source, stop, recovered)
 

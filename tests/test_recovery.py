@@ -4,12 +4,16 @@ import json
 import random
 import shutil
 import struct
+from threading import Event
 
 import numpy as np
 import pytest
 from logs import features
 
+from recorder.config import load_settings
 from recorder.recovery import recover_active
+from recorder.service import record_files
+from recorder.sources.replayed import FileSource
 from recorder.stream import FRAME_NANOSECONDS
 from schemas.errors import LogError
 from schemas.files import active_path
@@ -23,14 +27,10 @@ CHUNK = 0x06
 @pytest.fixture(scope="module")
 def log(tmp_path_factory, day, model_file):
     """A finished log of three minutes."""
-    from threading import Event  # noqa: PLC0415
-
-    from recorder.config import load_settings  # noqa: PLC0415
-    from recorder.service import record_files  # noqa: PLC0415
 
     folder = tmp_path_factory.mktemp("whole")
     settings = load_settings(None, {"output": folder, "model": model_file}, {})
-    (path,) = record_files(settings, [day], 10**18, Event(), realtime=False).logs
+    (path,) = record_files(settings, FileSource([day], 10**18), Event()).logs
     return path
 
 

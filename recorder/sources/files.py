@@ -37,16 +37,16 @@ def read_audio(path: Path) -> Iterator[Float32]:
         yield from _resampled(_mono_blocks(audio), audio.samplerate)
 
 
-def check_audio(path: Path) -> None:
-    """Look whether a file can be read as audio.
+def audio_seconds(path: Path) -> float:
+    """Look whether a file can be read as audio, and how long it says that it is.
 
     Raises
     ------
     SourceError
-        If not.
+        If it cannot.
     """
-    with _opened(path):
-        pass
+    with _opened(path) as audio:
+        return float(audio.frames / audio.samplerate)
 
 
 @contextmanager

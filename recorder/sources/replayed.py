@@ -1,7 +1,7 @@
 """Audio files in the place of a microphone."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from threading import Event as Flag
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recorder.errors import SourceError
 from recorder.features import FRAME_SAMPLES
-from recorder.sources.files import check_audio, read_audio
+from recorder.sources.files import audio_seconds, read_audio
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
 from schemas.messages import NANOSECONDS
 
@@ -32,6 +32,8 @@ class FileSource:
         Time of the first sample in nanoseconds of UTC.
     realtime : bool
         Hand on each frame only when its time has come since the first one.
+    progress : callable
+        Told the share of the sound that was handed on.
 
     Raises
     ------
@@ -39,13 +41,20 @@ class FileSource:
         If one of the files is missing, or is no audio.
     """
 
-    def __init__(self, paths: Sequence[Path], start: int, *, realtime: bool = False) -> None:
-        for path in paths:
-            check_audio(path)
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        start: int,
+        *,
+        realtime: bool = False,
+        progress: Callable[[float], None] = lambda _: None,
+    ) -> None:
+        self._seconds = sum(audio_seconds(path) for path in paths)
         self.device = _name(paths)
         self._paths = paths
         self._start = start
         self._realtime = realtime
+        self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Hand on the frames until the files end or `stop` is set.
@@ -68,6 +77,7 @@ class FileSource:
                 yield Health(int(frames.stamps[0]), 0, "reading", {"device": self.device})
             yield frames
             first += len(samples)
+            self._progress(first * FRAME_NANOSECONDS / NANOSECONDS / self._seconds)
         if first == 0:
             files = ", ".join(str(path) for path in self._paths)
             raise SourceError(f"{files}: shorter than one frame of 50 ms")

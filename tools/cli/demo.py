@@ -23,6 +23,7 @@ def demo(
     from analyzer.timeline import save_timeline
     from recorder.config import load_settings
     from recorder.service import record_files
+    from recorder.sources.replayed import FileSource
     from schemas.errors import HearthlogError
     from tools.cli.info import info
     from tools.cli.record import start_time
@@ -49,7 +50,7 @@ def demo(
     settings = load_settings(None, {"output": logs, "model": model}, {})
     start = start_time(_START, day)
     began = time.perf_counter()
-    record_files(settings, [day], start, Flag(), realtime=False)
+    record_files(settings, FileSource([day], start), Flag())
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
     print(f"{_agreement(logs, start, truth):.1%} of the labels are what was simulated")

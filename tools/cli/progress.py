@@ -1,7 +1,8 @@
-"""A progress bar on standard error, when that is a terminal."""
+"""Progress on standard error, when that is a terminal."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -15,3 +16,17 @@ def track(items: Sequence[Item], what: str) -> Iterable[Item]:
     from rich.progress import track as track_with_bar
 
     return track_with_bar(items, what, console=Console(stderr=True), transient=True)
+
+
+@contextmanager
+def share_done(what: str) -> Iterator[Callable[[float], None]]:
+    """Show the share, 0 to 1, that the block reports."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)

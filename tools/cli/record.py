@@ -1,6 +1,7 @@
 """`hearthlog record`: a microphone, or audio files in its place, to a log."""
 
 import signal
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event as Flag
@@ -52,6 +53,8 @@ def record(
     """
     from recorder.config import load_settings
     from recorder.service import record_files, record_microphone
+    from recorder.sources.replayed import FileSource
+    from tools.cli.progress import share_done
 
     given = {
         "output": output,
@@ -65,10 +68,14 @@ def record(
         signal.signal(number, lambda *_: stop.set())
     if files:
         begin = start_time(start, files[0])
-        recording = record_files(settings, files, begin, stop, realtime=realtime)
+        with share_done("recording") as progress:
+            source = FileSource(files, begin, realtime=realtime, progress=progress)
+            recording = record_files(settings, source, stop)
     elif start is not None or realtime:
         raise typer.BadParameter("--start and --realtime go with files")
     else:
+        if sys.stderr.isatty():
+            typer.echo("hearthlog: listening; Ctrl-C completes the log", err=True)
         recording = record_microphone(settings, stop)
     for log in recording.logs:
         print(log)
