@@ -39,14 +39,13 @@ class Source(Protocol):
 
 @dataclass
 class Recording:
-    """What was recorded: finished logs, frames heard, and gaps between them.
+    """What was recorded: finished logs, and the gaps in them.
 
     `recovered` are the logs of an earlier recorder that were completed first.
     """
 
     logs: list[Path]
     recovered: Sequence[Recovered]
-    frames: int = 0
     frames_lost: int = 0
     gaps: int = 0
 
@@ -120,19 +119,13 @@ def record(
     recording = Recording(log.finished, recovered)
     try:
         for event in source.events(stop):
-            _count(recording, event)
+            if isinstance(event, Gap):
+                recording.gaps += 1
+                recording.frames_lost += event.frames_lost
             log.write(pipeline.push(event))
     finally:
         log.finish(pipeline.finish())
     return recording
-
-
-def _count(recording: Recording, event: Event) -> None:
-    if isinstance(event, Frames):
-        recording.frames += len(event.samples)
-    elif isinstance(event, Gap):
-        recording.gaps += 1
-        recording.frames_lost += event.frames_lost
 
 
 def _describe(settings: Settings, source: Source, model: Model | None) -> LogDescription:

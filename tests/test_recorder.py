@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from datetime import UTC, datetime
+from threading import Event
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from models.modelfile import load_model
 from recorder.features import FRAME_SAMPLES, FeatureExtractor
 from recorder.pipeline import Pipeline
 from recorder.sources.files import read_audio
+from recorder.sources.replayed import FileSource
 from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
 from schemas.messages import nanoseconds
 from schemas.reader import LogReader
@@ -170,6 +172,15 @@ def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_second(model_fi
     statistics = [[r.data[20:] for r in x if r.topic == "/mic/statistics"] for x in (before, after)]
     payload = [[data[12:] for data in found] for found in statistics]
     assert payload[0] == payload[1]
+
+
+def test_progress_goes_from_nothing_to_all(day):
+    shares = []
+    for _ in FileSource([day, day], START, progress=shares.append).events(Event()):
+        pass
+    assert shares == sorted(shares)
+    assert shares[0] == pytest.approx(10 / 360)
+    assert shares[-1] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
