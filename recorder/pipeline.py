@@ -13,7 +13,7 @@ from recorder.features import FeatureExtractor
 from recorder.statistics import WINDOW_FRAMES, RollingStatistics
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
 from schemas import messages
-from schemas.messages import NANOSECONDS, duration_message, encode, header, message
+from schemas.messages import duration_message, encode, header, message
 from schemas.rows import Column, encode_rows
 from schemas.topics import DIAGNOSTICS, topic
 
@@ -135,8 +135,7 @@ class Pipeline:
         self, kind: str, frames: Int64, stamps: Int64, columns: Mapping[str, Column]
     ) -> list[Record]:
         common: dict[str, Column] = {
-            "header.stamp.sec": stamps // NANOSECONDS,
-            "header.stamp.nanosec": stamps % NANOSECONDS,
+            "header.stamp": stamps,
             "header.frame_id": self.microphone,
             "frame": frames,
         }

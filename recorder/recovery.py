@@ -2,20 +2,100 @@
 
 import fcntl
 import os
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
-from mcap.writer import Writer
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    Header,
+    McapRecord,
+    Message,
+    Metadata,
+    Schema,
+)
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC, Writer
 
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages, rosbag2
 from schemas.errors import LogError
 from schemas.files import ACTIVE_SUFFIX, SUFFIX, sync_folder
-from schemas.reader import read_records
+
+_RECORD_LIMIT = 256 << 20  # bytes; ours are below 2 MiB
+_HEAD = struct.Struct("<BQ")  # opcode and length
+_READ = {  # the others index these
+    Opcode.HEADER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.ATTACHMENT,
+    Opcode.METADATA,
+    Opcode.FOOTER,
+}
+_TAIL_LIMIT = 64 << 10  # a longer one was not left by a writer that was killed between two flushes
+
+
+def read_records(path: Path) -> Iterator[McapRecord]:
+    """Read the records of a log, those inside chunks too, up to the point where it is cut.
+
+    The last record is a `Footer` if the log is complete.
+
+    Raises
+    ------
+    LogError
+        If this is no MCAP file, or if it is damaged before its end.
+    """
+    with path.open("rb") as stream:
+        magic = stream.read(len(MCAP0_MAGIC))
+        if path.name.endswith(ACTIVE_SUFFIX) and MCAP0_MAGIC.startswith(magic):
+            pass  # at first a writer has written less than that
+        elif magic != MCAP0_MAGIC:
+            raise LogError(f"{path}: is no MCAP file")
+        while True:
+            offset = stream.tell()
+            try:
+                content = _next_record(stream, path.stat().st_size - offset)
+                records = [] if content is None else _parsed(content)
+            except Exception as error:  # the decompressors raise what they like
+                what = str(error) or type(error).__name__
+                raise LogError(f"{path}: damaged at byte {offset} ({what})") from error
+            yield from records
+            if content is None or content[0] == Opcode.FOOTER:
+                return
+
+
+def _next_record(stream: BinaryIO, rest: int) -> bytes | None:
+    """Read one record as it is; None at the end of what was written."""
+    head = stream.read(_HEAD.size)
+    length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else _RECORD_LIMIT
+    if len(head) + length > rest:
+        if rest > _TAIL_LIMIT:
+            raise McapError("a record claims to be longer than the file")
+        return None
+    if length > _RECORD_LIMIT:
+        raise McapError("a record claims to be too large")
+    return head + stream.read(length)
+
+
+def _parsed(content: bytes) -> list[McapRecord]:
+    if content[0] not in _READ:
+        return []
+    record = next(StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True).records)
+    if not isinstance(record, Chunk):
+        return [record]
+    if record.uncompressed_size > _RECORD_LIMIT:
+        raise McapError("a chunk claims to be too large")
+    return breakup_chunk(record, validate_crc=True)
 
 
 @dataclass(frozen=True)

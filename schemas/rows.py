@@ -1,119 +1,246 @@
-"""Encode many messages of one type at once.
+"""Many messages of one type at once: from arrays to payloads, and back."""
 
-The payloads of a channel differ only in their numbers as long as their strings and sequences
-keep their lengths, so one numpy record type describes them all.
-"""
-
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Nodetype
 
-from schemas.messages import typestore
-
-_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian
-_START = len(_ENCAPSULATION)
-_DTYPES = {
-    "int8": "i1", "uint8": "u1", "byte": "u1", "bool": "?",
-    "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
-    "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
-}  # fmt: skip
+from schemas.errors import LogError
+from schemas.layout import Leaf, Messages, MessageType, message_type
+from schemas.messages import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
+Fields = dict[str, NDArray[Any]]
+Bytes = NDArray[np.uint8]
+Int64 = NDArray[np.int64]
+Indices = NDArray[np.intp]
 
 
-def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
+def encode_groups(
+    typename: str, columns: Mapping[str, Column], count: int
+) -> Iterator[tuple[Indices, NDArray[np.void]]]:
     """Encode `count` messages, each field given as one column.
 
     Parameters
     ----------
     typename : str
-    columns : mapping from field path, such as "header.stamp.sec", to its values
-        An array of shape (count,) for a number, of shape (count, k) for a sequence of numbers;
-        for a string, one string for all messages or a sequence of `count` strings.
+    columns : mapping from field path, such as "header.frame_id", to its values
+        An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
+        for an array of numbers; for a string, one for all messages or a sequence of `count`.
     count : int
 
-    Returns
-    -------
-    list of bytes
+    Yields
+    ------
+    rows : np.ndarray [shape=(m,)]
+        Which messages have strings of the same lengths.
+    payloads : np.ndarray [shape=(m,)], of a structured dtype
         Equal to what the typestore gives for each message.
     """
-    constant = {k: v.encode() for k, v in columns.items() if isinstance(v, str)}
-    numbers = {k: v for k, v in columns.items() if isinstance(v, np.ndarray)}
-    texts = {
-        k: [text.encode() for text in v]
-        for k, v in columns.items()
-        if k not in constant and not isinstance(v, np.ndarray)
-    }
-    rows: list[bytes] = [b""] * count
-    for chosen, same in _groups(texts, count):
-        strings = constant | same
-        lengths = {k: len(v) for k, v in strings.items()}
-        lengths |= {k: v.shape[1] for k, v in numbers.items() if v.ndim > 1}
-        dtype = _dtype(typename, tuple(sorted(lengths.items())))
-        block = np.zeros(len(chosen), dtype)
-        block["encapsulation"] = np.void(_ENCAPSULATION)
-        for path, text in strings.items():
-            block[path] = text
-            block[f"{path} length"] = len(text) + 1
-        for path, values in numbers.items():
-            block[path] = values[chosen]
-            if values.ndim > 1:
-                block[f"{path} length"] = values.shape[1]
-        raw, size = block.tobytes(), dtype.itemsize
-        for position, row in enumerate(chosen):
-            rows[row] = raw[position * size : (position + 1) * size]
-    return rows
+    kind = message_type(typename)
+    arrays = {k: v for k, v in columns.items() if isinstance(v, np.ndarray) and v.dtype != object}
+    texts = {k: v for k, v in columns.items() if k not in arrays}
+    for rows, strings in _groups(texts, count):
+        lengths = {k: len(text) + 1 for k, text in strings.items()}
+        lengths |= {k: v.shape[1] for k, v in arrays.items() if v.ndim > 1}
+        layout = kind.layout_for(lengths)
+        block = np.zeros(len(rows), layout.dtype)
+        for name, value in layout.fixed.items():
+            block[name] = value
+        for leaf in layout.leaves:
+            _fill(block, leaf, arrays, strings, rows)
+        yield rows, block
 
 
-def _groups(
-    texts: Mapping[str, list[bytes]], count: int
-) -> list[tuple[NDArray[np.intp], dict[str, bytes]]]:
+def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
+    """Encode messages as `encode_groups` does, one `bytes` each."""
+    payloads: list[bytes] = [b""] * count
+    for rows, block in encode_groups(typename, columns, count):
+        raw, size = block.tobytes(), block.dtype.itemsize
+        for position, row in enumerate(rows.tolist()):
+            payloads[row] = raw[position * size : (position + 1) * size]
+    return payloads
+
+
+def _fill(
+    block: NDArray[np.void],
+    leaf: Leaf | Messages,
+    arrays: Mapping[str, NDArray[Any]],
+    strings: Mapping[str, bytes],
+    rows: Indices,
+) -> None:
+    if isinstance(leaf, Messages) or leaf.kind == "texts":
+        raise LogError(f"{leaf.path}: arrays of texts or messages are encoded one by one")
+    if leaf.kind == "text":
+        if strings[leaf.path]:
+            block[leaf.path] = np.void(strings[leaf.path])
+        return
+    values = arrays[leaf.path]
+    values = values if len(rows) == len(values) else values[rows]
+    if leaf.kind == "stamp":
+        block[leaf.path]["sec"] = values // NANOSECONDS
+        block[leaf.path]["nanosec"] = values % NANOSECONDS
+    else:
+        block[leaf.path] = values
+
+
+def _groups(texts: Mapping[str, Any], count: int) -> list[tuple[Indices, dict[str, bytes]]]:
     """Group the rows whose strings are the same."""
-    if not texts:
-        return [(np.arange(count), {})]
-    found: dict[tuple[bytes, ...], list[int]] = {}
-    for row, values in enumerate(zip(*texts.values(), strict=True)):
+    constant = {k: v.encode() for k, v in texts.items() if isinstance(v, str)}
+    varying = {k: v for k, v in texts.items() if not isinstance(v, str)}
+    if not varying:
+        return [(np.arange(count), constant)]
+    found: dict[tuple[str, ...], list[int]] = {}
+    for row, values in enumerate(zip(*varying.values(), strict=True)):
         found.setdefault(values, []).append(row)
     return [
-        (np.array(rows), dict(zip(texts, values, strict=True))) for values, rows in found.items()
+        (
+            np.array(rows, np.intp),
+            constant | {k: v.encode() for k, v in zip(varying, values, strict=True)},
+        )
+        for values, rows in found.items()
     ]
 
 
-@cache
-def _dtype(typename: str, lengths: tuple[tuple[str, int], ...]) -> np.dtype[np.void]:
-    """Lay out a message whose strings and sequences have the given lengths."""
-    known = dict(lengths)
-    names, formats, offsets = ["encapsulation"], [f"V{_START}"], [0]
-    end = _START
+def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
+    """Copy pieces of `size` bytes, at any offsets, out of a buffer.
 
-    def add(name: str, form: str, alignment: int) -> None:
-        nonlocal end
-        start = end + (_START - end) % alignment
-        names.append(name)
-        formats.append(form)
-        offsets.append(start)
-        end = start + np.dtype(form).itemsize
+    Returns
+    -------
+    np.ndarray [shape=(n,)], of dtype V`size`
+    """
+    # A view whose elements overlap: one for every offset at which a piece may begin.
+    view: NDArray[np.void] = np.ndarray(
+        (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
+    )
+    return view[offsets]
 
-    def walk(name: str, prefix: str) -> None:
-        for field, (node, kind) in typestore().fielddefs[name][1]:
-            path = f"{prefix}{field}"
-            if node is Nodetype.NAME:
-                walk(str(kind), f"{path}.")
-            elif node is Nodetype.BASE and kind[0] == "string":
-                add(f"{path} length", "<u4", 4)
-                add(path, f"S{known[path] + 1}", 1)
-            elif node is Nodetype.BASE:
-                form = _DTYPES[str(kind[0])]
-                add(path, form, np.dtype(form).itemsize)
-            else:
-                form = _DTYPES[str(kind[0][1][0])]
-                add(f"{path} length", "<u4", 4)
-                add(path, f"({known[path]},){form}", np.dtype(form).itemsize)
 
-    walk(typename, "")
-    layout = {"names": names, "formats": formats, "offsets": offsets, "itemsize": end}
-    return np.dtype(layout)  # type: ignore[call-overload]
+def decode_rows(
+    kind: MessageType,
+    buffer: Bytes,
+    offsets: Int64,
+    sizes: Int64,
+    fields: Collection[str] | None = None,
+) -> Fields:
+    """Decode messages of one type.
+
+    Parameters
+    ----------
+    kind : MessageType
+    buffer : np.ndarray [shape=(b,)], uint8
+    offsets, sizes : np.ndarray [shape=(n,)], int64
+        Where in the buffer the payloads are.
+    fields : collection of str, optional
+        Paths of the fields that are wanted; all by default.
+
+    Returns
+    -------
+    dict of str to np.ndarray [shape=(n, ...)]
+        By field path: numbers as they are, stamps and durations as int64 nanoseconds, strings as
+        objects (`str`), arrays of numbers or strings with one row each, or as objects where their
+        lengths differ, arrays of messages as lists of dicts.
+
+    Raises
+    ------
+    LogError
+        If a payload is not of this type.
+    """
+    parts: list[tuple[Indices, Fields]] = []
+    for size in np.unique(sizes).tolist():
+        rows = np.flatnonzero(sizes == size)
+        parts += _decode_same_size(kind, rows, gather(buffer, offsets[rows], size), fields)
+    return _scattered(parts, len(sizes))
+
+
+def _decode_same_size(
+    kind: MessageType, rows: Indices, payloads: NDArray[np.void], fields: Collection[str] | None
+) -> Iterator[tuple[Indices, Fields]]:
+    """Decode payloads by layout; yield which rows have it, and their fields."""
+    known = iter([*kind.layouts(payloads.dtype.itemsize)])
+    while len(rows):
+        layout = next(known, None) or kind.layout_of(memoryview(payloads[0].tobytes()))
+        block = payloads.view(layout.dtype)
+        fitting = layout.fits(block)
+        if fitting.all():
+            yield rows, _decode(layout.leaves, block, fields)
+            return
+        if fitting.any():
+            yield rows[fitting], _decode(layout.leaves, block[fitting], fields)
+            rows, payloads = rows[~fitting], payloads[~fitting]
+
+
+def _decode(
+    leaves: Sequence[Leaf | Messages], block: NDArray[np.void], fields: Collection[str] | None
+) -> Fields:
+    return {
+        leaf.path: _values(leaf, block) for leaf in leaves if fields is None or leaf.path in fields
+    }
+
+
+def _values(leaf: Leaf | Messages, block: NDArray[np.void]) -> NDArray[Any]:
+    if isinstance(leaf, Messages):
+        return _messages(leaf, block)
+    if leaf.kind == "texts":
+        rows = [_texts(block, name) for name in leaf.names]
+        return np.stack(rows, axis=1) if rows else np.empty((len(block), 0), object)
+    if leaf.kind == "text":
+        return _texts(block, leaf.path)
+    values = block[leaf.path]
+    if leaf.kind == "stamp":
+        return values["sec"].astype(np.int64) * NANOSECONDS + values["nanosec"]
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+
+
+def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
+    """Decode strings of one length; equal ones become one object."""
+    assert block.dtype.names is not None
+    if name not in block.dtype.names:
+        return np.full(len(block), "", object)
+    raw = np.ascontiguousarray(block[name])
+    if (raw == raw[:1]).all():
+        return np.full(len(block), _text(raw[0], name), object)
+    distinct, which = np.unique(raw, return_inverse=True)
+    return np.array([_text(value, name) for value in distinct], object)[which]
+
+
+def _text(value: np.void, name: str) -> str:
+    try:
+        return value.tobytes().decode()
+    except UnicodeDecodeError as error:
+        raise LogError(f"{name}: a string is not UTF-8") from error
+
+
+def _messages(array: Messages, block: NDArray[np.void]) -> NDArray[np.object_]:
+    """Turn an array of messages into one list of dicts a row."""
+    elements = []
+    for leaves in array.elements:
+        columns = {leaf.path.rpartition("].")[2]: _values(leaf, block) for leaf in leaves}
+        lists = [column.tolist() for column in columns.values()]
+        elements.append([dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)])
+    rows = zip(*elements, strict=True) if elements else iter([()] * len(block))
+    return np.fromiter(map(list, rows), object, len(block))
+
+
+def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
+    """Put rows that were decoded apart back into their order."""
+    if len(parts) == 1:
+        return parts[0][1]
+    found: Fields = {}
+    for path in parts[0][1] if parts else ():
+        columns = [(rows, fields[path]) for rows, fields in parts]
+        like = columns[0][1]
+        if all(c.dtype == like.dtype and c.shape[1:] == like.shape[1:] for _, c in columns):
+            values = np.empty((count, *like.shape[1:]), like.dtype)
+        else:
+            values = np.empty(count, object)
+            columns = [(rows, ragged(column)) for rows, column in columns]
+        for rows, column in columns:
+            values[rows] = column
+        found[path] = values
+    return found
+
+
+def ragged(column: NDArray[Any]) -> NDArray[np.object_]:
+    """Make each row of an array an object of its own."""
+    return np.fromiter(column, object, len(column))

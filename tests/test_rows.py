@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas import messages
-from schemas.messages import NANOSECONDS, encode, header, message
+from schemas.messages import encode, header, message
 from schemas.rows import encode_rows
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
@@ -14,8 +14,7 @@ NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=
 
 def common(stamps, name, frames):
     return {
-        "header.stamp.sec": stamps // NANOSECONDS,
-        "header.stamp.nanosec": stamps % NANOSECONDS,
+        "header.stamp": stamps,
         "header.frame_id": name,
         "frame": frames,
     }

@@ -1,0 +1,243 @@
+"""Read topics of logs as columns, in the order of time and within bounded memory."""
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.chunks import RawMessages
+from schemas.errors import LogError
+from schemas.layout import message_type
+from schemas.rows import Fields, Int64, decode_rows, ragged
+from schemas.series import iterate_messages
+
+_BLOCK = 8 << 20  # bytes
+_HEADS = ("log_times", "publish_times", "sequences")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Messages of one topic as arrays, one row each.
+
+    `columns["values"]` is the column of a field, by its path ("header.stamp" for one of a message
+    in the message): numbers as they are; stamps and durations as int64 nanoseconds; strings as
+    `str` objects; arrays as one row each, or as objects where their lengths differ; arrays of
+    messages as lists of dicts.
+
+    Attributes
+    ----------
+    topic, type : str
+    metadata : mapping of str to str
+        Of the channel.
+    log_times, publish_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds; log times ascend.
+    sequences : np.ndarray [shape=(n,)], uint32
+    fields : dict of str to np.ndarray [shape=(n, ...)]
+    """
+
+    topic: str
+    type: str
+    metadata: Mapping[str, str]
+    log_times: Int64
+    publish_times: Int64
+    sequences: NDArray[np.uint32]
+    fields: Fields
+
+    def __len__(self) -> int:
+        return len(self.log_times)
+
+    def __getitem__(self, path: str) -> NDArray[Any]:
+        return self.fields[path]
+
+
+def read_columns(
+    logs: Iterable[Path],
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    end: int | None = None,
+    fields: Collection[str] | None = None,
+) -> dict[str, Columns]:
+    """Read topics of some logs as one series each.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    topics : collection of str, optional
+        All by default.
+    start, end : int, optional
+        Log times, in nanoseconds: from `start` on, before `end`.
+    fields : collection of str, optional
+        Paths of the fields that are wanted; all by default.
+
+    Returns
+    -------
+    dict of str to Columns
+        By topic; a topic without a message is not there. Where the files of a topic do not agree
+        on its metadata, only what they agree on is kept.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if its messages are not of the type that it says, or if two logs
+        have different types on one topic.
+    """
+    found: dict[str, _Pile] = {}
+    for batch in iterate_columns(logs, topics, start, end, fields):
+        for columns in batch:
+            found.setdefault(columns.topic, _Pile()).add(columns)
+    return {topic: found.pop(topic).columns() for topic in list(found)}
+
+
+def iterate_columns(
+    logs: Iterable[Path],
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    end: int | None = None,
+    fields: Collection[str] | None = None,
+) -> Iterator[list[Columns]]:
+    """Read topics of some logs piece by piece; parameters and errors as of `read_columns`.
+
+    Yields
+    ------
+    list of Columns
+        The next span of time: one for each topic that speaks in it, or more where its channels
+        differ in type or metadata. Nothing is older than what was yielded before.
+    """
+    for messages in iterate_messages(logs, topics, start, end):
+        yield decode(messages, fields)
+
+
+def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
+    """Decode messages, those of one topic, type and metadata together.
+
+    Raises
+    ------
+    LogError
+        If they are not of the type that their channel says, or not encoded as CDR.
+    """
+    parts: dict[Any, list[Columns]] = {}
+    for raw in messages:
+        columns = _decode(raw, fields)
+        key = columns.topic, columns.type, tuple(sorted(columns.metadata.items()))
+        parts.setdefault(key, []).append(columns)
+    return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
+
+
+def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
+    topic, schema = raw.channel.topic, raw.schema
+    if schema is None or raw.channel.message_encoding != "cdr":
+        raise LogError(f"{topic}: holds no ROS 2 messages ({raw.channel.message_encoding!r})")
+    try:
+        kind = message_type(schema.name, schema.encoding, schema.data)
+        values = decode_rows(kind, raw.buffer, raw.offsets, raw.sizes, fields)
+    except LogError as error:
+        raise LogError(f"{topic}: {error}") from error
+    return Columns(
+        topic,
+        schema.name,
+        raw.channel.metadata,
+        np.ascontiguousarray(raw.heads["log_time"]),
+        np.ascontiguousarray(raw.heads["publish_time"]),
+        np.ascontiguousarray(raw.heads["sequence"]),
+        values,
+    )
+
+
+def join(parts: Sequence[Columns]) -> Columns:
+    """Put pieces of one topic one after the other.
+
+    Raises
+    ------
+    LogError
+        If they are of different types.
+    """
+    pile = _Pile()
+    for part in parts:
+        pile.add(part)
+    return pile.columns()
+
+
+class _Pile:
+    """Pieces of one topic, until they are joined."""
+
+    def __init__(self) -> None:
+        self._first: Columns | None = None
+        self._metadata: dict[str, str] = {}
+        self._heads = {name: _Growing() for name in _HEADS}
+        self._fields: dict[str, _Growing] = {}
+
+    def add(self, part: Columns) -> None:
+        """Append a piece; it must be of the type of the others."""
+        if self._first is None:
+            self._first, self._metadata = part, dict(part.metadata)
+        if part.type != self._first.type:
+            raise LogError(f"{part.topic}: is of type {self._first.type} and of type {part.type}")
+        self._metadata = dict(self._metadata.items() & part.metadata.items())
+        for name, growing in self._heads.items():
+            growing.append(getattr(part, name))
+        for path, values in part.fields.items():
+            self._fields.setdefault(path, _Growing()).append(values)
+
+    def columns(self) -> Columns:
+        """Return all pieces as one; they are gone then."""
+        assert self._first is not None
+        heads: Any = {name: growing.joined() for name, growing in self._heads.items()}
+        fields = {path: growing.joined() for path, growing in self._fields.items()}
+        return replace(self._first, metadata=self._metadata, fields=fields, **heads)
+
+
+class _Growing:
+    """An array that grows by large blocks.
+
+    Fresh memory is what takes the time: large blocks come in large pages, and are given back one
+    by one while the whole array is filled from them.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: list[NDArray[Any]] = []
+        self._free = 0  # rows at the end of the last block
+
+    def append(self, values: NDArray[Any]) -> None:
+        """Append rows; where their dtype or shape is another, rows become objects."""
+        if self._blocks:
+            kept = self._blocks[-1]
+            if (kept.dtype, kept.shape[1:]) != (values.dtype, values.shape[1:]):
+                self._blocks = [ragged(block) for block in self._blocks]
+                values = ragged(values)
+        while len(values):
+            if not self._free:
+                row = values[:1].nbytes
+                self._free = max(_BLOCK // max(row, 1), 1)
+                self._blocks.append(np.empty((self._free, *values.shape[1:]), values.dtype))
+            block = self._blocks[-1][len(self._blocks[-1]) - self._free :]
+            part = values[: len(block)]
+            block[: len(part)] = part
+            self._free -= len(part)
+            values = values[len(part) :]
+
+    def joined(self) -> NDArray[Any]:
+        """Return all rows as one array, and forget them."""
+        blocks = self._blocks
+        if self._free:
+            blocks[-1] = blocks[-1][: -self._free]
+        whole = np.empty((sum(map(len, blocks)), *blocks[0].shape[1:]), blocks[0].dtype)
+        start = 0
+        while blocks:
+            block = blocks.pop(0)
+            whole[start : start + len(block)] = block
+            start += len(block)
+        return whole
+
+
+def _in_order(columns: Columns) -> Columns:
+    order = np.argsort(columns.log_times, kind="stable")
+    return replace(
+        columns,
+        log_times=columns.log_times[order],
+        publish_times=columns.publish_times[order],
+        sequences=columns.sequences[order],
+        fields={path: values[order] for path, values in columns.fields.items()},
+    )

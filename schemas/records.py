@@ -1,0 +1,157 @@
+"""MCAP at the level of its records: framing, parsing and decompression, within limits.
+
+A file may come from anywhere: no length that it claims is believed before it is checked, and no
+record or chunk may be larger than `LIMIT`.
+"""
+
+import struct
+import threading
+import zlib
+from io import BytesIO
+from typing import Any, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import McapRecord
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+__all__ = ["HEAD", "LIMIT", "MAGIC", "ChunkHead", "McapError", "chunk_head", "decompress", "parse"]
+
+LIMIT = 100 << 20  # bytes; ours are below 2 MiB
+HEAD = struct.Struct("<BQ")  # opcode and length
+_CHUNK = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+_CLASSES: dict[int, Any] = {
+    Opcode.HEADER: records.Header,
+    Opcode.FOOTER: records.Footer,
+    Opcode.SCHEMA: records.Schema,
+    Opcode.CHANNEL: records.Channel,
+    Opcode.CHUNK_INDEX: records.ChunkIndex,
+    Opcode.ATTACHMENT: records.Attachment,
+    Opcode.ATTACHMENT_INDEX: records.AttachmentIndex,
+    Opcode.STATISTICS: records.Statistics,
+    Opcode.METADATA: records.Metadata,
+    Opcode.METADATA_INDEX: records.MetadataIndex,
+    Opcode.SUMMARY_OFFSET: records.SummaryOffset,
+    Opcode.DATA_END: records.DataEnd,
+}
+
+
+class _Content(ReadDataStream):
+    """The content of one record, which must not end within a field."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) != length:
+            raise McapError("a record ends within a field")
+        return data
+
+
+def parse(opcode: int, content: bytes) -> McapRecord | None:
+    """Parse a record that holds no messages; None if this is not one of them.
+
+    Raises
+    ------
+    McapError
+        If it is too short for what it claims to hold.
+    UnicodeDecodeError
+        If a text in it is none.
+    """
+    kind = _CLASSES.get(opcode)
+    return None if kind is None else kind.read(_Content(BytesIO(content)))
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk says of itself, and where in the record its data are."""
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: bytes
+    data: slice
+
+
+def chunk_head(content: bytes | memoryview) -> ChunkHead:
+    """Read the head of a chunk's content.
+
+    Raises
+    ------
+    McapError
+        If it contradicts itself, or claims to be larger than `LIMIT`.
+    """
+    try:
+        start, end, size, crc, length = _CHUNK.unpack_from(content)
+        first = _CHUNK.size + length
+        compression = bytes(content[_CHUNK.size : first])
+        (stored,) = _LENGTH.unpack_from(content, first)
+    except struct.error as error:
+        raise McapError("a chunk is too short") from error
+    first += _LENGTH.size
+    if first + stored > len(content):
+        raise McapError("a chunk is shorter than it claims")
+    if size > LIMIT:
+        raise McapError("a chunk claims to be too large")
+    return ChunkHead(start, end, size, crc, compression, slice(first, first + stored))
+
+
+def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = False) -> bytes:
+    """Decompress the records of a chunk.
+
+    Parameters
+    ----------
+    head : ChunkHead
+    content : bytes-like
+        The chunk's record, without opcode and length.
+    check : bool
+        Whether to compare with its checksum, which takes longer than to decompress.
+
+    Raises
+    ------
+    McapError
+        If the data are damaged.
+    """
+    data = content[head.data]
+    try:
+        raw = _DECOMPRESS[head.compression](data, head.size)
+    except KeyError as error:
+        raise McapError(f"a chunk has unknown compression {head.compression!r}") from error
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:  # the last two are lz4's
+        raise McapError(f"a chunk cannot be decompressed ({error})") from error
+    if len(raw) != head.size:
+        raise McapError("a chunk has another size than it claims")
+    if check and head.crc and zlib.crc32(raw) != head.crc:
+        raise McapError("a chunk has another checksum than it claims")
+    return raw
+
+
+def _zstd(data: bytes | memoryview, size: int) -> bytes:
+    if zstandard.frame_content_size(data) not in {size, -1}:  # it would be allocated unseen
+        raise McapError("a chunk has another size than it claims")
+    return _LOCAL.zstd.decompress(data, max_output_size=size) if size else b""
+
+
+def _lz4(data: bytes | memoryview, size: int) -> bytes:
+    stream = lz4.frame.LZ4FrameDecompressor()
+    return bytes(stream.decompress(data, max_length=size + 1))
+
+
+class _Local(threading.local):
+    """Decompressors are dear to make and must not be shared between threads."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_LOCAL = _Local()
+
+
+def _stored(data: bytes | memoryview, _size: int) -> bytes:
+    return bytes(data)
+
+
+_DECOMPRESS = {b"zstd": _zstd, b"lz4": _lz4, b"": _stored}
