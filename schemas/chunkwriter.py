@@ -6,7 +6,7 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -16,13 +16,17 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from schemas.chunks import MESSAGE_HEAD
+from schemas.chunks import MESSAGE_HEAD, RawMessages
 from schemas.records import HEAD, MAGIC
-from schemas.rows import Int64
+from schemas.rows import Int64, gather
 
 CHUNK_SIZE = 1 << 20
+_COMPRESSION = b"zstd"
+_LAST = 1 << 63
+_MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<BQQQQII")
 _INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
+_ENTRY = struct.Struct("<QQ")
 _INDEX_HEAD = struct.Struct("<BQHI")
 _FOOTER_START = struct.Struct("<BQQQ")
 
@@ -62,6 +66,30 @@ class Block(NamedTuple):
         return whole.view(f"V{whole.dtype.itemsize}")
 
 
+def blocks_of(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
+    """Group messages that were read by the sizes of their payloads, to write them as they are.
+
+    Parameters
+    ----------
+    messages : RawMessages
+    channel : int
+        Number of the channel that they are written to.
+    first_rank : int
+        Rank of the first of them; the others follow.
+    """
+    for size in np.unique(messages.sizes).tolist():
+        rows = np.flatnonzero(messages.sizes == size)
+        heads = messages.heads[rows]
+        yield Block(
+            channel,
+            heads["log_time"],
+            heads["publish_time"],
+            heads["sequence"],
+            gather(messages.buffer, messages.offsets[rows], size),
+            first_rank + rows,
+        )
+
+
 class ChunkWriter:
     """Writes an MCAP file, chunks compressed with Zstandard and indexed.
 
@@ -79,7 +107,8 @@ class ChunkWriter:
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._content = bytearray()  # of the chunk in progress
-        self._entries: dict[int, list[NDArray[np.void]]] = {}  # its index, by channel
+        self._entries: dict[int, bytearray] = {}  # its index, by channel
+        self._span = (_LAST, 0)
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
@@ -134,8 +163,23 @@ class ChunkWriter:
         self._content += _encoded(channel)
         return channel.id
 
+    def add_message(
+        self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
+    ) -> None:
+        """Append a message."""
+        entry = _ENTRY.pack(log_time, len(self._content))
+        self._entries.setdefault(channel_id, bytearray()).extend(entry)
+        length = _MESSAGE.size - HEAD.size + len(data)
+        self._content += _MESSAGE.pack(
+            Opcode.MESSAGE, length, channel_id, sequence, log_time, publish_time
+        )
+        self._content += data
+        self._span = min(self._span[0], log_time), max(self._span[1], log_time)
+        if len(self._content) > self._chunk_size:
+            self.flush()
+
     def write(self, blocks: Sequence[Block]) -> None:
-        """Append messages, in the order of their log times."""
+        """Append blocks of messages, in the order of their log times."""
         blocks = [block for block in blocks if len(block.log_times)]
         if not blocks:
             return
@@ -159,45 +203,38 @@ class ChunkWriter:
         """End the chunk in progress."""
         if not self._entries:
             return
-        content = bytes(self._content)
-        times = np.concatenate([part["time"] for parts in self._entries.values() for part in parts])
-        start, end = int(times.min()), int(times.max())
-        data = self._compressor.compress(content)
-        head = _CHUNK.pack(
-            Opcode.CHUNK,
-            _CHUNK.size - HEAD.size + 4 + 8 + len(data),
-            start,
-            end,
-            len(content),
-            zlib.crc32(content),
-            4,
-        )
+        start, end = self._span
+        size = len(self._content)
+        data = self._compressor.compress(self._content)
+        length = _CHUNK.size - HEAD.size + len(_COMPRESSION) + 8 + len(data)
+        crc = zlib.crc32(self._content)
+        head = _CHUNK.pack(Opcode.CHUNK, length, start, end, size, crc, len(_COMPRESSION))
         offset = self._stream.tell()
-        self._stream.write(head + b"zstd" + struct.pack("<Q", len(data)))
+        self._stream.write(head + _COMPRESSION + struct.pack("<Q", len(data)))
         self._stream.write(data)
         first = self._stream.tell()
         places = {}
-        for channel, parts in self._entries.items():
+        for channel, entries in self._entries.items():
             places[channel] = self._stream.tell()
-            entries = b"".join(part.tobytes() for part in parts)
             head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel, len(entries))
             self._stream.write(head + entries)
-            self._counts[channel] += len(entries) // _INDEX.itemsize
+            self._counts[channel] += len(entries) // _ENTRY.size
         self._chunks.append(
             records.ChunkIndex(
                 chunk_length=first - offset,
                 chunk_start_offset=offset,
-                compression="zstd",
+                compression=_COMPRESSION.decode(),
                 compressed_size=len(data),
                 message_end_time=end,
                 message_index_length=self._stream.tell() - first,
                 message_index_offsets=places,
                 message_start_time=start,
-                uncompressed_size=len(content),
+                uncompressed_size=size,
             )
         )
         self._content.clear()
         self._entries.clear()
+        self._span = (_LAST, 0)
 
     def finish(self) -> None:
         """Complete the file; the stream stays open."""
@@ -271,7 +308,10 @@ class ChunkWriter:
     def _add_entries(self, channels: Int64, entries: NDArray[np.void]) -> None:
         found, places = np.unique(channels, return_index=True)
         for channel in found[np.argsort(places)].tolist():
-            self._entries.setdefault(channel, []).append(entries[channels == channel])
+            same = entries[channels == channel].tobytes()
+            self._entries.setdefault(channel, bytearray()).extend(same)
+        times = entries["time"]
+        self._span = min(self._span[0], int(times.min())), max(self._span[1], int(times.max()))
 
     def _write(self, record: records.McapRecord) -> tuple[int, int]:
         """Write a record; return its offset and its length."""

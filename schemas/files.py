@@ -2,6 +2,8 @@
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -58,3 +60,37 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_new(path: Path) -> None:
+    """Raise LogError unless a file or folder can be made under this name."""
+    if os.path.lexists(path):
+        raise LogError(f"{path}: exists already; choose another name, or delete it first")
+    if not path.parent.is_dir():
+        raise LogError(f"{path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise LogError(f"{path}: the folder cannot be written to")
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Make a file: yield a temporary name to write to, and give it its own when that went well.
+
+    Raises
+    ------
+    LogError
+        If there is such a file already, or if it cannot be written.
+    """
+    check_new(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        path.open("xb").close()  # the name is ours now: unlike a rename, never over another file
+        temporary.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)

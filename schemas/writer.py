@@ -7,21 +7,22 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
-from mcap.writer import Writer
+import numpy as np
 
 from schemas import rosbag2
+from schemas.chunkwriter import Block, ChunkWriter
 from schemas.errors import LogError
 from schemas.files import active_path, sync_folder
 from schemas.messages import definition, type_hash
+from schemas.rows import Column, Int64, encode_groups
 from schemas.topics import Topic
 
 PROFILE = "ros2"
 ENCODING = "cdr"
 SCHEMA_ENCODING = "ros2msg"
 METADATA = "hearthlog"
-_CHUNK_SIZE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,23 @@ class Attachment:
     name: str
     media_type: str
     data: bytes
+
+
+class Rows(NamedTuple):
+    """Messages of one topic as columns.
+
+    Attributes
+    ----------
+    topic : str
+    log_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds; the publish times are the same.
+    fields : mapping of str to column
+        As `schemas.rows.encode_groups` takes them.
+    """
+
+    topic: str
+    log_times: Int64
+    fields: Mapping[str, Column]
 
 
 class LogWriter:
@@ -72,7 +90,7 @@ class LogWriter:
         self._counts: dict[str, rosbag2.TopicCount] = {}
         self._span: tuple[int, int] | None = None
         self._stream = _create(path, self.active_path)
-        self._writer = Writer(self._stream, chunk_size=_CHUNK_SIZE)
+        self._writer = ChunkWriter(self._stream)
         self._writer.start(profile=PROFILE, library="hearthlog")
         self._writer.add_metadata(METADATA, dict(metadata))
         for item in attachments:
@@ -92,9 +110,28 @@ class LogWriter:
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         """Append one encoded message; its publish time is its log time."""
         self._writer.add_message(self._channels[topic], log_time, data, log_time)
-        self._counts[topic].messages += 1
-        first, last = self._span or (log_time, log_time)
-        self._span = min(first, log_time), max(last, log_time)
+        self._count(topic, 1, log_time, log_time)
+
+    def write_columns(self, batch: Sequence[Rows]) -> None:
+        """Append messages of several topics, in the order of their log times.
+
+        Messages of one time are written in the order of the batch. The file is the same as if
+        they had been encoded and written one by one.
+        """
+        blocks = []
+        first = 0
+        for part in batch:
+            count = len(part.log_times)
+            for rows, payloads in encode_groups(self._counts[part.topic].type, part.fields, count):
+                times = part.log_times[rows]
+                sequences = np.zeros(len(rows), np.uint32)
+                channel = self._channels[part.topic]
+                blocks.append(Block(channel, times, times, sequences, payloads, first + rows))
+            first += count
+            if count:
+                span = int(part.log_times.min()), int(part.log_times.max())
+                self._count(part.topic, count, *span)
+        self._writer.write(blocks)
 
     def flush(self) -> None:
         """End the chunk and hand it to the operating system."""
@@ -121,6 +158,11 @@ class LogWriter:
         """Stop writing and leave the active file as it is, after the disk refused it."""
         with suppress(OSError):  # it is the reason for being here
             self._stream.close()
+
+    def _count(self, topic: str, messages: int, first: int, last: int) -> None:
+        self._counts[topic].messages += messages
+        start, end = self._span or (first, last)
+        self._span = min(start, first), max(end, last)
 
 
 def _create(path: Path, active: Path) -> BinaryIO:
