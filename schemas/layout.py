@@ -18,8 +18,8 @@ from schemas.messages import definition, typestore
 from schemas.records import LIMIT
 
 START = 4  # of the fields: alignment counts from here
-_ENCAPSULATION = {"<": b"\x00\x01\x00\x00", ">": b"\x00\x00\x00\x00"}  # plain CDR, by byte order
-_ORDERS = {value[:2]: order for order, value in _ENCAPSULATION.items()}
+_ENCAPSULATION = {"<": b"\x00\x01", ">": b"\x00\x00"}  # plain CDR, by byte order
+_ORDERS = {value: order for order, value in _ENCAPSULATION.items()}
 _FORMATS = {
     "int8": "i1", "uint8": "u1", "byte": "u1", "char": "u1", "bool": "?",
     "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -117,6 +117,8 @@ class MessageType:
         if walk.end + 3 < len(payload):  # some middleware pads to four bytes
             raise LogError(f"{self.name}: a message is longer than its type")
         found = walk.layout(leaves, len(payload))
+        if not found.fits(np.frombuffer(payload, found.dtype)).all():
+            raise LogError(f"{self.name}: a string in a message has no end")
         if sum(map(len, self._layouts.values())) >= _LAYOUTS_KEPT:
             self._layouts.clear()
         self._layouts.setdefault(len(payload), []).append(found)
@@ -172,7 +174,7 @@ class _Walk:
         self._size = size
         self._depth = 0
         self._steps = 0
-        self._fields: dict[str, tuple[Any, int]] = {"encapsulation": (f"V{START}", 0)}
+        self._fields: dict[str, tuple[Any, int]] = {"encapsulation": ("V2", 0)}
         self._fixed: dict[str, Any] = {"encapsulation": np.void(_ENCAPSULATION[order])}
 
     def layout(self, leaves: tuple[Leaf | Messages, ...], size: int) -> Layout:

@@ -14,17 +14,19 @@ STATISTICS = f"{PACKAGE}/msg/AudioStatistics"
 LABEL = f"{PACKAGE}/msg/AudioLabel"
 SEGMENT = f"{PACKAGE}/msg/AudioSegment"
 GAP = f"{PACKAGE}/msg/AudioGap"
+RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+LOG = "rcl_interfaces/msg/Log"
 
-_OWN = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, GAP)
+_DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, GAP, RAW_AUDIO)
 NANOSECONDS = 1_000_000_000
 
 
 @cache
 def typestore() -> Typestore:
-    """Return the ROS 2 types with those of `hearthlog_msgs` among them."""
+    """Return the types of ROS 2 and those of `schemas/msg`."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name in _OWN:
+    for name in _DEFINED_HERE:
         text = files("schemas").joinpath("msg", name.rpartition("/")[2] + ".msg").read_text()
         store.register(get_types_from_msg(text, name))
     return store

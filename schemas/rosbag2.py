@@ -4,6 +4,8 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from schemas.topics import Quality
+
 METADATA = "rosbag2"
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
@@ -17,15 +19,16 @@ class TopicCount:
     messages: int = 0
 
 
-def channel_metadata(type_hash: str, *, transient_local: bool) -> dict[str, str]:
+def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
     """Return the metadata that a ROS 2 channel must have; JSON is a part of YAML."""
+    seconds = quality.lifespan_seconds
     profile = {
         "history": "keep_last",
-        "depth": 1 if transient_local else 10,
+        "depth": quality.depth,
         "reliability": "reliable",
-        "durability": "transient_local" if transient_local else "volatile",
+        "durability": "transient_local" if quality.transient_local else "volatile",
         "deadline": _FOREVER,
-        "lifespan": _FOREVER,
+        "lifespan": _FOREVER if seconds is None else {"sec": seconds, "nsec": 0},
         "liveliness": "automatic",
         "liveliness_lease_duration": _FOREVER,
         "avoid_ros_namespace_conventions": False,

@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import LogError
-from schemas.layout import Leaf, Messages, MessageType, message_type
+from schemas.layout import Layout, Leaf, Messages, MessageType, message_type
 from schemas.messages import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
 Bytes = NDArray[np.uint8]
 Int64 = NDArray[np.int64]
+_TRIED = 64  # layouts, before rows are looked at one by one
 Indices = NDArray[np.intp]
 
 
@@ -157,17 +158,33 @@ def _decode_same_size(
     kind: MessageType, rows: Indices, payloads: NDArray[np.void], fields: Collection[str] | None
 ) -> Iterator[tuple[Indices, Fields]]:
     """Decode payloads by layout; yield which rows have it, and their fields."""
-    known = iter([*kind.layouts(payloads.dtype.itemsize)])
-    while len(rows):
-        layout = next(known, None) or kind.layout_of(memoryview(payloads[0].tobytes()))
-        block = payloads.view(layout.dtype)
-        fitting = layout.fits(block)
-        if fitting.all():
-            yield rows, _decode(layout.leaves, block, fields)
-            return
+    for layout, same in _by_layout(kind, payloads):
+        block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
+        yield rows[same], _decode(layout.leaves, block, fields)
+
+
+def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[Layout, Indices]]:
+    """Group payloads of one size by layout."""
+    rest = np.arange(len(payloads))
+    for layout in kind.layouts(payloads.dtype.itemsize)[:_TRIED]:
+        fitting = layout.fits(payloads[rest].view(layout.dtype))
         if fitting.any():
-            yield rows[fitting], _decode(layout.leaves, block[fitting], fields)
-            rows, payloads = rows[~fitting], payloads[~fitting]
+            yield layout, rest[fitting]
+            rest = rest[~fitting]
+        if not len(rest):
+            return
+    for _ in range(_TRIED):
+        layout = kind.layout_of(memoryview(payloads[rest[0]].tobytes()))
+        fitting = layout.fits(payloads[rest].view(layout.dtype))
+        yield layout, rest[fitting]
+        rest = rest[~fitting]
+        if not len(rest):
+            return
+    found: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
+    for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
+        layout = kind.layout_of(memoryview(payloads[row].tobytes()))
+        found.setdefault(tuple(layout.fixed.items()), (layout, []))[1].append(row)
+    yield from ((layout, np.array(same)) for layout, same in found.values())
 
 
 def _decode(
@@ -195,11 +212,14 @@ def _values(leaf: Leaf | Messages, block: NDArray[np.void]) -> NDArray[Any]:
 def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
     """Decode strings of one length; equal ones become one object."""
     assert block.dtype.names is not None
+    texts = np.empty(len(block), object)
     if name not in block.dtype.names:
-        return np.full(len(block), "", object)
+        texts.fill("")
+        return texts
     raw = np.ascontiguousarray(block[name])
     if (raw == raw[:1]).all():
-        return np.full(len(block), _text(raw[0], name), object)
+        texts.fill(_text(raw[0], name))
+        return texts
     distinct, which = np.unique(raw, return_inverse=True)
     return np.array([_text(value, name) for value in distinct], object)[which]
 

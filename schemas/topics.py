@@ -8,6 +8,30 @@ from schemas import messages
 from schemas.errors import LogError
 
 DIAGNOSTICS = "/diagnostics"
+ROSOUT = "/rosout"
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The quality of service of a topic, where topics differ: the defaults are those of ROS 2.
+
+    Attributes
+    ----------
+    depth : int
+        How many messages are kept.
+    transient_local : bool
+        They are kept for those who come late.
+    lifespan_seconds : int or None
+        For how long; None: for ever.
+    """
+
+    depth: int = 10
+    transient_local: bool = False
+    lifespan_seconds: int | None = None
+
+
+_LATCHED = Quality(depth=1, transient_local=True)
+_OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # of any ROS 2 node
 
 
 @dataclass(frozen=True)
@@ -16,7 +40,7 @@ class Topic:
 
     name: str
     type: str
-    transient_local: bool = False
+    quality: Quality = Quality()
     array_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
@@ -41,7 +65,7 @@ def topics_of(
     """List what a recorder writes for a microphone; without classes it writes no labels."""
     statistics = {"mean": feature_names, "std": feature_names}
     found = [
-        Topic(topic(microphone, "info"), messages.STREAM_INFO, transient_local=True),
+        Topic(topic(microphone, "info"), messages.STREAM_INFO, _LATCHED),
         Topic(
             topic(microphone, "features"),
             messages.FEATURES,
@@ -50,6 +74,7 @@ def topics_of(
         Topic(topic(microphone, "statistics"), messages.STATISTICS, array_names=statistics),
         Topic(topic(microphone, "gap"), messages.GAP),
         Topic(DIAGNOSTICS, messages.DIAGNOSTICS),
+        Topic(ROSOUT, messages.LOG, _OF_ROSOUT),
     ]
     if classes is not None:
         names = {"probabilities": classes}

@@ -183,5 +183,5 @@ def _create(path: Path, active: Path) -> BinaryIO:
 
 def _channel_metadata(topic: Topic) -> dict[str, str]:
     names = {f"{key}_names": json.dumps(list(value)) for key, value in topic.array_names.items()}
-    ros = rosbag2.channel_metadata(type_hash(topic.type), transient_local=topic.transient_local)
+    ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
     return ros | names

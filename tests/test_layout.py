@@ -1,0 +1,220 @@
+"""Messages of any ROS 2 type come out of their bytes as rosbags decodes them."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
+
+from schemas import messages
+from schemas.errors import LogError
+from schemas.layout import message_type
+from schemas.messages import NANOSECONDS, definition, typestore
+from schemas.rows import decode_rows
+
+TYPES = [
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Path",
+    "rcl_interfaces/msg/ParameterEvent",
+    "rcl_interfaces/msg/Log",
+    "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/CameraInfo",
+    "sensor_msgs/msg/JointState",
+    "sensor_msgs/msg/PointCloud2",
+    "std_msgs/msg/Empty",
+    "std_msgs/msg/Float64MultiArray",
+    "std_msgs/msg/String",
+    "tf2_msgs/msg/TFMessage",
+    "trajectory_msgs/msg/MultiDOFJointTrajectory",
+    messages.LABEL,
+    messages.STREAM_INFO,
+]
+TEXT = st.text(st.characters(codec="utf-8"), max_size=9)
+FORMATS = {
+    "bool": "?", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1",
+    "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+
+@st.composite
+def a_message(draw, typename):
+    """Draw a message with any numbers, texts and lengths."""
+    fields = {}
+    for name, (node, kind) in typestore().fielddefs[typename][1]:
+        if node is Nodetype.NAME:
+            fields[name] = draw(a_message(kind))
+        elif node is Nodetype.BASE:
+            fields[name] = draw(TEXT) if kind[0] == "string" else draw(numbers(kind[0], 1))[0]
+        else:
+            element, count = kind
+            count = count if node is Nodetype.ARRAY else draw(st.integers(0, 3))
+            if element[0] is Nodetype.NAME:
+                fields[name] = [draw(a_message(element[1])) for _ in range(count)]
+            elif element[1][0] == "string":
+                fields[name] = [draw(TEXT) for _ in range(count)]
+            else:
+                fields[name] = draw(numbers(element[1][0], count))
+    if typename in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
+        fields["nanosec"] = fields["nanosec"] % NANOSECONDS
+    return typestore().types[typename](**fields)
+
+
+def numbers(base, count):
+    size = np.dtype(FORMATS[base]).itemsize * count
+    if base == "byte":  # rosbags takes it for signed
+        return st.binary(min_size=count, max_size=count).map(
+            lambda raw: np.frombuffer(raw, np.uint8) & 127
+        )
+    if base == "bool":
+        return st.binary(min_size=count, max_size=count).map(
+            lambda raw: np.frombuffer(raw, np.uint8) % 2 == 1
+        )
+    return st.binary(min_size=size, max_size=size).map(
+        lambda raw: np.frombuffer(raw, FORMATS[base])
+    )
+
+
+def flat(value, prefix=""):
+    """Return the fields of a decoded message by path, in bytes where they are numbers."""
+    found = {}
+    for name in value.__dataclass_fields__:
+        part = getattr(value, name)
+        if name == "__msgtype__" or name.isupper():
+            continue
+        if type(part).__name__.endswith(("msg__Time", "msg__Duration")):
+            found[prefix + name] = part.sec * NANOSECONDS + part.nanosec
+        elif hasattr(part, "__dataclass_fields__"):
+            found |= flat(part, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = plain(part)
+    return found
+
+
+def plain(value):
+    if hasattr(value, "__dataclass_fields__"):
+        return flat(value)
+    if isinstance(value, list | np.ndarray):
+        return [plain(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return struct.pack("<d", value)
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def decoded(typename, payloads):
+    sizes = np.array([len(payload) for payload in payloads])
+    buffer = np.frombuffer(b"".join(payloads), np.uint8)
+    return decode_rows(message_type(typename), buffer, np.cumsum(sizes) - sizes, sizes)
+
+
+@pytest.mark.parametrize("typename", TYPES)
+@settings(deadline=None, max_examples=25)
+@given(st.data())
+def test_messages_of_any_lengths_come_out_as_rosbags_decodes_them(typename, data):
+    drawn = data.draw(st.lists(a_message(typename), min_size=1, max_size=4))
+    payloads = [
+        bytes(typestore().serialize_cdr(m, typename, little_endian=data.draw(st.booleans())))
+        for m in drawn
+    ]
+    columns = decoded(typename, payloads)
+    for row, payload in enumerate(payloads):
+        expected = flat(typestore().deserialize_cdr(payload, typename))
+        assert {path: plain(values[row]) for path, values in columns.items()} == expected
+
+
+def test_a_definition_from_a_file_is_read_as_well_as_one_that_is_known():
+    text = definition(messages.SEGMENT).encode() + b"\n# and another word\n"
+    kind = message_type(messages.SEGMENT, "ros2msg", text)
+    payload = messages.encode(
+        messages.message(
+            messages.SEGMENT,
+            header=messages.header(5, "mic"),
+            duration=messages.duration_message(7),
+            label="speech",
+            confidence=0.5,
+        )
+    )
+    rows = decode_rows(
+        kind, np.frombuffer(payload, np.uint8), np.array([0]), np.array([len(payload)])
+    )
+    assert {path: values.tolist() for path, values in rows.items()} == {
+        "header.stamp": [5],
+        "header.frame_id": ["mic"],
+        "duration": [7],
+        "label": ["speech"],
+        "confidence": [0.5],
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (b"int32 a\nNowhere b", "cannot be read|not defined"),
+        (b"float128 a", "cannot be read|not supported|not defined"),
+        (b"test/msg/Loop a\n" + b"=" * 80 + b"\nMSG: test/msg/Loop\ntest/msg/Loop a", "itself"),
+        (b"uint8[4000000000] a", "ends before"),
+        (b"std_msgs/Header[4000000000] a", "too many"),
+        (b"string[4000000000] a", "too many"),
+        (b"int32 a\n" * 100_000, "too long"),
+        (b"\xff\xfe", "cannot be read"),
+        (b"this is no definition", "cannot be read|not defined"),
+        (b"=" * 200, "cannot be read"),
+    ],
+)
+def test_a_hostile_definition_is_refused(text, what):
+    payload = b"\0\1\0\0" + bytes(40)
+    with pytest.raises(LogError, match=what):
+        decode_rows(
+            message_type("test/msg/Test", "ros2msg", text),
+            np.frombuffer(payload, np.uint8),
+            np.array([0]),
+            np.array([len(payload)]),
+        )
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200))
+def test_no_bytes_make_it_fail_otherwise(payload):
+    for typename in (messages.LABEL, messages.DIAGNOSTICS, messages.STREAM_INFO):
+        try:
+            decoded(typename, [b"\0\1\0\0" + payload])
+        except LogError:
+            continue
+
+
+@pytest.mark.parametrize("damage", ["cut", "long", "no terminator", "not UTF-8", "XCDR2"])
+def test_a_message_that_is_not_of_its_type_is_refused(damage):
+    payload = bytearray(
+        messages.encode(messages.message("std_msgs/msg/String", data="something long enough"))
+    )
+    if damage == "cut":
+        payload = payload[:-3]
+    elif damage == "long":
+        payload += bytes(4)
+    elif damage == "no terminator":
+        payload[-1] = 1
+    elif damage == "not UTF-8":
+        payload[12] = 0xFF
+    else:
+        payload[1] = 7
+    with pytest.raises(LogError):
+        decoded("std_msgs/msg/String", [bytes(payload)])
+
+
+def test_rows_of_more_layouts_than_are_tried_come_out_right():
+    rng = np.random.default_rng(3)
+    texts = ["x" * length for length in rng.permutation(100).repeat(2)]
+    payloads = [
+        messages.encode(
+            messages.message(
+                "diagnostic_msgs/msg/KeyValue", key=text, value="y" * (100 - len(text))
+            )
+        )
+        for text in texts
+    ]
+    assert decoded("diagnostic_msgs/msg/KeyValue", payloads)["key"].tolist() == texts
