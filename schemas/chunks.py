@@ -2,6 +2,8 @@
 
 import struct
 from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -112,6 +114,7 @@ def read_chunks(
             indices.setdefault(identity, []).append((number, entries))
     sizes = np.array([len(content) for content in contents], np.int64)
     buffer = np.frombuffer(b"".join(contents), np.uint8)
+    _define(file, indices.keys())
     batch = _Batch(file, chunks, sizes, buffer)
     read = [
         batch.messages(identity, parts)
@@ -180,6 +183,16 @@ def _walk(file: LogFile, content: memoryview) -> dict[int, bytes]:
             elif isinstance(record, records.Channel):
                 file.channels.setdefault(record.id, record)
     return {identity: b"".join(entries) for identity, entries in found.items()}
+
+
+def _define(file: LogFile, identities: AbstractSet[int]) -> None:
+    """Look for channels that nothing read so far defines, from the first chunk on."""
+    for chunk in np.sort(file.chunks, order="offset"):
+        if identities <= file.channels.keys():
+            return
+        with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
+            content, _ = _read(file, chunk, check=False)
+            _walk(file, memoryview(content))
 
 
 class _Batch(NamedTuple):

@@ -6,7 +6,8 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -66,6 +67,31 @@ class Block(NamedTuple):
         return whole.view(f"V{whole.dtype.itemsize}")
 
 
+class StoredChunk(NamedTuple):
+    """A chunk as a file holds it.
+
+    Attributes
+    ----------
+    compression : bytes
+    data : bytes-like
+        Its records, compressed.
+    size, crc : int
+        Of its records.
+    start, end : int
+        Log times of its first and last message.
+    entries : mapping of int to bytes-like
+        Its message index: by channel, times and offsets of the messages.
+    """
+
+    compression: bytes
+    data: bytes | memoryview
+    size: int
+    crc: int
+    start: int
+    end: int
+    entries: Mapping[int, bytes | bytearray]
+
+
 def blocks_of(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
     """Group messages that were read by the sizes of their payloads, to write them as they are.
 
@@ -102,7 +128,9 @@ class ChunkWriter:
         self._compressor = zstandard.ZstdCompressor()
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
-        self._chunks: list[records.ChunkIndex] = []
+        self._chunk_indexes = bytearray()  # as it will be written: there may be very many
+        self._chunk_count = 0
+        self._file_span = (_LAST, 0)
         self._attachments: list[records.AttachmentIndex] = []
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
@@ -124,32 +152,23 @@ class ChunkWriter:
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
         """Write an attachment."""
-        offset, length = self._write(
-            records.Attachment(
-                create_time=create_time,
-                log_time=log_time,
-                name=name,
-                media_type=media_type,
-                data=data,
-            )
+        record = records.Attachment(create_time, log_time, name, media_type, data)
+        self.copy_attachment(
+            encoded(record),
+            records.AttachmentIndex(0, 0, log_time, create_time, len(data), name, media_type),
         )
-        self._attachments.append(
-            records.AttachmentIndex(
-                offset=offset,
-                length=length,
-                log_time=log_time,
-                create_time=create_time,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
-            )
-        )
+
+    def copy_attachment(self, record: bytes | memoryview, index: records.AttachmentIndex) -> None:
+        """Write an attachment as another file holds it; its place in the index is set here."""
+        offset = self._stream.tell()
+        self._stream.write(record)
+        self._attachments.append(replace(index, offset=offset, length=len(record)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Add a schema and return its number."""
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas.append(schema)
-        self._content += _encoded(schema)
+        self._content += encoded(schema)
         return schema.id
 
     def register_channel(
@@ -160,8 +179,23 @@ class ChunkWriter:
             len(self._channels) + 1, topic, message_encoding, metadata, schema_id
         )
         self._channels.append(channel)
-        self._content += _encoded(channel)
+        self._content += encoded(channel)
         return channel.id
+
+    def define(
+        self, schemas: Sequence[records.Schema], channels: Sequence[records.Channel]
+    ) -> None:
+        """Set the schemas and channels of the index, whose numbers they have already.
+
+        They are not written anywhere else: chunks that were copied contain them, or
+        `write_definition` has put them before their first message.
+        """
+        self._schemas = list(schemas)
+        self._channels = list(channels)
+
+    def write_definition(self, record: records.Schema | records.Channel) -> None:
+        """Write a schema or a channel outside of chunks."""
+        self._write(record)
 
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
@@ -203,67 +237,38 @@ class ChunkWriter:
         """End the chunk in progress."""
         if not self._entries:
             return
-        start, end = self._span
-        size = len(self._content)
         data = self._compressor.compress(self._content)
-        length = _CHUNK.size - HEAD.size + len(_COMPRESSION) + 8 + len(data)
         crc = zlib.crc32(self._content)
-        head = _CHUNK.pack(Opcode.CHUNK, length, start, end, size, crc, len(_COMPRESSION))
-        offset = self._stream.tell()
-        self._stream.write(head + _COMPRESSION + struct.pack("<Q", len(data)))
-        self._stream.write(data)
-        first = self._stream.tell()
-        places = {}
-        for channel, entries in self._entries.items():
-            places[channel] = self._stream.tell()
-            head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel, len(entries))
-            self._stream.write(head + entries)
-            self._counts[channel] += len(entries) // _ENTRY.size
-        self._chunks.append(
-            records.ChunkIndex(
-                chunk_length=first - offset,
-                chunk_start_offset=offset,
-                compression=_COMPRESSION.decode(),
-                compressed_size=len(data),
-                message_end_time=end,
-                message_index_length=self._stream.tell() - first,
-                message_index_offsets=places,
-                message_start_time=start,
-                uncompressed_size=size,
-            )
-        )
+        size = len(self._content)
+        self._put(StoredChunk(_COMPRESSION, data, size, crc, *self._span, self._entries))
         self._content.clear()
         self._entries.clear()
         self._span = (_LAST, 0)
+
+    def copy_chunk(self, chunk: StoredChunk) -> None:
+        """Write a chunk of another file as it is, and its message index behind it."""
+        self.flush()
+        self._put(chunk)
 
     def finish(self) -> None:
         """Complete the file; the stream stays open."""
         self.flush()
         self._write(records.DataEnd(0))
         summary_start = self._stream.tell()
-        groups: list[Sequence[records.McapRecord]] = [
-            self._schemas,
-            self._channels,
-            [self._statistics()],
-            self._chunks,
-            self._attachments,
-            self._metadata,
-        ]
-        opcodes = [
-            Opcode.SCHEMA,
-            Opcode.CHANNEL,
-            Opcode.STATISTICS,
-            Opcode.CHUNK_INDEX,
-            Opcode.ATTACHMENT_INDEX,
-            Opcode.METADATA_INDEX,
-        ]
+        groups: dict[int, bytes | bytearray] = {
+            Opcode.SCHEMA: _encoded_all(self._schemas),
+            Opcode.CHANNEL: _encoded_all(self._channels),
+            Opcode.STATISTICS: encoded(self._statistics()),
+            Opcode.CHUNK_INDEX: self._chunk_indexes,
+            Opcode.ATTACHMENT_INDEX: _encoded_all(self._attachments),
+            Opcode.METADATA_INDEX: _encoded_all(self._metadata),
+        }
         summary = bytearray()
         offsets = bytearray()
-        for opcode, group in zip(opcodes, groups, strict=True):
-            encoded = b"".join(_encoded(record) for record in group)
-            place = records.SummaryOffset(opcode, summary_start + len(summary), len(encoded))
-            offsets += _encoded(place)
-            summary += encoded
+        for opcode, group in groups.items():
+            place = records.SummaryOffset(opcode, summary_start + len(summary), len(group))
+            offsets += encoded(place)
+            summary += group
         offset_start = summary_start + len(summary)
         summary += offsets
         footer = _FOOTER_START.pack(Opcode.FOOTER, 20, summary_start, offset_start)
@@ -272,19 +277,53 @@ class ChunkWriter:
         self._stream.write(footer + struct.pack("<I", crc) + MAGIC)
 
     def _statistics(self) -> records.Statistics:
-        starts = [chunk.message_start_time for chunk in self._chunks]
-        ends = [chunk.message_end_time for chunk in self._chunks]
+        start, end = self._file_span
         return records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=sum(self._counts.values()),
-            message_end_time=max(ends, default=0),
-            message_start_time=min(starts, default=0),
+            message_end_time=end,
+            message_start_time=start if self._chunk_count else 0,
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
+
+    def _put(self, chunk: StoredChunk) -> None:
+        """Write a chunk and its message index."""
+        text = len(chunk.compression)
+        length = _CHUNK.size - HEAD.size + text + 8 + len(chunk.data)
+        head = _CHUNK.pack(
+            Opcode.CHUNK, length, chunk.start, chunk.end, chunk.size, chunk.crc, text
+        )
+        offset = self._stream.tell()
+        self._stream.write(head + chunk.compression + struct.pack("<Q", len(chunk.data)))
+        self._stream.write(chunk.data)
+        first = self._stream.tell()
+        places = {}
+        for channel, entries in chunk.entries.items():
+            places[channel] = self._stream.tell()
+            head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel, len(entries))
+            self._stream.write(head)
+            self._stream.write(entries)
+            self._counts[channel] += len(entries) // _ENTRY.size
+        self._chunk_indexes += encoded(
+            records.ChunkIndex(
+                chunk_length=first - offset,
+                chunk_start_offset=offset,
+                compression=chunk.compression.decode(),
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.end,
+                message_index_length=self._stream.tell() - first,
+                message_index_offsets=places,
+                message_start_time=chunk.start,
+                uncompressed_size=chunk.size,
+            )
+        )
+        self._chunk_count += 1
+        start, end = self._file_span
+        self._file_span = min(start, chunk.start), max(end, chunk.end)
 
     def _append(
         self, data: NDArray[np.uint8], ends: Int64, sizes: Int64, channels: Int64, times: Int64
@@ -315,15 +354,20 @@ class ChunkWriter:
 
     def _write(self, record: records.McapRecord) -> tuple[int, int]:
         """Write a record; return its offset and its length."""
-        offset, encoded = self._stream.tell(), _encoded(record)
-        self._stream.write(encoded)
-        return offset, len(encoded)
+        offset, data = self._stream.tell(), encoded(record)
+        self._stream.write(data)
+        return offset, len(data)
 
 
-def _encoded(record: records.McapRecord) -> bytes:
+def encoded(record: records.McapRecord) -> bytes:
+    """Encode a record, opcode and length included."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()
+
+
+def _encoded_all(group: Sequence[records.McapRecord]) -> bytes:
+    return b"".join(encoded(record) for record in group)
 
 
 def _scatter(rows: NDArray[np.void], data: NDArray[np.uint8], offsets: Int64) -> None:

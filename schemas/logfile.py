@@ -53,16 +53,21 @@ class LogFile:
     Parameters
     ----------
     path : Path
+    indexed : bool
+        Whether to use the index of a finished log; without it `chunks` is empty, and `walk` gives
+        the chunks.
 
     Attributes
     ----------
     complete : bool
         Whether the file was finished.
+    ended : bool
+        Whether `walk` came to the end of a finished log.
     header : mcap.records.Header or None
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
         Of a file without an index, those inside chunks are not among them.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        In the order of their start times.
+        In the order of their start times; after further walks, those of each walk.
     channel_sets : list of frozenset of int
         Channels with messages in a chunk. An empty set: it is not known which.
     statistics : mcap.records.Statistics or None
@@ -75,15 +80,17 @@ class LogFile:
         If it is no MCAP file, or is damaged.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, indexed: bool = True) -> None:
         self.path = path
         self.complete = False
+        self.ended = False
         self.header: records.Header | None = None
         self.schemas: dict[int, records.Schema] = {}
         self.channels: dict[int, records.Channel] = {}
         self.statistics: records.Statistics | None = None
         self.places: list[Place] = []
         self.channel_sets: list[frozenset[int]] = []
+        self.chunks = np.empty(0, CHUNKS)
         self.end = len(MAGIC)  # of the records that were walked through
         try:
             self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -92,7 +99,8 @@ class LogFile:
         self._sets: dict[frozenset[int], int] = {}
         try:
             self._check_magic()
-            self.chunks = self._read_index()
+            if indexed:
+                self._find_chunks()
         except BaseException:
             self.close()
             raise
@@ -111,6 +119,13 @@ class LogFile:
     def size(self) -> int:
         """Bytes of the file as it is now."""
         return os.fstat(self._descriptor).st_size
+
+    def is_at(self, path: Path) -> bool:
+        """Tell whether the file of this name is this one."""
+        try:
+            return os.path.samestat(os.fstat(self._descriptor), path.stat())
+        except FileNotFoundError:
+            return False
 
     def read(self, offset: int, length: int) -> bytes:
         """Read some bytes; fewer at the end of the file."""
@@ -138,23 +153,22 @@ class LogFile:
             return  # at first a writer has written less than that
         raise LogError(f"{self.path}: is no MCAP file")
 
-    def _read_index(self) -> NDArray[np.void]:
+    def _find_chunks(self) -> None:
         size = self.size
         tail = self.read(max(size - FOOTER_SIZE, 0), FOOTER_SIZE)
         self.complete = tail.endswith(MAGIC) and tail[:1] == bytes([Opcode.FOOTER])
         if self.complete:
             footer = parse(Opcode.FOOTER, tail[HEAD.size :])
             assert isinstance(footer, records.Footer)
-            chunks = self._read_summary(footer, size - FOOTER_SIZE)
-            if chunks is not None:
-                return chunks
-        return self.walk()
+            if self._read_summary(footer, size - FOOTER_SIZE):
+                return
+        self.walk()
 
-    def _read_summary(self, footer: records.Footer, end: int) -> NDArray[np.void] | None:
-        """Read the summary; None if it has no index, or is damaged."""
+    def _read_summary(self, footer: records.Footer, end: int) -> bool:
+        """Read the summary, and return whether it has an index and is sound."""
         start = footer.summary_start
         if not len(MAGIC) <= start < end:
-            return None
+            return False
         rows = array("q")
         crc = 0
         try:
@@ -171,10 +185,11 @@ class LogFile:
         counted = self.statistics.message_count if self.statistics else -1
         if crc < 0 or footer.summary_crc not in {0, crc} or (not rows and counted):
             self._forget()
-            return None
+            return False
         opcode, length = HEAD.unpack(self.read(len(MAGIC), HEAD.size))
         self._note(Place(opcode, len(MAGIC), HEAD.size + length))
-        return _table(rows)
+        self.chunks = _table(rows)
+        return True
 
     def _records(self, start: int, end: int) -> Iterator[tuple[Place, bytes]]:
         """Read the records of a section one by one, heads included."""
@@ -213,7 +228,9 @@ class LogFile:
                 self._note(place)
         if chunk:  # its indexes may not all be there yet
             rows.extend([*chunk[:2], min(chunk[2], 0), *chunk[3:], self._channel_set(frozenset())])
-        return _table(rows)
+        found = _table(rows)
+        self.chunks = np.concatenate([self.chunks, found])
+        return found
 
     @staticmethod
     def _continues(run: list[int], place: Place) -> bool:
@@ -233,6 +250,7 @@ class LogFile:
                 return
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
             if opcode in {Opcode.DATA_END, Opcode.FOOTER}:
+                self.ended = True
                 return
             if opcode == 0 or self.end + HEAD.size + length > size:
                 if self.complete:

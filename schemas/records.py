@@ -45,7 +45,7 @@ class _Content(ReadDataStream):
     """The content of one record, which must not end within a field."""
 
     def read(self, length: int) -> bytes:
-        data = super().read(length)
+        data = super().read(min(length, LIMIT))
         if len(data) != length:
             raise McapError("a record ends within a field")
         return data

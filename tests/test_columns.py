@@ -1,0 +1,409 @@
+"""Topics read as columns are what is read message by message, whatever the file looks like."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from mcap.records import Channel, Schema
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+
+from recorder.config import load_settings
+from recorder.service import record_files
+from recorder.sources.replayed import FileSource
+from schemas import messages
+from schemas.chunks import read_chunks
+from schemas.columns import iterate_columns, read_columns
+from schemas.errors import LogError
+from schemas.files import active_path
+from schemas.logfile import LogFile
+from schemas.messages import NANOSECONDS, definition, encode, header, message, typestore
+from schemas.reader import LogReader
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
+
+SECOND = NANOSECONDS
+
+
+@pytest.fixture(scope="module", params=["simulated home", "real household"])
+def logs(request, tmp_path_factory, model_file):
+    """Several files of one recording."""
+    if request.param == "simulated home":
+        paths = [request.getfixturevalue("day")]
+    else:
+        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::20]
+    folder = tmp_path_factory.mktemp("logs")
+    settings = load_settings(
+        None, {"output": folder, "model": model_file, "max_bag_duration": 60}, {}
+    )
+    found = record_files(settings, FileSource(paths, 1_772_348_370_123_456_789), Event()).logs
+    assert len(found) > 2
+    return found
+
+
+@pytest.fixture(scope="module")
+def log(logs):
+    return logs[1]
+
+
+def flat(item):
+    """Return the fields of one decoded message by path."""
+    found = {}
+
+    def add(prefix, part):
+        for name in part.__dataclass_fields__:
+            value = getattr(part, name)
+            if type(value).__name__.endswith(("msg__Time", "msg__Duration")):
+                found[prefix + name] = messages.nanoseconds(value)
+            elif hasattr(value, "__dataclass_fields__"):
+                add(f"{prefix}{name}.", value)
+            elif name != "__msgtype__" and not name.isupper():
+                found[prefix + name] = value
+
+    add("", item)
+    return found
+
+
+def expected(paths, kind, start=None, end=None):
+    """Read message by message: log times, and the fields as lists."""
+    found = [
+        (item.log_time, flat(item.decode()))
+        for path in paths
+        for item in LogReader(path).messages()
+        if item.topic.endswith(kind)
+    ]
+    found.sort(key=lambda row: row[0])
+    wanted = [row for row in found if (start or 0) <= row[0] < (end or 1 << 63)]
+    return [time for time, _ in wanted], [fields for _, fields in wanted]
+
+
+def assert_same(columns, times, rows):
+    assert columns.log_times.tolist() == times
+    for path in rows[0]:
+        values = columns[path]
+        assert len(values) == len(rows)
+        if values.dtype == object:
+            assert [as_list(v) for v in values] == [as_list(row[path]) for row in rows]
+        else:
+            stacked = np.array([row[path] for row in rows], values.dtype)
+            assert values.tobytes() == stacked.tobytes()
+
+
+def as_list(value):
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+@pytest.mark.parametrize("kind", ["info", "features", "statistics", "label", "segment"])
+def test_columns_of_several_files_are_what_their_messages_say(logs, kind):
+    columns = read_columns(reversed(logs), [f"/mic/{kind}"])
+    assert list(columns) == [f"/mic/{kind}"]
+    assert_same(columns[f"/mic/{kind}"], *expected(logs, kind))
+
+
+@pytest.mark.parametrize("span", [(None, 20), (20, None), (3, 4.5), (10, 10), (-50, 0), (70, 71)])
+def test_a_span_of_time_is_read_to_the_message(logs, span):
+    first = 1_772_348_370_123_456_789
+    start, end = (None if s is None else first + int(s * SECOND) for s in span)
+    times, rows = expected(logs, "label", start, end)
+    columns = read_columns(logs, ["/mic/label"], start, end)
+    if not times:
+        assert columns == {}
+    else:
+        assert_same(columns["/mic/label"], times, rows)
+
+
+def test_fields_that_are_not_wanted_are_left_out(log):
+    columns = read_columns([log], ["/mic/label"], fields=["header.stamp", "label"])
+    assert list(columns["/mic/label"].fields) == ["header.stamp", "label"]
+
+
+def test_the_names_behind_the_arrays_come_along(log):
+    columns = read_columns([log], ["/mic/features"])["/mic/features"]
+    assert len(json.loads(columns.metadata["values_names"])) == columns["values"].shape[1]
+
+
+def rewritten(log, path, **options):
+    """Write the messages of a log with the options of the writer of mcap."""
+    with LogFile(log) as file:
+        raw = read_chunks(file, file.chunks)
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=50_000, **options)
+        writer.start("ros2", "another")
+        channels = {}
+        for part in raw:
+            schema = writer.register_schema(
+                part.schema.name, part.schema.encoding, part.schema.data
+            )
+            channels[part.channel.topic] = writer.register_channel(
+                part.channel.topic, "cdr", schema, part.channel.metadata
+            )
+        every = [
+            (offset, time, part.channel.topic, part.buffer[offset : offset + size].tobytes())
+            for part in raw
+            for offset, time, size in zip(
+                part.offsets.tolist(), part.log_times.tolist(), part.sizes.tolist(), strict=True
+            )
+        ]
+        for _, time, topic, data in sorted(every):
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK},
+        {"index_types": IndexType.MESSAGE},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_statistics": False, "use_summary_offsets": False},
+        {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False},
+        {"enable_crcs": False},
+    ],
+    ids=str,
+)
+def test_a_file_is_read_whatever_it_leaves_out(log, tmp_path, options):
+    other = rewritten(log, tmp_path / "other.mcap", **options)
+    for kind in ("label", "segment"):
+        columns = read_columns([other], [f"/mic/{kind}"])[f"/mic/{kind}"]
+        assert_same(columns, *expected([log], kind))
+    times, rows = expected([log], "features")
+    middle = slice(100, 300)
+    columns = read_columns([other], ["/mic/features"], times[100], times[300])["/mic/features"]
+    assert_same(columns, times[middle], rows[middle])
+
+
+@pytest.mark.parametrize("name", ["cut.mcap", "cut.mcap.active"])
+@pytest.mark.parametrize("share", [0.03, 0.4, 0.77, 0.999])
+def test_of_a_log_that_is_cut_everything_complete_is_read(log, tmp_path, name, share):
+    data = log.read_bytes()
+    cut = tmp_path / name
+    cut.write_bytes(data[: int(len(data) * share)])
+    times, rows = expected([cut], "features")
+    assert_same(read_columns([cut], ["/mic/features"])["/mic/features"], times, rows)
+
+
+def test_a_log_that_is_being_written_is_read_up_to_its_last_flush(tmp_path):
+    names = ["a", "b"]
+    writer = LogWriter(
+        tmp_path / "home_20260301T070000Z.mcap",
+        [Topic("/mic/features", messages.FEATURES, array_names={"values": names})],
+        {},
+    )
+    path = writer.active_path
+    assert read_columns([path]) == {}
+    for block in range(3):
+        for row in range(5):
+            stamp = (block * 5 + row) * SECOND
+            frame = message(
+                messages.FEATURES,
+                header=header(stamp, "mic"),
+                frame=block * 5 + row,
+                values=np.ones(2, np.float32),
+            )
+            writer.write("/mic/features", stamp, encode(frame))
+        writer.flush()
+        columns = read_columns([path])["/mic/features"]
+        assert columns["frame"].tolist() == list(range(block * 5 + 5))
+    columns = read_columns([writer.finish()])["/mic/features"]
+    assert columns["frame"].tolist() == list(range(15))
+
+
+def test_files_that_overlap_and_layers_come_as_one_series_in_the_order_of_time(tmp_path):
+    first = written(tmp_path / "a.mcap", "/mic/label", np.arange(0, 40_000, 2))
+    second = written(tmp_path / "b.mcap", "/mic/label", np.arange(1, 30_001, 2))
+    layer = written(tmp_path / "a.relabel-x.mcap", "/mic/relabel/x/label", np.arange(0, 500, 5))
+    seen = {}
+    last = -1
+    for batch in iterate_columns([second, layer, first]):
+        for columns in batch:
+            assert (np.diff(columns.log_times) >= 0).all()
+            assert columns.log_times[0] >= last
+            assert columns["frame"].tolist() == columns.log_times.tolist()
+            seen.setdefault(columns.topic, []).extend(columns["frame"].tolist())
+        last = max(int(columns.log_times[-1]) for columns in batch)
+    assert seen["/mic/label"] == sorted([*range(0, 40_000, 2), *range(1, 30_001, 2)])
+    assert seen["/mic/relabel/x/label"] == list(range(0, 500, 5))
+
+
+def written(path, topic, times, *, label="speech", width=3):
+    """Write labels at these times, whose frame numbers are the times."""
+    writer = LogWriter(path, [Topic(topic, messages.LABEL)], {})
+    writer.write_columns([Rows(topic, times, label_fields(times, label, width))])
+    return writer.finish()
+
+
+def label_fields(times, label, width):
+    rng = np.random.default_rng(len(times))
+    probabilities = rng.random((len(times), width), np.float32)
+    return {
+        "header.stamp": times,
+        "header.frame_id": "mic",
+        "frame": times,
+        "label": label,
+        "confidence": probabilities[:, 0],
+        "novelty": np.full(len(times), np.nan, np.float32),
+        "probabilities": probabilities,
+    }
+
+
+def test_rows_whose_arrays_differ_in_length_come_as_objects(tmp_path):
+    first = written(tmp_path / "a.mcap", "/mic/label", np.arange(5))
+    second = written(tmp_path / "b.mcap", "/mic/label", np.arange(5, 9), width=4)
+    columns = read_columns([first, second])["/mic/label"]
+    assert [len(row) for row in columns["probabilities"]] == [3] * 5 + [4] * 4
+
+
+def test_two_types_on_one_topic_are_told(tmp_path):
+    first = written(tmp_path / "a.mcap", "/mic/label", np.arange(5))
+    writer = LogWriter(tmp_path / "b.mcap", [Topic("/mic/label", "std_msgs/msg/Float32")], {})
+    writer.write_columns([Rows("/mic/label", np.arange(3), {"data": np.zeros(3, np.float32)})])
+    with pytest.raises(
+        LogError, match="/mic/label: is of type std_msgs/msg/Float32 and of "
+    ):
+        read_columns([first, writer.finish()])
+
+
+def test_messages_that_are_no_cdr_are_told(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/x", "json", schema), 5, b"{}", 5)
+        writer.finish()
+    with pytest.raises(LogError, match="/x: holds no ROS 2 messages"):
+        read_columns([path])
+    assert read_columns([path], ["/y"]) == {}
+
+
+def test_a_bag_of_rosbags_is_read(tmp_path):
+    name = "sensor_msgs/msg/JointState"
+    sent = []
+    with BagWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/joints", name, typestore=typestore())
+        for i in range(50):
+            joints = message(
+                name,
+                header=header(i * SECOND, "arm"),
+                name=["a", "b"][: i % 3],
+                position=np.arange(i % 3) * 0.5,
+                velocity=np.zeros(0),
+                effort=np.zeros(2),
+            )
+            bag.write(connection, i * SECOND, typestore().serialize_cdr(joints, name))
+            sent.append(flat(joints))
+    (path,) = (tmp_path / "bag").glob("*.mcap")
+    assert_same(read_columns([path])["/joints"], [i * SECOND for i in range(50)], sent)
+
+
+def test_only_the_chunks_that_are_needed_are_read(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    with LogFile(log) as file:
+        chunks = file.chunks
+        ids = {c.topic: i for i, c in file.channels.items()}
+        silent = [
+            chunk
+            for chunk in chunks
+            if ids["/mic/info"] not in file.channel_sets[chunk["channels"]]
+        ]
+    assert len(silent) > 1
+    for chunk in silent:
+        middle = int(chunk["offset"] + chunk["length"] // 2)
+        data[middle : middle + 50] = bytes(50)
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    assert len(read_columns([path], ["/mic/info"])["/mic/info"]) == 1
+    until = int(chunks["end"][0]) + 1
+    assert len(read_columns([path], ["/mic/features"], end=until)) == 1
+    with pytest.raises(LogError, match=r"damaged at byte .* `hearthlog recover` saves the rest"):
+        read_columns([path], ["/mic/features"])
+
+
+def test_an_index_that_does_not_belong_to_its_chunk_is_damage(log, tmp_path):
+    for field, step in (("offset", 8), ("offset", 1 << 40), ("time", 1)):
+        data = bytearray(log.read_bytes())
+        with LogFile(log) as file:
+            chunk = file.chunks[3]
+        place = int(chunk["offset"] + chunk["length"]) + 15 + (8 if field == "offset" else 0)
+        value = int.from_bytes(data[place : place + 8], "little") + step
+        data[place : place + 8] = value.to_bytes(8, "little")
+        path = tmp_path / f"{field}{step}.mcap"
+        path.write_bytes(data)
+        with pytest.raises(LogError, match="the index of a chunk does not belong to it"):
+            read_columns([path])
+
+
+def test_a_summary_that_is_damaged_is_done_without(log, tmp_path):
+    data = bytearray(log.read_bytes())
+    data[-300] ^= 1
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data)
+    assert_same(read_columns([path], ["/mic/label"])["/mic/label"], *expected([log], "label"))
+
+
+def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
+    path = tmp_path / "long.mcap"
+    writer = LogWriter(path, [Topic("/mic/statistics", messages.STATISTICS)], {})
+    for block in range(20):
+        times = np.arange(50_000) + block * 50_000
+        fields = {
+            "header.stamp": times,
+            "header.frame_id": "mic",
+            "frame": times,
+            "mean": np.tile(times.astype(np.float32)[:, np.newaxis], 21),
+            "std": np.ones((len(times), 21), np.float32),
+        }
+        writer.write_columns([Rows("/mic/statistics", times, fields)])
+    writer.finish()
+    code = f"""
+import resource
+from pathlib import Path
+from schemas.columns import iterate_columns
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+rows = sum(len(c) for batch in iterate_columns([Path({str(path)!r})]) for c in batch)
+print(rows, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
+"""
+    root = Path(__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root
+    )
+    rows, megabytes = map(int, done.stdout.split())
+    assert rows == 1_000_000
+    assert megabytes < 100
+
+
+@pytest.mark.parametrize("active", [False, True])
+def test_an_empty_log_has_no_columns(tmp_path, active):
+    writer = LogWriter(tmp_path / "home.mcap", [Topic("/mic/gap", messages.GAP)], {})
+    if not active:
+        assert read_columns([writer.finish()]) == {}
+    else:
+        assert read_columns([active_path(writer.path)]) == {}
+        writer.abandon()
+
+
+def test_definitions_of_the_file_come_before_those_that_are_known(tmp_path):
+    schema = Schema(1, b"int16 frame\nstring extra", "ros2msg", messages.FEATURES)
+    channel = Channel(1, "/mic/features", "cdr", {}, 1)
+    assert replace(schema).name != definition(messages.FEATURES)
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        writer.register_schema(schema.name, schema.encoding, schema.data)
+        writer.register_channel(channel.topic, "cdr", 1)
+        writer.add_message(1, 5, b"\0\1\0\0" + b"\7\0\0\0" + b"\3\0\0\0hi\0", 5)
+        writer.finish()
+    columns = read_columns([path])["/mic/features"]
+    assert (columns["frame"].tolist(), columns["extra"].tolist()) == ([7], ["hi"])

@@ -1,0 +1,182 @@
+"""A log is followed while it is written, across files, restarts and kills of the recorder."""
+
+import shutil
+import signal
+import subprocess
+from threading import Event, Thread
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from conftest import HEARTHLOG
+from logs import features
+
+from schemas import messages
+from schemas.errors import LogError
+from schemas.files import find_logs
+from schemas.follow import follow
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
+
+TOPIC = "/mic/features"
+
+
+class Followed(Thread):
+    """What a follower gives, frame numbers and batches, gathered while the test goes on."""
+
+    def __init__(self, folder, **options):
+        super().__init__(daemon=True)
+        self.folder = folder
+        self.options = options
+        self.frames = []
+        self.stop = Event()
+        self.start()
+
+    def run(self):
+        for batch in follow(self.folder, [TOPIC], stop=self.stop, **self.options):
+            for columns in batch:
+                self.frames += columns["frame"].tolist()
+
+    def wait_for(self, frames):
+        """Wait until all these frames were given, and give what was."""
+        until = monotonic() + 30
+        while len(self.frames) < len(frames) and monotonic() < until:
+            sleep(0.02)
+        return self.frames
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.join()
+
+
+def log(folder, name):
+    return LogWriter(folder / name, [Topic(TOPIC, messages.FEATURES)], {})
+
+
+def write(writer, first, count=20):
+    times = np.arange(first, first + count)
+    fields = {
+        "header.stamp": times,
+        "header.frame_id": "mic",
+        "frame": times,
+        "values": np.zeros((count, 3), np.float32),
+    }
+    writer.write_columns([Rows(TOPIC, times, fields)])
+    writer.flush()
+
+
+def test_every_flush_arrives_also_in_the_next_file(tmp_path):
+    with Followed(tmp_path, start=0) as followed:
+        for number in range(3):
+            writer = log(tmp_path / f"{number}", f"home_{number}.mcap")
+            for block in range(5):
+                write(writer, 100 * number + 20 * block)
+                expected = list(range(100 * number + 20 * block + 20))
+                assert followed.wait_for(expected) == expected
+            writer.finish()
+
+
+def test_a_log_that_is_finished_before_it_was_seen_is_read_too(tmp_path):
+    with Followed(tmp_path, start=0) as followed:
+        for number in range(20):
+            writer = log(tmp_path, f"home_{number:02}.mcap")
+            write(writer, 20 * number)
+            writer.finish()
+        assert sorted(followed.wait_for(range(400))) == list(range(400))
+
+
+def test_without_a_start_only_what_is_written_from_now_on_is_given(tmp_path):
+    old = log(tmp_path, "home_0.mcap")
+    write(old, 0)
+    old.finish()
+    writer = log(tmp_path, "home_1.mcap")
+    write(writer, 100)
+    with Followed(tmp_path) as followed:
+        sleep(0.5)
+        write(writer, 200)
+        assert followed.wait_for(range(20)) == list(range(200, 220))
+    writer.abandon()
+
+
+def test_what_was_recorded_before_comes_first_from_the_start_that_is_asked_for(tmp_path):
+    for number in range(3):
+        writer = log(tmp_path, f"home_{number}.mcap")
+        write(writer, 20 * number)
+        writer.finish()
+    writer = log(tmp_path, "home_3.mcap")
+    write(writer, 60)
+    with Followed(tmp_path, start=25) as followed:
+        assert followed.wait_for(range(55)) == list(range(25, 80))
+        write(writer, 80)
+        assert followed.wait_for(range(75)) == list(range(25, 100))
+    writer.abandon()
+
+
+def test_two_recorders_in_one_folder_are_followed_at_once(tmp_path):
+    kitchen, bedroom = log(tmp_path, "kitchen.mcap"), log(tmp_path, "bedroom.mcap")
+    with Followed(tmp_path, start=0) as followed:
+        for block in range(4):
+            write(kitchen, 20 * block)
+            write(bedroom, 1000 + 20 * block)
+        expected = [*range(80), *range(1000, 1080)]
+        assert sorted(followed.wait_for(expected)) == expected
+    kitchen.abandon()
+    bedroom.abandon()
+
+
+def test_a_record_that_is_half_written_is_waited_for(tmp_path):
+    writer = log(tmp_path, "home.mcap")
+    write(writer, 0)
+    half = len(writer.active_path.read_bytes())
+    write(writer, 20)
+    data = writer.finish().read_bytes()
+    other = tmp_path / "slow" / "home.mcap.active"
+    other.parent.mkdir()
+    with Followed(other.parent, start=0) as followed, other.open("wb") as stream:
+        for first, last, known in ((0, 5, 0), (5, half + 30, 20), (half + 30, len(data), 40)):
+            stream.write(data[first:last])
+            stream.flush()
+            assert followed.wait_for(range(known)) == list(range(known))
+            sleep(0.3)
+            assert len(followed.frames) == known
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(LogError, match="no such folder"):
+        next(follow(tmp_path / "nowhere"))
+
+
+def test_a_folder_that_is_removed_and_made_again_is_followed(tmp_path):
+    writer = log(tmp_path / "2026", "home_0.mcap")
+    with Followed(tmp_path, start=0) as followed:
+        write(writer, 0)
+        assert followed.wait_for(range(20)) == list(range(20))
+        writer.finish()
+        sleep(0.5)
+        shutil.rmtree(tmp_path / "2026")
+        sleep(0.5)
+        writer = log(tmp_path / "2026", "home_1.mcap")
+        write(writer, 20)
+        assert followed.wait_for(range(40)) == list(range(40))
+        writer.abandon()
+
+
+def test_a_recorder_is_followed_through_files_and_through_being_killed(tmp_path, day):
+    """Real processes; what was followed is, frame by frame, what is in the logs at the end."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    command = [*HEARTHLOG, "record", str(day), "--realtime", "-o", str(logs), "-d", "3"]
+    with Followed(logs, start=0) as followed:
+        for minute, end in (("00", signal.SIGKILL), ("10", signal.SIGKILL), ("20", signal.SIGTERM)):
+            start = ["--start", f"2026-03-01T07:{minute}"]
+            with subprocess.Popen([*command, *start], stderr=subprocess.DEVNULL) as recorder:
+                followed.wait_for(range(len(followed.frames) + 100))
+                recorder.send_signal(end)
+        recorded = features(logs)[0].tolist()
+        assert followed.wait_for(recorded) == recorded
+    assert recorded.count(0) == 3
+    assert len(find_logs(logs)) > 4
+    assert not list(logs.rglob("*.active"))
