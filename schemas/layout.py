@@ -89,6 +89,7 @@ class MessageType:
         self.name = name
         self.types = types
         self._layouts: dict[int, list[Layout]] = {}
+        self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
 
     def layouts(self, size: int) -> list[Layout]:
         """Return the layouts of payloads of this size that were met last."""
@@ -126,9 +127,14 @@ class MessageType:
 
     def layout_for(self, lengths: Mapping[str, int]) -> Layout:
         """Lay out a message whose strings (bytes, with their end) and sequences are this long."""
-        walk = _Walk(self, "<", lambda path, _: lengths[path], LIMIT)
-        leaves = walk.message(self.name)
-        return walk.layout(leaves, walk.end)
+        key = tuple(lengths.items())
+        if key not in self._made:
+            walk = _Walk(self, "<", lambda path, _: lengths[path], LIMIT)
+            leaves = walk.message(self.name)
+            if len(self._made) >= _LAYOUTS_KEPT:
+                self._made.clear()
+            self._made[key] = walk.layout(leaves, walk.end)
+        return self._made[key]
 
 
 @lru_cache(64)

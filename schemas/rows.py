@@ -39,17 +39,22 @@ def encode_groups(
         Equal to what the typestore gives for each message.
     """
     kind = message_type(typename)
-    arrays = {k: v for k, v in columns.items() if isinstance(v, np.ndarray) and v.dtype != object}
-    texts = {k: v for k, v in columns.items() if k not in arrays}
-    for rows, strings in _groups(texts, count):
-        lengths = {k: len(text) + 1 for k, text in strings.items()}
-        lengths |= {k: v.shape[1] for k, v in arrays.items() if v.ndim > 1}
-        layout = kind.layout_for(lengths)
+    arrays: dict[str, NDArray[Any]] = {}
+    texts: dict[str, _Texts] = {}
+    for path, values in columns.items():
+        if isinstance(values, np.ndarray) and values.dtype != object:
+            arrays[path] = values
+        else:
+            texts[path] = _Texts(values, count)
+    widths = {k: v.shape[1] for k, v in arrays.items() if v.ndim > 1}
+    for rows in _same_lengths(texts.values(), count):
+        lengths = {k: text.length(rows[0]) for k, text in texts.items()}
+        layout = kind.layout_for(lengths | widths)
         block = np.zeros(len(rows), layout.dtype)
         for name, value in layout.fixed.items():
             block[name] = value
         for leaf in layout.leaves:
-            _fill(block, leaf, arrays, strings, rows)
+            _fill(block, leaf, arrays, texts, rows)
         yield rows, block
 
 
@@ -67,14 +72,14 @@ def _fill(
     block: NDArray[np.void],
     leaf: Leaf | Messages,
     arrays: Mapping[str, NDArray[Any]],
-    strings: Mapping[str, bytes],
+    texts: Mapping[str, "_Texts"],
     rows: Indices,
 ) -> None:
     if isinstance(leaf, Messages) or leaf.kind == "texts":
         raise LogError(f"{leaf.path}: arrays of texts or messages are encoded one by one")
     if leaf.kind == "text":
-        if strings[leaf.path]:
-            block[leaf.path] = np.void(strings[leaf.path])
+        if block.dtype.fields and leaf.path in block.dtype.fields:
+            block[leaf.path] = texts[leaf.path].encoded(rows)
         return
     values = arrays[leaf.path]
     values = values if len(rows) == len(values) else values[rows]
@@ -85,22 +90,44 @@ def _fill(
         block[leaf.path] = values
 
 
-def _groups(texts: Mapping[str, Any], count: int) -> list[tuple[Indices, dict[str, bytes]]]:
-    """Group the rows whose strings are the same."""
-    constant = {k: v.encode() for k, v in texts.items() if isinstance(v, str)}
-    varying = {k: v for k, v in texts.items() if not isinstance(v, str)}
+class _Texts:
+    """A column of strings: its distinct values, encoded, and which of them each row has."""
+
+    def __init__(self, values: Column, count: int) -> None:
+        if isinstance(values, str):
+            values = [values] * min(count, 1)
+        numbers = {text: number for number, text in enumerate(dict.fromkeys(values))}
+        self._values = [text.encode() for text in numbers]
+        self._codes: Indices | None = None  # not needed if all are alike
+        self.lengths: Indices | None = None
+        if len(numbers) > 1:
+            self._codes = np.fromiter(map(numbers.__getitem__, values), np.intp, count)
+            self.lengths = np.array([len(value) for value in self._values])[self._codes]
+
+    def length(self, row: np.intp) -> int:
+        """Bytes of the string of a row, with its end."""
+        return len(self._values[0 if self._codes is None else self._codes[row]]) + 1
+
+    def encoded(self, rows: Indices) -> NDArray[np.void] | np.void:
+        """Return the strings of some rows, all of one length."""
+        if self._codes is None:
+            return np.void(self._values[0])
+        codes = self._codes[rows]
+        size = len(self._values[codes[0]])
+        # Those of other lengths do not occur, but keep the others in their places.
+        return np.array([value[:size] for value in self._values], f"V{size}")[codes]
+
+
+def _same_lengths(texts: Collection[_Texts], count: int) -> list[Indices]:
+    """Group the rows whose strings have the same lengths."""
+    varying = [text.lengths for text in texts if text.lengths is not None]
     if not varying:
-        return [(np.arange(count), constant)]
-    found: dict[tuple[str, ...], list[int]] = {}
-    for row, values in enumerate(zip(*varying.values(), strict=True)):
-        found.setdefault(values, []).append(row)
-    return [
-        (
-            np.array(rows, np.intp),
-            constant | {k: v.encode() for k, v in zip(varying, values, strict=True)},
-        )
-        for values, rows in found.items()
-    ]
+        return [np.arange(count)] if count else []
+    group = np.zeros(count, np.intp)
+    for lengths in varying:
+        _, group = np.unique(group * (lengths.max() + 1) + lengths, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(group))[:-1])
 
 
 def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:

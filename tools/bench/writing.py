@@ -1,0 +1,90 @@
+"""Features, statistics and labels from arrays to a log: as columns, and message by message."""
+
+from collections.abc import Iterator, Mapping
+from itertools import count
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import Writer
+
+from schemas.columns import Columns, read_columns
+from schemas.files import find_logs
+from schemas.messages import definition, encode, message, time_message
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
+from tools.bench.table import Row, Table, Target
+from tools.bench.timing import best_of, hearthlog
+from tools.bench.workload import Workload
+
+_KINDS = ("/mic/features", "/mic/statistics", "/mic/label")
+_AT_ONCE = 7_200  # frames
+_TEN_TIMES = Target(10)
+
+
+def measure(work: Workload) -> Table:
+    """Measure writing what `hearthlog record` wrote once more."""
+    folder = work.folder / "logs-writing"
+    hearthlog(["record", work.wav, "--model", work.model_file, "-o", folder])
+    columns = read_columns(find_logs(folder), _KINDS)
+    frames = len(columns[_KINDS[0]])
+    numbers = count()
+    best = best_of(
+        {
+            "columns": lambda: _as_columns(folder / f"{next(numbers)}.mcap", columns),
+            "messages": lambda: _as_messages(folder / f"{next(numbers)}.mcap", columns),
+        },
+        2,
+    )
+    columns_rate, messages_rate = (frames / seconds for seconds in best.values())
+    ratio = columns_rate / messages_rate
+    return Table(
+        f"writing: {frames:,} frames, three messages each, from arrays to a log, CPU time",
+        [
+            Row("hearthlog, columns", columns_rate, "frames/s"),
+            Row("rosbags + mcap, messages", messages_rate, "frames/s", ratio, _TEN_TIMES),
+        ],
+    )
+
+
+def _as_columns(path: Path, columns: Mapping[str, Columns]) -> None:
+    writer = LogWriter(path, [Topic(name, part.type) for name, part in columns.items()], {})
+    for start in range(0, len(columns[_KINDS[0]]), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        writer.write_columns(
+            [
+                Rows(name, part.log_times[rows], {k: v[rows] for k, v in part.fields.items()})
+                for name, part in columns.items()
+            ]
+        )
+    writer.finish()
+
+
+def _as_messages(path: Path, columns: Mapping[str, Columns]) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        channels = {
+            name: writer.register_channel(
+                name,
+                "cdr",
+                writer.register_schema(part.type, "ros2msg", definition(part.type).encode()),
+            )
+            for name, part in columns.items()
+        }
+        encoded = [row for part in columns.values() for row in _encoded(part)]
+        for time, topic, data in sorted(encoded, key=itemgetter(0)):
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()
+
+
+def _encoded(columns: Columns) -> Iterator[tuple[int, str, bytes]]:
+    names = [name for name in columns.fields if not name.startswith("header.")]
+    stamps, about = columns["header.stamp"].tolist(), columns["header.frame_id"]
+    values = zip(*(columns[name] for name in names), strict=True)
+    for time, stamp, frame_id, row in zip(
+        columns.log_times.tolist(), stamps, about, values, strict=True
+    ):
+        header = message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
+        fields: dict[str, Any] = dict(zip(names, row, strict=True))
+        yield time, columns.topic, encode(message(columns.type, header=header, **fields))
