@@ -4,7 +4,6 @@ The only module that knows Rerun, much of which is marked unstable. Writing a re
 nothing: Rerun's usage statistics, and the port it opens to the network, are its viewer's.
 """
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import cycle
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 from analyzer.errors import DataError
 from analyzer.tracks import Rows, Spans, Tracks, read_tracks
 from schemas import messages
+from schemas.errors import LogError
+from schemas.files import check_new, new_file
 
 APPLICATION = "hearthlog"
 TIMELINE = "time"
@@ -75,26 +76,21 @@ def save_timeline(logs: Iterable[Path], output: Path) -> None:
     start, end = tracks.range
     if start == end:
         raise DataError("no features, labels, segments or gaps in these logs: nothing to show")
-    temporary = output.with_name(f".{output.name}.{os.getpid()}.tmp")
     try:
-        _write(tracks, temporary)
-        output.hardlink_to(temporary)  # unlike a rename, never over another file
-    except OSError as error:
-        raise DataError(f"{output}: cannot be written ({error.strerror or error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        with new_file(output) as temporary:
+            _write(tracks, temporary)
+    except LogError as error:
+        raise DataError(str(error)) from error
 
 
 def check_output(output: Path) -> None:
     """Raise DataError unless a recording can be saved under this name."""
     if output.suffix != ".rrd":
         raise DataError(f"{output}: the name of a Rerun recording must end in .rrd")
-    if os.path.lexists(output):
-        raise DataError(f"{output}: exists already; choose another name, or delete it first")
-    if not output.parent.is_dir():
-        raise DataError(f"{output}: there is no folder {output.parent}; create it first")
-    if not os.access(output.parent, os.W_OK):
-        raise DataError(f"{output}: the folder cannot be written to")
+    try:
+        check_new(output)
+    except LogError as error:
+        raise DataError(str(error)) from error
 
 
 def _write(tracks: Tracks, path: Path) -> None:
@@ -196,11 +192,9 @@ def _label_changes(rows: Rows) -> tuple[Int64, list[str | None]]:
 
 def _span_changes(spans: Spans) -> tuple[Int64, list[str | None]]:
     """Begin each span with its text, and end it with None unless the next one follows at once."""
-    order = np.argsort(spans.starts, kind="stable")
-    starts, ends = np.array(spans.starts)[order], np.array(spans.ends)[order]
-    last = np.flatnonzero(ends < np.append(starts[1:], np.iinfo(np.int64).max))
-    times = np.concatenate([ends[last], starts])
-    states = [*[None] * len(last), *(spans.texts[i] for i in order)]
+    last = np.flatnonzero(spans.ends < np.append(spans.starts[1:], np.iinfo(np.int64).max))
+    times = np.concatenate([spans.ends[last], spans.starts])
+    states = [*[None] * len(last), *spans.texts]
     order = np.argsort(times, kind="stable")
     return times[order], [states[i] for i in order]
 
@@ -230,13 +224,15 @@ def _log_lines(
     )
     recording.log(entity, about, static=True)
     width = len(rows.names)
-    # A row of NaN ends the lines where frames are missing.
-    times = np.insert(rows.times, rows.breaks, rows.ends[rows.breaks - 1])
-    values = np.insert(rows.values, rows.breaks, np.nan, axis=0)
-    for start in range(0, len(times), _ROWS_AT_ONCE):
-        part = values[start : start + _ROWS_AT_ONCE]
-        column = rr.Scalars.columns(scalars=part.reshape(-1)).partition([width] * len(part))
-        recording.send_columns(entity, [_time_column(times[start : start + len(part)])], column)
+    breaks, ends = rows.breaks, rows.ends
+    for start in range(0, len(rows.times), _ROWS_AT_ONCE):
+        part = slice(start, start + _ROWS_AT_ONCE)
+        # A row of NaN ends the lines where frames are missing.
+        missing = breaks[(breaks >= part.start) & (breaks < part.stop)]
+        times = np.insert(rows.times[part], missing - start, ends[missing - 1])
+        values = np.insert(rows.values[part], missing - start, np.nan, axis=0)
+        column = rr.Scalars.columns(scalars=values.reshape(-1)).partition([width] * len(values))
+        recording.send_columns(entity, [_time_column(times)], column)
 
 
 def _level(rows: Rows) -> Rows:
@@ -279,8 +275,9 @@ def _means(rows: Rows) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     share = ((rows.times - rows.times[0]) / span * _HEAT_COLUMNS).astype(np.int64)
     first = np.union1d(np.flatnonzero(np.diff(share, prepend=-1)), rows.breaks)
     size = np.diff(first, append=len(share))
-    sums = np.add.reduceat(np.nan_to_num(rows.values.astype(np.float64)), first)
-    return first, sums / size[:, np.newaxis]
+    columns = (np.nan_to_num(column.astype(np.float64)) for column in rows.values.T)
+    sums = [np.add.reduceat(column, first) for column in columns]
+    return first, np.stack(sums, axis=1) / size[:, np.newaxis]
 
 
 def _time_column(times: Int64) -> rr.TimeColumn:

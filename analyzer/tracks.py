@@ -1,25 +1,31 @@
 """Logs as arrays: what was heard and recognised, by topic and in the order of time."""
 
 import json
-from array import array
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analyzer.known import decode_known
 from schemas import messages
+from schemas.columns import Columns
 from schemas.errors import LogError
-from schemas.messages import nanoseconds
-from schemas.reader import LogMessage, LogReader
+from schemas.series import iterate_messages
 
 Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
 
 _VALUES = {messages.FEATURES: "values", messages.LABEL: "probabilities"}
-_SPAN_TEXTS = {messages.SEGMENT: "label", messages.GAP: "reason"}
+_TEXTS = {messages.SEGMENT: "label", messages.GAP: "reason"}
+_FIELDS = {
+    messages.FEATURES: ("header.stamp", "frame", "values"),
+    messages.LABEL: ("header.stamp", "frame", "label", "probabilities"),
+    messages.SEGMENT: ("header.stamp", "duration", "label"),
+    messages.GAP: ("header.stamp", "duration", "reason"),
+}
 
 
 @dataclass(frozen=True)
@@ -58,13 +64,21 @@ class Rows:
         return np.flatnonzero(np.diff(self.frames) != 1) + 1
 
 
-@dataclass
+@dataclass(frozen=True)
 class Spans:
-    """Segments or gaps of a topic: starts and ends in nanoseconds of UTC, label or reason."""
+    """Segments or gaps of a topic.
 
-    starts: list[int] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)
-    texts: list[str] = field(default_factory=list)
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, by start.
+    texts : np.ndarray [shape=(n,)] of str
+        Label or reason.
+    """
+
+    starts: Int64
+    ends: Int64
+    texts: NDArray[np.object_]
 
 
 @dataclass(frozen=True)
@@ -79,8 +93,8 @@ class Tracks:
         """Start of the first and end of the last of everything, in nanoseconds of UTC."""
         rows = [rows for topics in self.rows.values() for rows in topics.values()]
         spans = [spans for topics in self.spans.values() for spans in topics.values()]
-        starts = [int(r.times[0]) for r in rows] + [min(s.starts) for s in spans]
-        ends = [int(r.ends[-1]) for r in rows] + [max(s.ends) for s in spans]
+        starts = [int(r.times[0]) for r in rows] + [int(s.starts[0]) for s in spans]
+        ends = [int(r.ends[-1]) for r in rows] + [int(s.ends.max()) for s in spans]
         return min(starts, default=0), max(ends, default=0)
 
 
@@ -92,69 +106,64 @@ def read_tracks(logs: Iterable[Path]) -> Tracks:
     LogError
         If one of the files is no log, is damaged, or does not name its values.
     """
-    blocks: dict[str, dict[str, list[_Block]]] = {kind: {} for kind in _VALUES}
-    spans: dict[str, dict[str, Spans]] = {kind: {} for kind in _SPAN_TEXTS}
+    rows: dict[str, dict[str, dict[tuple[str, ...], _Growing]]] = {kind: {} for kind in _VALUES}
+    spans: dict[str, dict[str, list[Spans]]] = {kind: {} for kind in _TEXTS}
     for path in logs:
-        log = LogReader(path)
-        open_blocks: dict[str, _Block] = {}
-        for item in log.messages():
-            if item.type in _SPAN_TEXTS:
-                _add_span(spans[item.type].setdefault(item.topic, Spans()), item)
-            elif item.type in _VALUES:
-                block = open_blocks.get(item.topic)
-                if block is None:
-                    block = open_blocks[item.topic] = _Block(log, item)
-                    blocks[item.type].setdefault(item.topic, []).append(block)
-                block.add(item)
-    rows = {
-        kind: {topic: _joined(found) for topic, found in topics.items()}
-        for kind, topics in blocks.items()
-    }
-    return Tracks(rows, spans)
+        for batch in iterate_messages([path]):
+            for columns in decode_known(path, batch, _FIELDS):
+                kind, topic = columns.type, columns.topic
+                if kind in spans:
+                    spans[kind].setdefault(topic, []).append(_spans(columns))
+                else:
+                    part = _rows(path, columns)
+                    parts = rows[kind].setdefault(topic, {})
+                    parts.setdefault(part.names, _Growing()).add(part)
+    return Tracks(
+        {k: {t: _joined(parts) for t, parts in found.items()} for k, found in rows.items()},
+        {k: {t: _chained(parts) for t, parts in found.items()} for k, found in spans.items()},
+    )
 
 
-def _add_span(spans: Spans, item: LogMessage) -> None:
-    content = item.decode()
-    start = nanoseconds(content.header.stamp)
-    spans.starts.append(start)
-    spans.ends.append(start + nanoseconds(content.duration))
-    spans.texts.append(getattr(content, _SPAN_TEXTS[item.type]))
+class _Growing:
+    """Rows that come piece by piece; memory that grows is moved by the page, not copied."""
 
+    def __init__(self) -> None:
+        self._times, self._frames = bytearray(), bytearray()
+        self._values, self._labels = bytearray(), bytearray()
 
-class _Block:
-    """Rows of one topic in one log, in machine arrays: a day has 1.7 million of them."""
+    def add(self, part: Rows) -> None:
+        """Append rows; they must have the same names."""
+        self._times += part.times.data
+        self._frames += part.frames.data
+        self._values += part.values.data
+        self._labels += part.labels.data
 
-    def __init__(self, log: LogReader, first: LogMessage) -> None:
-        self._where = f"{log.path}: {first.topic}"
-        self._field = _VALUES[first.type]
-        text = log.channels[first.topic].metadata.get(f"{self._field}_names", "")
-        self.names = _names(text, self._where)
-        self._index = {name: i for i, name in enumerate(self.names)}
-        self._times, self._frames, self._labels = array("q"), array("Q"), array("q")
-        self._values = array("f")
-
-    def add(self, item: LogMessage) -> None:
-        content = item.decode()
-        values = getattr(content, self._field)
-        if len(values) != len(self.names):
-            raise LogError(f"{self._where}: {len(values)} values for {len(self.names)} names")
-        label = self._index.get(content.label) if item.type == messages.LABEL else -1
-        if label is None:
-            raise LogError(f"{self._where}: label {content.label!r} is none of its classes")
-        self._times.append(nanoseconds(content.header.stamp))
-        self._frames.append(content.frame)
-        self._labels.append(label)
-        self._values.frombytes(np.asarray(values, np.float32).tobytes())
-
-    def rows(self) -> Rows:
-        """Return what was added."""
+    def rows(self, names: tuple[str, ...]) -> Rows:
+        """Return all of them."""
         return Rows(
-            self.names,
+            names,
             np.frombuffer(self._times, np.int64),
             np.frombuffer(self._frames, np.uint64),
-            np.frombuffer(self._values, np.float32).reshape(-1, len(self.names)),
+            np.frombuffer(self._values, np.float32).reshape(-1, len(names)),
             np.frombuffer(self._labels, np.int64),
         )
+
+
+def _rows(path: Path, columns: Columns) -> Rows:
+    where = f"{path}: {columns.topic}"
+    column = _VALUES[columns.type]
+    names = _names(columns.metadata.get(f"{column}_names", ""), where)
+    values = columns[column]
+    if values.shape[1:] != (len(names),):
+        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
+    labels = np.full(len(columns), -1)
+    if columns.type == messages.LABEL:
+        places = {name: place for place, name in enumerate(names)}
+        try:
+            labels = np.fromiter(map(places.__getitem__, columns["label"]), np.int64)
+        except KeyError as error:
+            raise LogError(f"{where}: label {error} is none of its classes") from error
+    return Rows(names, columns["header.stamp"], columns["frame"], values, labels)
 
 
 def _names(text: str, where: str) -> tuple[str, ...]:
@@ -167,24 +176,42 @@ def _names(text: str, where: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _joined(blocks: list[_Block]) -> Rows:
-    """Join the rows of several logs, whose columns may differ, in the order of time."""
-    parts = [block.rows() for block in blocks]
+def _spans(columns: Columns) -> Spans:
+    starts = columns["header.stamp"]
+    return Spans(starts, starts + columns["duration"], columns[_TEXTS[columns.type]])
+
+
+def _joined(found: Mapping[tuple[str, ...], _Growing]) -> Rows:
+    """Join rows whose columns may differ, in the order of time."""
+    parts = [growing.rows(names) for names, growing in found.items()]
+    rows = parts[0] if len(parts) == 1 else _of_all_names(parts)
+    return Rows(rows.names, *_by_time(rows.times, rows.frames, rows.values, rows.labels))
+
+
+def _of_all_names(parts: Sequence[Rows]) -> Rows:
     names = tuple(dict.fromkeys(name for part in parts for name in part.names))
-    values = np.full((sum(len(part.times) for part in parts), len(names)), np.nan, np.float32)
-    labels = []
+    times = np.concatenate([part.times for part in parts])
+    frames = np.concatenate([part.frames for part in parts])
+    values = np.full((len(times), len(names)), np.nan, np.float32)
+    labels = np.full(len(times), -1)
     start = 0
     for part in parts:
+        here = slice(start, start + len(part.times))
         place = np.array([names.index(name) for name in part.names])
-        values[start : start + len(part.times), place] = part.values
-        labels.append(np.where(part.labels < 0, -1, place[part.labels]))
-        start += len(part.times)
-    times = np.concatenate([part.times for part in parts])
+        values[here, place] = part.values
+        labels[here] = np.where(part.labels < 0, -1, place[part.labels])
+        start = here.stop
+    return Rows(names, times, frames, values, labels)
+
+
+def _chained(parts: Sequence[Spans]) -> Spans:
+    starts = np.concatenate([part.starts for part in parts])
+    ends = np.concatenate([part.ends for part in parts])
+    return Spans(*_by_time(starts, ends, np.concatenate([part.texts for part in parts])))
+
+
+def _by_time(times: Int64, *others: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    if (np.diff(times) >= 0).all():
+        return times, *others
     order = np.argsort(times, kind="stable")
-    return Rows(
-        names,
-        times[order],
-        np.concatenate([part.frames for part in parts])[order],
-        values[order],
-        np.concatenate(labels)[order],
-    )
+    return tuple(array[order] for array in (times, *others))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from safetensors.numpy import load, save
 
 from models.errors import ModelError
-from schemas.files import sync_folder
+from schemas.errors import LogError
+from schemas.files import check_new, new_file
 
 SUFFIX = ".safetensors"
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
@@ -209,12 +209,10 @@ def check_output(path: Path) -> None:
         raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
     if not path.stem.isprintable():
         raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
-    if os.path.lexists(path):
-        raise ModelError(f"{path}: exists already; choose another name, or delete it first")
-    if not path.parent.is_dir():
-        raise ModelError(f"{path}: there is no folder {path.parent}; create it first")
-    if not os.access(path.parent, os.W_OK):
-        raise ModelError(f"{path}: the folder cannot be written to")
+    try:
+        check_new(path)
+    except LogError as error:
+        raise ModelError(str(error)) from error
 
 
 def save_model(model: Model, path: Path) -> None:
@@ -231,20 +229,11 @@ def save_model(model: Model, path: Path) -> None:
     text = json.dumps(model.description.model_dump(), ensure_ascii=False)
     data = save(arrays, {_KEY: text})
     _check_header(path, data)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with temporary.open("xb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        path.hardlink_to(temporary)  # unlike a rename, never over another file
-        sync_folder(path.parent)
-    except FileExistsError as error:
-        raise ModelError(f"{path}: exists already; choose another name, or delete it") from error
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        with new_file(path) as temporary:
+            temporary.write_bytes(data)
+    except LogError as error:
+        raise ModelError(str(error)) from error
 
 
 def load_model(path: Path) -> Model:

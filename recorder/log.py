@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recorder.pipeline import Record
+from recorder.pipeline import Record, opening
 from schemas.errors import LogError
 from schemas.files import log_path
-from schemas.messages import NANOSECONDS, encode, header
-from schemas.topics import Topic, topic
+from schemas.messages import NANOSECONDS, header
+from schemas.topics import Topic
 from schemas.writer import Attachment, LogWriter
 
 # What may lie between a sound and its being written: a block of frames, and the capture's delay.
@@ -149,6 +149,7 @@ class RollingLog:
         self._last = stamp
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
         about.info.header = header(stamp, about.microphone)
-        self._writer.write(topic(about.microphone, "info"), stamp, encode(about.info))
+        for record in opening(about.info):
+            self._append(record)
         self._writer.flush()  # the file now says what it is, whatever happens next
         self._flush_at = None

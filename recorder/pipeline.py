@@ -2,20 +2,21 @@
 
 from collections.abc import Mapping
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.classifier import Classifier
 from models.segments import Segment, SegmentMerger
+from recorder import lines
 from recorder.features import FeatureExtractor
 from recorder.statistics import WINDOW_FRAMES, RollingStatistics
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
 from schemas import messages
-from schemas.messages import duration_message, encode, header, message
+from schemas.messages import duration_message, encode, header, message, nanoseconds
 from schemas.rows import Column, encode_rows
-from schemas.topics import DIAGNOSTICS, topic
+from schemas.topics import DIAGNOSTICS, ROSOUT, topic
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -33,6 +34,15 @@ class Record(NamedTuple):
     log_time: int
     topic: str
     data: bytes
+
+
+def opening(info: Any) -> list[Record]:
+    """Return what every file begins with: its `AudioStreamInfo`, and the same in words."""
+    stamp = nanoseconds(info.header.stamp)
+    return [
+        Record(stamp, topic(info.header.frame_id, "info"), encode(info)),
+        Record(stamp, ROSOUT, lines.of_info(info)),
+    ]
 
 
 class Pipeline:
@@ -58,6 +68,7 @@ class Pipeline:
         self._statistics = RollingStatistics()
         self._segments = SegmentMerger()
         self._end = 0
+        self._level = 0
 
     def push(self, event: Event) -> list[Record]:
         """Turn what a source handed on into messages, in the order of their log times."""
@@ -65,7 +76,7 @@ class Pipeline:
             return self.push_features(self._features(event.samples), event.first, event.stamps)
         if isinstance(event, Gap):
             return self._push_gap(event)
-        return [self._health_record(event)]
+        return self._push_health(event)
 
     def push_features(self, features: Float32, first: int, stamps: Int64) -> list[Record]:
         """Turn the features of successive frames into messages.
@@ -114,7 +125,11 @@ class Pipeline:
                 frames_lost=gap.frames_lost,
             )
         )
-        return [*closed, Record(gap.end, topic(self.microphone, "gap"), data)]
+        return [
+            *closed,
+            Record(gap.end, topic(self.microphone, "gap"), data),
+            Record(gap.end, ROSOUT, lines.of_gap(self.microphone, gap)),
+        ]
 
     def _labels(
         self, classifier: Classifier, window: Float32, frames: Int64, stamps: Int64
@@ -144,20 +159,32 @@ class Pipeline:
         return [Record(time, name, row) for time, row in zip(stamps.tolist(), rows, strict=True)]
 
     def _segment_records(self, segments: list[Segment]) -> list[Record]:
-        return [self._segment_record(segment) for segment in segments]
+        return [record for segment in segments for record in self._of_segment(segment)]
 
-    def _segment_record(self, segment: Segment) -> Record:
+    def _of_segment(self, segment: Segment) -> list[Record]:
         assert self._classifier is not None
+        label = self._classifier.classes[segment.label]
         data = encode(
             message(
                 messages.SEGMENT,
                 header=header(segment.start, self.microphone),
                 duration=duration_message(segment.end - segment.start),
-                label=self._classifier.classes[segment.label],
+                label=label,
                 confidence=segment.confidence,
             )
         )
-        return Record(segment.end, topic(self.microphone, "segment"), data)
+        return [
+            Record(segment.end, topic(self.microphone, "segment"), data),
+            Record(segment.end, ROSOUT, lines.of_segment(self.microphone, segment, label)),
+        ]
+
+    def _push_health(self, health: Health) -> list[Record]:
+        records = [self._health_record(health)]
+        if health.level != self._level:
+            self._level = health.level
+            line = lines.of_health(self.microphone, health)
+            records.append(Record(health.stamp, ROSOUT, line))
+        return records
 
     def _health_record(self, health: Health) -> Record:
         values = [

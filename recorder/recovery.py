@@ -1,101 +1,321 @@
-"""Complete the logs that a killed recorder left behind."""
+"""Make a valid log of what is whole in one that was cut or damaged."""
 
 import fcntl
 import os
-import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    Header,
-    McapRecord,
-    Message,
-    Metadata,
-    Schema,
-)
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import MCAP0_MAGIC, Writer
+import numpy as np
+from mcap.records import Message
 
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages, rosbag2
+from schemas.chunks import read_chunks
+from schemas.chunkwriter import ChunkWriter
+from schemas.damage import Damage
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, sync_folder
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, sync_folder
+from schemas.intact import FoundAttachment, FoundChunk
+from schemas.logfile import LogFile
+from schemas.salvage import Definition, Piece, Salvage
 
-_RECORD_LIMIT = 256 << 20  # bytes; ours are below 2 MiB
-_HEAD = struct.Struct("<BQ")  # opcode and length
-_READ = {  # the others index these
-    Opcode.HEADER,
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.MESSAGE,
-    Opcode.CHUNK,
-    Opcode.ATTACHMENT,
-    Opcode.METADATA,
-    Opcode.FOOTER,
-}
-_TAIL_LIMIT = 64 << 10  # a longer one was not left by a writer that was killed between two flushes
+_PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
+_ENCODING = "cdr"
+_READ_SIZE = 4 << 20  # bytes of chunks that are read at once
 
 
-def read_records(path: Path) -> Iterator[McapRecord]:
-    """Read the records of a log, those inside chunks too, up to the point where it is cut.
+@dataclass
+class Topic:
+    """What was saved of a topic.
 
-    The last record is a `Footer` if the log is complete.
+    Attributes
+    ----------
+    type : str
+    messages : int
+    expected : int or None
+        How many there should be, if the log says so.
+    end : int
+        Log time of the last one.
+    """
+
+    type: str
+    messages: int = 0
+    expected: int | None = None
+    end: int = 0
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What became of a log.
+
+    Attributes
+    ----------
+    topics : dict of str to Topic
+    damages : list of Damage
+    complete : bool
+        Whether the log was finished, and its index whole.
+    """
+
+    topics: dict[str, Topic]
+    damages: list[Damage]
+    complete: bool
+
+    @property
+    def messages(self) -> int:
+        """How many were saved."""
+        return sum(topic.messages for topic in self.topics.values())
+
+    @property
+    def lossless(self) -> bool:
+        """Whether nothing was lost."""
+        return all(damage.lossless for damage in self.damages)
+
+
+def recover_log(
+    source: Path, copy: Path, name: str, progress: Callable[[float], None] = lambda _: None
+) -> Recovery:
+    """Copy what is whole in a log to a new one, read that again and count it.
+
+    Parameters
+    ----------
+    source, copy : Path
+    name : str
+        Name that the copy will have in the end.
+    progress : callable, optional
+        Is given the share that is done, 0 to 1.
+
+    Raises
+    ------
+    NothingWholeError
+        If the source is no MCAP file, or nothing in it is whole.
+    LogError
+        If it cannot be read, or the copy does not hold what was written to it.
+    OSError
+        If the copy cannot be written.
+    """
+    known: list[Definition] = []
+    profile = ""
+    while True:
+        with Salvage(source, known) as salvage, copy.open("wb") as stream:
+            attempt = _Copy(stream, salvage, profile)
+            attempt.write(name, progress)
+        if not attempt.could_be_better():
+            break
+        known = [*salvage.definitions.schemas.values(), *salvage.definitions.channels.values()]
+        profile = attempt.profile()
+    if not attempt.pieces:
+        if not salvage.is_mcap:
+            raise NothingWholeError(f"{source}: is no MCAP file, and holds no whole piece of one")
+        raise NothingWholeError(f"{source}: holds nothing that could be saved")
+    recovery = attempt.recovery()
+    _check(copy, recovery.topics)
+    return recovery
+
+
+def recover_in_place(
+    log: Path, progress: Callable[[float], None] = lambda _: None
+) -> tuple[Path, Recovery]:
+    """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
+
+    Returns
+    -------
+    path : Path
+        Its name: that of the damaged one, without `.active`.
+    recovery : Recovery
 
     Raises
     ------
     LogError
-        If this is no MCAP file, or if it is damaged before its end.
+        As `recover_log`, or if the log is being written, or there is a file of a name needed here.
     """
+    path = log.with_name(log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX) + SUFFIX)
+    kept = path.with_name(path.name + ".damaged")
+    copy = path.with_name(f".{path.name}.{os.getpid()}.recovering")
+    check_new(kept)
+    if path != log:
+        check_new(path)
+    with _abandoned(log) as is_abandoned:
+        if not is_abandoned:
+            raise LogError(f"{log}: is being written; stop the recorder first")
+        try:
+            recovery = recover_log(log, copy, path.name, progress)
+            _sync(copy)
+            _keep(log, kept)
+            copy.replace(path)
+            if path != log:
+                log.unlink(missing_ok=True)
+            sync_folder(path.parent)
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+        finally:
+            copy.unlink(missing_ok=True)
+    return path, recovery
+
+
+def _keep(log: Path, name: Path) -> None:
+    try:
+        name.hardlink_to(log)  # so that there is a file of its own name at any time
+    except OSError:  # FAT knows no links
+        log.rename(name)
+
+
+def _sync(path: Path) -> None:
     with path.open("rb") as stream:
-        magic = stream.read(len(MCAP0_MAGIC))
-        if path.name.endswith(ACTIVE_SUFFIX) and MCAP0_MAGIC.startswith(magic):
-            pass  # at first a writer has written less than that
-        elif magic != MCAP0_MAGIC:
-            raise LogError(f"{path}: is no MCAP file")
-        while True:
-            offset = stream.tell()
-            try:
-                content = _next_record(stream, path.stat().st_size - offset)
-                records = [] if content is None else _parsed(content)
-            except Exception as error:  # the decompressors raise what they like
-                what = str(error) or type(error).__name__
-                raise LogError(f"{path}: damaged at byte {offset} ({what})") from error
-            yield from records
-            if content is None or content[0] == Opcode.FOOTER:
-                return
+        os.fsync(stream.fileno())
 
 
-def _next_record(stream: BinaryIO, rest: int) -> bytes | None:
-    """Read one record as it is; None at the end of what was written."""
-    head = stream.read(_HEAD.size)
-    length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else _RECORD_LIMIT
-    if len(head) + length > rest:
-        if rest > _TAIL_LIMIT:
-            raise McapError("a record claims to be longer than the file")
-        return None
-    if length > _RECORD_LIMIT:
-        raise McapError("a record claims to be too large")
-    return head + stream.read(length)
+class NothingWholeError(LogError):
+    """Of a log nothing is left."""
 
 
-def _parsed(content: bytes) -> list[McapRecord]:
-    if content[0] not in _READ:
+class _Copy:
+    """The whole pieces of a log, on their way into another one."""
+
+    def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
+        self.pieces = 0
+        self._salvage = salvage
+        self._profile = profile
+        self._writer = ChunkWriter(stream)
+        self._begun = False
+        self._written: set[tuple[type, int]] = set()
+        self._counts: dict[int, int] = {}
+        self._ends: dict[int, int] = {}
+        self._span = (1 << 63, 0)
+
+    def write(self, name: str, progress: Callable[[float], None]) -> None:
+        """Write all, and complete the file, which will bear this name."""
+        for piece in self._salvage.pieces():
+            self._add(piece)
+            progress(self._salvage.offset / self._salvage.size)
+            del piece  # before the next is read, which may be as large
+        self._begin()
+        self._writer.flush()
+        used = self._salvage.definitions
+        channels = [c for c in used.channels.values() if c.schema_id in {0, *used.schemas}]
+        about = self._rosbag2(name)
+        if about is not None:
+            self._writer.add_metadata(rosbag2.METADATA, about)
+        self._writer.define(list(used.schemas.values()), channels)
+        self._writer.finish()
+
+    def could_be_better(self) -> bool:
+        """Whether another attempt would know what this one learned too late."""
+        defines = self._salvage.definitions.defines
+        late = any(defines(channel) for channel in self._salvage.unnamed)
+        return late or (self._salvage.header is None and self.profile() != self._profile)
+
+    def profile(self) -> str:
+        """Guess the profile from the channels."""
+        channels = self._salvage.definitions.channels.values()
+        return _PROFILE if any(c.message_encoding == _ENCODING for c in channels) else ""
+
+    def recovery(self) -> Recovery:
+        """Say what was saved and what was not."""
+        topics: dict[str, Topic] = {}
+        for number, channel in self._salvage.definitions.channels.items():
+            schema = self._salvage.definitions.schemas.get(channel.schema_id)
+            topic = topics.setdefault(channel.topic, Topic("" if schema is None else schema.name))
+            topic.messages += self._counts.get(number, 0)
+            topic.end = max(topic.end, self._ends.get(number, 0))
+            if self._salvage.expected is not None:
+                expected = self._salvage.expected.get(number, 0)
+                topic.expected = (topic.expected or 0) + expected
+        damages = self._salvage.damages()
+        return Recovery(topics, [*damages, *_untraced(topics, damages)], self._salvage.complete)
+
+    def _add(self, piece: Piece) -> None:
+        self._begin()
+        self.pieces += 1
+        if isinstance(piece, FoundChunk):
+            chunk = piece.stored
+            self._define(chunk.entries, piece.definitions)
+            self._writer.copy_chunk(chunk)
+            for number, entries in chunk.entries.items():
+                times = np.frombuffer(entries, np.int64)[::2]
+                self._count(number, len(times), int(times.min()), int(times.max()))
+        elif isinstance(piece, Message):
+            self._define([piece.channel_id])
+            number, time = piece.channel_id, piece.log_time
+            self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
+            self._count(number, 1, time, time)
+        elif isinstance(piece, FoundAttachment):
+            self._writer.copy_attachment(piece.record, piece.about)
+        elif piece.name != rosbag2.METADATA:
+            self._writer.add_metadata(piece.name, piece.metadata)
+
+    def _begin(self) -> None:
+        if not self._begun:
+            header = self._salvage.header
+            profile, library = (
+                (self._profile, "") if header is None else (header.profile, header.library)
+            )
+            self._writer.start(profile, library)
+            self._begun = True
+
+    def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
+        """Write what defines these channels before their first message, unless it is with them."""
+        self._written.update((type(record), record.id) for record in inside)
+        known = self._salvage.definitions
+        for number in numbers:
+            channel = known.channels[number]
+            schema = known.schemas.get(channel.schema_id)
+            for record in (schema, channel):
+                if record is not None and (type(record), record.id) not in self._written:
+                    self._writer.write_definition(record)
+                    self._written.add((type(record), record.id))
+
+    def _count(self, number: int, count: int, first: int, last: int) -> None:
+        self._counts[number] = self._counts.get(number, 0) + count
+        self._ends[number] = max(self._ends.get(number, 0), last)
+        self._span = min(self._span[0], first), max(self._span[1], last)
+
+    def _rosbag2(self, name: str) -> dict[str, str] | None:
+        """Make the record for rosbag2, which reads the index where there is none."""
+        definitions = self._salvage.definitions
+        topics: dict[str, rosbag2.TopicCount] = {}
+        for number, channel in definitions.channels.items():
+            schema = definitions.schemas.get(channel.schema_id)
+            kind = "" if schema is None else schema.name
+            topic = topics.setdefault(channel.topic, rosbag2.TopicCount(kind, channel.metadata))
+            topic.messages += self._counts.get(number, 0)
+        try:
+            return rosbag2.file_metadata(name, topics, self._span if self._counts else (0, 0))
+        except (KeyError, ValueError):  # other writers describe their channels in other ways
+            return None
+
+
+def _untraced(topics: dict[str, Topic], damages: list[Damage]) -> list[Damage]:
+    """List messages that the log counts, while nothing shows where they were."""
+    if not all(damage.exact for damage in damages):
         return []
-    record = next(StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True).records)
-    if not isinstance(record, Chunk):
-        return [record]
-    if record.uncompressed_size > _RECORD_LIMIT:
-        raise McapError("a chunk claims to be too large")
-    return breakup_chunk(record, validate_crc=True)
+    missing = {
+        name: topic.expected - topic.messages - sum(d.messages.get(name, 0) for d in damages)
+        for name, topic in topics.items()
+        if topic.expected is not None
+    }
+    missing = {name: count for name, count in missing.items() if count > 0}
+    return [Damage(0, 0, "its statistics count more", missing)] if missing else []
+
+
+def _check(path: Path, topics: dict[str, Topic]) -> None:
+    """Raise LogError unless a log, read with all its checksums, holds what it should."""
+    expected = {name: topic.messages for name, topic in topics.items() if topic.messages}
+    found: dict[str, int] = {}
+    with LogFile(path) as file:
+        for place in file.places:
+            file.record(place)
+        groups = np.cumsum(file.chunks["size"]) // _READ_SIZE
+        for chunks in np.split(file.chunks, np.flatnonzero(np.diff(groups)) + 1):
+            for some in read_chunks(file, chunks, check=True):
+                found[some.channel.topic] = found.get(some.channel.topic, 0) + len(some)
+    if found != expected:
+        raise LogError(
+            f"{path}: holds {sum(found.values())} messages of {sum(expected.values())} that were "
+            "recovered"
+        )
 
 
 @dataclass(frozen=True)
@@ -108,7 +328,7 @@ class Recovered:
     end : int
         End of its last frame, in nanoseconds of UTC; 0 if it has none.
     damage : str
-        Why less than the whole file could be read; empty if it only ended early.
+        What is wrong with the file, and was lost; empty if it only ended early.
     """
 
     path: Path
@@ -119,8 +339,8 @@ class Recovered:
 def recover_active(root: Path, node: str) -> list[Recovered]:
     """Complete all logs of a node that nobody writes any more.
 
-    Each is copied to its final name up to where it was cut, read again and counted, and only
-    then removed. One that is damaged, or holds no message, is kept beside it as `*.damaged`.
+    What is whole is copied to the final name, read again and counted; only then is the original
+    removed. One that is damaged, or holds no message, is kept beside it as `*.damaged`.
     """
     found = []
     for active in sorted(root.rglob(f"{node}_*{ACTIVE_SUFFIX}")):
@@ -134,110 +354,51 @@ def _recover(active: Path) -> list[Recovered]:
     path = active.with_name(active.name.removesuffix(ACTIVE_SUFFIX) + SUFFIX)
     copy = active.with_name(path.name + ".recovering")
     try:
-        with copy.open("wb") as stream:
-            log = _Copy(stream)
-            log.read(active)
-            if log.count:
-                log.finish(path.name)
-            stream.flush()
-            os.fsync(stream.fileno())
-        _put_in_place(copy, path, log.count)
+        try:
+            recovery = recover_log(active, copy, path.name)
+        except NothingWholeError:
+            recovery = Recovery({}, [], complete=False)
+        if recovery.messages:
+            _put_in_place(copy, path, recovery)
     except OSError as error:
-        copy.unlink(missing_ok=True)
         what = error.strerror or str(error)
         raise LogError(f"{active}: cannot be completed ({what}); it is left as it is") from error
-    if log.damage or not log.count:
+    finally:
+        copy.unlink(missing_ok=True)
+    damages = [damage for damage in recovery.damages if not damage.cut]
+    if damages or not recovery.messages:
         active.rename(active.with_name(path.name + ".damaged"))
     else:
         active.unlink()
     sync_folder(path.parent)
-    return [Recovered(path, log.end, log.damage)] if log.count else []
+    if not recovery.messages:
+        return []
+    ends = [
+        t.end + FRAME_NANOSECONDS
+        for t in recovery.topics.values()
+        if t.type == messages.FEATURES and t.messages
+    ]
+    more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
+    damage = f"{active}: {damages[0]}{more}" if damages else ""
+    return [Recovered(path, max(ends, default=0), damage)]
 
 
-def _put_in_place(copy: Path, path: Path, count: int) -> None:
-    if not count:
-        copy.unlink()
+def _put_in_place(copy: Path, path: Path, recovery: Recovery) -> None:
+    if path.exists():
+        _check(path, recovery.topics)  # an earlier start got as far as this, and no further
         return
-    _check(copy, count)
-    if not path.exists():
-        copy.rename(path)
-        return
-    copy.unlink()
-    _check(path, count)  # else an earlier start got as far as this, and no further
-
-
-class _Copy:
-    """A log being copied record by record."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.count = 0
-        self.end = 0
-        self.damage = ""
-        self._writer = Writer(stream)
-        self._schemas: dict[int, tuple[int, str]] = {}
-        self._channels: dict[int, tuple[int, rosbag2.TopicCount]] = {}
-        self._topics: dict[str, rosbag2.TopicCount] = {}
-        self._span = (1 << 64, 0)
-
-    def read(self, source: Path) -> None:
-        """Copy all complete records of a log."""
-        try:
-            for record in read_records(source):
-                self._add(record)
-        except LogError as error:
-            self.damage = str(error)
-
-    def finish(self, name: str) -> None:
-        """Complete the copy, which will bear this name."""
-        about = rosbag2.file_metadata(name, self._topics, self._span)
-        self._writer.add_metadata(rosbag2.METADATA, about)
-        self._writer.finish()
-
-    def _add(self, record: object) -> None:
-        if isinstance(record, Message):
-            self._add_message(record)
-        elif isinstance(record, Header):
-            self._writer.start(record.profile, record.library)
-        elif isinstance(record, Metadata):
-            self._writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Attachment):
-            self._writer.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
-        elif isinstance(record, Schema) and record.id not in self._schemas:
-            new = self._writer.register_schema(record.name, record.encoding, record.data)
-            self._schemas[record.id] = new, record.name
-        elif isinstance(record, Channel) and record.id not in self._channels:
-            schema, name = self._schemas[record.schema_id]
-            topic = rosbag2.TopicCount(name, record.metadata)
-            new = self._writer.register_channel(
-                record.topic, record.message_encoding, schema, record.metadata
-            )
-            self._channels[record.id] = new, topic
-            self._topics[record.topic] = topic
-
-    def _add_message(self, record: Message) -> None:
-        channel, topic = self._channels[record.channel_id]
-        self._writer.add_message(
-            channel, record.log_time, record.data, record.publish_time, record.sequence
-        )
-        topic.messages += 1
-        self.count += 1
-        self._span = min(self._span[0], record.log_time), max(self._span[1], record.log_time)
-        if topic.type == messages.FEATURES:
-            self.end = max(self.end, record.log_time + FRAME_NANOSECONDS)
-
-
-def _check(path: Path, expected: int) -> None:
-    count = sum(isinstance(record, Message) for record in read_records(path))
-    if count != expected:
-        raise LogError(f"{path}: holds {count} messages of {expected} that were recovered")
+    _sync(copy)
+    copy.rename(path)
 
 
 @contextmanager
 def _abandoned(path: Path) -> Iterator[bool]:
     """Hold the file's lock, unless a recorder does."""
-    with path.open("rb") as stream:
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+    with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -1,10 +1,18 @@
 """The command line tells what is in a log, stays light where it must, and shows the whole way."""
 
 import json
+import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
+
+from schemas import messages
+from schemas.messages import NANOSECONDS
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
 
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
@@ -43,6 +51,52 @@ def test_info_for_people_has_the_same_figures(logs, hearthlog):
     assert "hearthlog_msgs/msg/AudioFeatures" in text
 
 
+def test_info_says_in_json_what_the_files_are_and_carry(logs, hearthlog):
+    found = json.loads(hearthlog("info", logs, "--json").stdout)
+    assert found["profiles"] == ["ros2"]
+    assert found["libraries"] == ["hearthlog"]
+    assert found["metadata"] == ["hearthlog", "rosbag2"]
+    assert len(found["attachments"]) == 2
+    assert found["chunks"] > 10
+    assert found["compression_ratio"] > 1
+    assert sum(found["segments"]["hall"].values()) == found["topics"]["/hall/segment"]["messages"]
+    assert found["layers"] == []
+    assert found["damaged"] == {}
+    assert found["gap_seconds"] == 0
+    assert found["health"]["level"] == "ok"
+    assert found["health"]["name"] == "hearthlog: hall"
+
+
+def gaps(path, count, reason="overrun"):
+    """A log that has nothing but gaps, each of a quarter of a second."""
+    times = 1_772_348_400 * NANOSECONDS + np.arange(count) * NANOSECONDS
+    fields = {
+        "header.stamp": times,
+        "header.frame_id": "hall",
+        "duration": np.full(count, NANOSECONDS // 4),
+        "reason": reason,
+        "frames_lost": np.full(count, 5, np.uint64),
+    }
+    writer = LogWriter(path, [Topic("/hall/gap", messages.GAP)], {})
+    writer.write_columns([Rows("/hall/gap", times, fields)])
+    return writer.finish()
+
+
+def test_info_lists_the_first_gaps_and_json_all_of_them_with_status_3(hearthlog, tmp_path):
+    log = gaps(tmp_path / "a.mcap", 15)
+    text = hearthlog("info", log)
+    assert text.returncode == 3
+    total, first, *_, more = text.stdout.splitlines()[-12:]
+    assert total == "15 gaps, together 3.750 s"
+    assert first == "gap: hall 2026-03-01T07:00:00.000Z 0.250 s, 5 frames: overrun"
+    assert more == "gap: and 5 more (--json lists all)"
+    result = hearthlog("info", log, "--json")
+    assert result.returncode == 3
+    found = json.loads(result.stdout)
+    assert len(found["gaps"]) == 15
+    assert found["gap_seconds"] == pytest.approx(3.75)
+
+
 def test_info_of_an_unfinished_log_says_so_with_status_3(logs, hearthlog, tmp_path):
     whole = min(logs.rglob("*.mcap"))
     cut = tmp_path / (whole.name + ".active")
@@ -50,6 +104,69 @@ def test_info_of_an_unfinished_log_says_so_with_status_3(logs, hearthlog, tmp_pa
     result = hearthlog("info", cut, "--json")
     assert result.returncode == 3
     assert json.loads(result.stdout)["unfinished"] == [str(cut)]
+
+
+def test_info_names_a_damaged_log_and_shows_the_others_with_status_3(logs, hearthlog, tmp_path):
+    whole, other = sorted(logs.rglob("*.mcap"))
+    shutil.copy(whole, tmp_path)
+    bad = tmp_path / other.name
+    data = bytearray(other.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 3000] = bytes(3000)
+    bad.write_bytes(data)
+    alone = json.loads(hearthlog("info", whole, "--json").stdout)
+    result = hearthlog("info", tmp_path, "--json")
+    assert result.returncode == 3
+    found = json.loads(result.stdout)
+    assert found["topics"] == alone["topics"]
+    assert list(found["damaged"]) == [str(bad)]
+    for stderr in (result.stderr, hearthlog("info", tmp_path).stderr):
+        assert stderr.startswith(f"hearthlog: {bad}: damaged at byte ")
+        assert stderr.count("\n") == 1
+
+
+def test_info_of_nothing_but_damaged_logs_fails(hearthlog, tmp_path):
+    for name in "ab":
+        (tmp_path / f"{name}.mcap").write_bytes(b"no log")
+    result = hearthlog("info", tmp_path)
+    assert result.returncode == 1
+    assert result.stdout == ""
+    assert result.stderr.splitlines() == [
+        f"hearthlog: {tmp_path / name}: is no MCAP file" for name in ("a.mcap", "b.mcap")
+    ]
+
+
+def test_info_of_a_log_without_messages(hearthlog, tmp_path):
+    log = LogWriter(tmp_path / "a.mcap", [Topic("/hall/gap", messages.GAP)], {}).finish()
+    result = hearthlog("info", log)
+    assert result.returncode == 0
+    assert "no messages" in result.stdout.splitlines()
+    found = json.loads(hearthlog("info", log, "--json").stdout)
+    assert found["start"] is found["end"] is found["compression_ratio"] is found["health"] is None
+    assert found["topics"]["/hall/gap"]["messages"] == 0
+
+
+def test_info_of_a_foreign_log_shows_its_topics(hearthlog, tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="", library="someone else's")
+        channel = writer.register_channel("/reading", "json", 0)
+        for time in range(5):
+            writer.add_message(channel, time * NANOSECONDS, b"{}", 0)
+        writer.finish()
+    result = hearthlog("info", path)
+    assert result.returncode == 0
+    assert "written by someone else's" in result.stdout.splitlines()
+    assert "1970-01-01T00:00:00.000Z to 1970-01-01T00:00:04.000Z (0:00:04)" in result.stdout
+    topic = json.loads(hearthlog("info", path, "--json").stdout)["topics"]["/reading"]
+    assert topic == {"type": "", "encoding": "json", "messages": 5, "rate_hz": 1.0, "bytes": None}
+
+
+def test_info_sends_nothing_of_a_file_to_the_terminal_that_would_steer_it(hearthlog, tmp_path):
+    log = gaps(tmp_path / "a.mcap", 1, reason="\x1b[2J[red]gone\r\n")
+    result = hearthlog("info", log)
+    assert result.stdout.splitlines()[-1].endswith(" 5 frames:  [2J[red]gone  ")
 
 
 def test_recording_with_labels_imports_nothing_of_the_analyzer(day, model_file, tmp_path):

@@ -268,9 +268,7 @@ def test_two_types_on_one_topic_are_told(tmp_path):
     first = written(tmp_path / "a.mcap", "/mic/label", np.arange(5))
     writer = LogWriter(tmp_path / "b.mcap", [Topic("/mic/label", "std_msgs/msg/Float32")], {})
     writer.write_columns([Rows("/mic/label", np.arange(3), {"data": np.zeros(3, np.float32)})])
-    with pytest.raises(
-        LogError, match="/mic/label: is of type std_msgs/msg/Float32 and of "
-    ):
+    with pytest.raises(LogError, match="/mic/label: is of type std_msgs/msg/Float32 and of "):
         read_columns([first, writer.finish()])
 
 

@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosDurability
+from rosbags.interfaces import QosDurability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -31,6 +31,8 @@ from schemas.reader import LogReader
 
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 40}
+LEVELS = {"INFO": 20, "WARN": 30, "ERROR": 40}
+FOR_EVER = QosTime(9_223_372_036, 854_775_807)
 TOPICS = {
     f"/mic/{kind}": f"hearthlog_msgs/msg/Audio{name}"
     for kind, name in {
@@ -41,7 +43,7 @@ TOPICS = {
         "segment": "Segment",
         "gap": "Gap",
     }.items()
-} | {"/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}
+} | {"/diagnostics": "diagnostic_msgs/msg/DiagnosticArray", "/rosout": "rcl_interfaces/msg/Log"}
 
 
 @pytest.fixture(scope="module", params=["simulated home", "real household"])
@@ -124,6 +126,20 @@ def test_mcap_ros2_support_reads_the_same(logs):
         assert found == ours(path)
 
 
+def log_messages(batch):
+    """The `Log` messages behind lines that Rerun has made its own."""
+    stamps = batch.column("ros2_timestamp").cast("int64").to_pylist()
+    names = ["file", "function", "line", "TextLog:level", "TextLog:text"]
+    rows = zip(stamps, *(batch.column(name).to_pylist() for name in names), strict=True)
+    found = []
+    for stamp, (file,), (function,), (line,), (level,), (text,) in rows:
+        sec, nanosec = divmod(stamp, NANOSECONDS)
+        name, _, msg = text.removeprefix("[").partition("] ")
+        about = {"stamp": {"sec": sec, "nanosec": nanosec}, "level": LEVELS[level], "name": name}
+        found.append(about | {"msg": msg, "file": file, "function": function, "line": line})
+    return found
+
+
 def test_rerun_reads_the_same_at_the_same_times(logs):
     for path in logs:
         found = {topic: [] for topic in TOPICS}
@@ -137,7 +153,10 @@ def test_rerun_reads_the_same_at_the_same_times(logs):
                 for timeline in ("message_log_time", "message_publish_time")
             ]
             assert times[0] == times[1]
-            rows = [plain(row) for (row,) in batch.column(name).to_pylist()]
+            if str(chunk.entity_path) == "/rosout":
+                rows = log_messages(batch)
+            else:
+                rows = [plain(row) for (row,) in batch.column(name).to_pylist()]
             found[str(chunk.entity_path)] += zip(times[0], rows, strict=True)
         for rows in found.values():
             rows.sort(key=lambda row: row[0])
@@ -153,7 +172,8 @@ def test_log_time_never_runs_backwards_and_is_the_time_of_the_message(logs):
         decoded = {topic: iter(rows) for topic, rows in ours(path).items()}
         for topic, message in raw:
             content = next(decoded[topic])[1]
-            stamp, duration = content["header"]["stamp"], content.get("duration")
+            stamp = content["stamp"] if topic == "/rosout" else content["header"]["stamp"]
+            duration = content.get("duration")
             time = stamp["sec"] * NANOSECONDS + stamp["nanosec"]
             if duration is not None:
                 time += duration["sec"] * NANOSECONDS + duration["nanosec"]
@@ -219,15 +239,19 @@ def test_the_metadata_in_the_file_serves_as_a_rosbag2_metadata_file(logs, tmp_pa
             assert all(c.digest.startswith("RIHS01_") for c in reader.connections)
 
 
-def test_every_channel_offers_a_quality_of_service_and_only_info_outlasts_its_writer(logs):
+def test_every_channel_offers_a_quality_of_service(logs):
     for path in logs:
         with AnyReader([path]) as reader:
             offered = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
         assert offered.keys() == TOPICS.keys()
-        for topic, profiles in offered.items():
-            (profile,) = profiles
-            outlasts = profile.durability is QosDurability.TRANSIENT_LOCAL
-            assert outlasts == (topic == "/mic/info")
+        for topic, (profile,) in offered.items():
+            kept = (profile.durability, profile.depth, profile.lifespan)
+            if topic == "/mic/info":
+                assert kept == (QosDurability.TRANSIENT_LOCAL, 1, FOR_EVER)
+            elif topic == "/rosout":  # as ROS 2 itself offers it
+                assert kept == (QosDurability.TRANSIENT_LOCAL, 1000, QosTime(10, 0))
+            else:
+                assert kept == (QosDurability.VOLATILE, 10, FOR_EVER)
 
 
 def test_the_type_hash_is_that_of_the_definition_in_the_file(logs):

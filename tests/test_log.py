@@ -9,7 +9,7 @@ from recorder.pipeline import Pipeline
 from recorder.service import Settings, _describe
 from recorder.stream import FRAME_NANOSECONDS
 from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
+from schemas.messages import NANOSECONDS, nanoseconds
 from schemas.reader import LogReader
 
 HOUR = 3600 * NANOSECONDS
@@ -73,5 +73,18 @@ def test_a_file_says_what_it_is_from_its_first_message_on(description, tmp_path)
     log = RollingLog(description, 3600, 1.0, 5.0)
     log.write(records(0, 1, START))
     (active,) = tmp_path.rglob("*.active")
-    assert [item.topic for item in LogReader(active).messages()] == ["/mic/info"]
+    topics = [item.topic for item in LogReader(active).messages()]
     log.finish()
+    assert topics == ["/mic/info", "/rosout"]
+
+
+def test_every_file_says_in_words_what_is_recorded(description):
+    log = RollingLog(description, 60, 1.0, 5.0)
+    log.write(records(0, 2000, START + 50 * NANOSECONDS))
+    log.finish()
+    for path in log.finished:
+        (first,) = LogReader(path).messages(["/rosout"])
+        said = first.decode()
+        assert first.log_time == nanoseconds(said.stamp) == features(path)[1][0]
+        assert (said.level, said.name) == (said.INFO, "hearthlog.mic")
+        assert said.msg == "recording test: no model, no labels"

@@ -1,12 +1,8 @@
 """What a Rerun recording of some logs shows."""
 
-import json
 import os
-import socket
 import subprocess
 import sys
-import time
-from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
@@ -15,7 +11,7 @@ from blobs import blobs, ignore_progress
 from logs import features, read
 from lossy import LossySource
 from rerun.chunk import RrdReader
-from rerun.experimental import ViewerClient
+from viewers import rerun_home, shown, viewer
 
 from analyzer.errors import DataError
 from analyzer.timeline import save_timeline
@@ -30,7 +26,11 @@ from schemas import messages
 from schemas.errors import LogError
 from schemas.files import find_logs
 from schemas.messages import nanoseconds
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
 from tools.cli.review import review
+
+__all__ = ["viewer"]  # a fixture
 
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 400}
@@ -215,6 +215,56 @@ def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
     assert [both.names[i] for i in both.labels] == expected
 
 
+def labels_log(path, names, labels, width=2):
+    """A log of labels, 50 ms apart."""
+    count = len(labels)
+    times = START + np.arange(count) * FRAME_NANOSECONDS
+    fields = {
+        "header.stamp": times,
+        "header.frame_id": "mic",
+        "frame": np.arange(count, dtype=np.uint64),
+        "label": labels,
+        "confidence": np.ones(count, np.float32),
+        "novelty": np.ones(count, np.float32),
+        "probabilities": np.ones((count, width), np.float32),
+    }
+    topic = Topic("/mic/label", messages.LABEL, array_names=names)
+    writer = LogWriter(path, [topic], {})
+    writer.write_columns([Rows("/mic/label", times, fields)])
+    return writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("names", "width", "message"),
+    [
+        ({}, 2, "the channel does not name its values"),
+        ({"probabilities": ["speech", "crying"]}, 3, "a value for each of 2 names"),
+        ({"probabilities": ["speech", "music"]}, 2, "label 'crying' is none of its classes"),
+    ],
+)
+def test_labels_that_contradict_their_names_are_one_line(tmp_path, names, width, message):
+    path = labels_log(tmp_path / "a.mcap", names, ["speech", "crying"], width)
+    with pytest.raises(LogError, match=message) as caught:
+        read_tracks([path])
+    assert str(caught.value).startswith(f"{path}: /mic/label: ")
+
+
+def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder):
+    logs = find_logs(folder)
+    there, back = read_tracks(logs), read_tracks(logs[::-1])
+    assert there.range == back.range
+    for kind, topics in there.rows.items():
+        for topic, rows in topics.items():
+            for name in ("times", "frames", "values", "labels"):
+                np.testing.assert_array_equal(
+                    getattr(back.rows[kind][topic], name), getattr(rows, name)
+                )
+    for kind, topics in there.spans.items():
+        for topic, spans in topics.items():
+            assert back.spans[kind][topic].starts.tolist() == spans.starts.tolist()
+            assert back.spans[kind][topic].texts.tolist() == spans.texts.tolist()
+
+
 def test_an_existing_file_is_left_alone(tmp_path, folder):
     path = tmp_path / "mine.rrd"
     path.write_text("precious")
@@ -264,11 +314,6 @@ def test_the_command_prints_the_file_and_how_to_open_it(tmp_path, folder, capsys
     assert output.stat().st_size > 100_000
 
 
-def rerun_home(folder: Path) -> dict[str, str]:
-    """An environment in which Rerun keeps its files in a folder of its own."""
-    return {"XDG_CONFIG_HOME": str(folder / "config"), "XDG_DATA_HOME": str(folder / "data")}
-
-
 def test_writing_a_recording_collects_no_usage_statistics(tmp_path, folder):
     code = (
         "import sys, pathlib; from analyzer.timeline import save_timeline; "
@@ -283,51 +328,12 @@ def test_writing_a_recording_collects_no_usage_statistics(tmp_path, folder):
     assert list(home.rglob("*")) == []
 
 
-@pytest.fixture
-def viewer(tmp_path, monkeypatch):
-    """Rerun's viewer without a screen; it asks for a Vulkan driver, such as Mesa's llvmpipe."""
-    for name, value in rerun_home(tmp_path).items():
-        monkeypatch.setenv(name, value)
-    configuration = tmp_path / "config" / "rerun" / "analytics.json"
-    configuration.parent.mkdir(parents=True)
-    statistics = {
-        "analytics_enabled": False,
-        "analytics_id": "",
-        "metadata": {},
-        "config_file_path": str(configuration),
-        "data_dir_path": str(tmp_path / "data"),
-    }
-    configuration.write_text(json.dumps(statistics))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    program = Path(sys.executable).with_name("rerun")
-    try:
-        client = ViewerClient.spawn(headless=True, port=port, executable_path=str(program))
-        client.get_state()
-    except ConnectionError as error:
-        if os.environ.get("HEARTHLOG_REQUIRE_AUDIO") == "1":
-            raise
-        pytest.skip(f"Rerun's viewer does not run here: {error}")
-    with client:
-        yield client
-
-
 def test_the_viewer_shows_every_view_without_complaint(viewer, recording):
-    viewer.open([str(recording)])
-    deadline = time.monotonic() + 60
-    state = viewer.get_state()
-    while state.loading or len(state.views) < 4:
-        assert time.monotonic() < deadline, state
-        time.sleep(0.1)
-        state = viewer.get_state()
-    time.sleep(2)
-    picture = viewer.take_screenshot()
-    state = viewer.get_state()
+    picture, state = shown(viewer, recording, views=4)
     assert sorted(view.view_class for view in state.views) == ["StateTimeline", *["TimeSeries"] * 3]
     assert all(view.visible for view in state.views)
     assert [report for view in state.views for report in view.reports] == []
-    (shown,) = state.recordings
-    assert shown.current_timeline == "time"
-    assert [(t.name, t.time_type) for t in shown.timelines] == [("time", "timestamp")]
+    (loaded,) = state.recordings
+    assert loaded.current_timeline == "time"
+    assert [(t.name, t.time_type) for t in loaded.timelines] == [("time", "timestamp")]
     assert picture.startswith(b"\x89PNG")

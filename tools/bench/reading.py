@@ -130,7 +130,8 @@ def _rerun(log: Path, _count: int) -> int:
 
 
 def _check(ours: Read, theirs: Read) -> None:
-    if not all(map(np.array_equal, (part[: len(theirs[0])] for part in ours), theirs)):
+    count = len(theirs[0])
+    if any((ours[i][:count] != theirs[i]).any() for i in range(3)):
         raise BenchError("two readers read different values")
 
 

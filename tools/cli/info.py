@@ -2,17 +2,21 @@
 
 import json
 import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 if TYPE_CHECKING:
     from analyzer.summary import Summary
 
 _PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
+_LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
+_SHOWN = 10  # of a list
 
 
 def info(
@@ -22,33 +26,45 @@ def info(
 ) -> None:
     """Show what is in a log: span, topics, rates, gaps, labels, model, sizes.
 
-    Exit status 3: a file is unfinished, or sound is missing.
+    Exit status 3: a file is unfinished or damaged, or sound is missing.
     """
     from analyzer.summary import summarise
     from schemas.files import find_logs
     from tools.cli.progress import track
 
     summary = summarise(track(find_logs(path), "reading logs"))
+    for error in summary.damaged.values():
+        print(f"hearthlog: {error}", file=sys.stderr)
+    if not summary.files:
+        raise typer.Exit(1)
     if as_json:
         print(json.dumps(_as_json(summary), indent=2))
     else:
         _print(summary)
-    if summary.unfinished or summary.gaps:
+    if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
 
 
 def _as_json(summary: "Summary") -> dict[str, Any]:
+    first, last = summary.span or (None, None)
     return {
         "files": [str(path) for path in summary.files],
         "unfinished": [str(path) for path in summary.unfinished],
+        "layers": [str(path) for path in summary.layers],
+        "damaged": {str(path): error for path, error in summary.damaged.items()},
         "size_bytes": summary.size,
-        "start": _time(summary.start),
-        "end": _time(summary.end),
+        "chunks": summary.chunks,
+        "compression_ratio": summary.compression_ratio,
+        "profiles": sorted(summary.profiles),
+        "libraries": sorted(summary.libraries),
+        "start": _time(first),
+        "end": _time(last),
         "seconds": summary.seconds,
         "streams": summary.streams,
         "topics": {
             name: {
                 "type": topic.type,
+                "encoding": topic.encoding,
                 "messages": topic.messages,
                 "rate_hz": topic.rate,
                 "bytes": topic.bytes,
@@ -56,10 +72,31 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
             for name, topic in summary.topics.items()
         },
         "labels": {
-            microphone: {label: seconds / 60 for label, seconds in labels.items()}
+            microphone: {label: seconds / 60 for label, seconds in labels.most_common()}
             for microphone, labels in summary.label_seconds.items()
         },
+        "segments": {
+            microphone: dict(labels.most_common())
+            for microphone, labels in summary.segments.items()
+        },
         "gaps": [asdict(gap) | {"start": _time(gap.start)} for gap in summary.gaps],
+        "gap_seconds": summary.gap_seconds,
+        "health": _health(summary),
+        "attachments": sorted(summary.attachments),
+        "metadata": sorted(summary.metadata),
+    }
+
+
+def _health(summary: "Summary") -> dict[str, str] | None:
+    health = summary.health
+    if health is None:
+        return None
+    level = _LEVELS[min(health.level, len(_LEVELS) - 1)]
+    return {
+        "level": level,
+        "name": health.name,
+        "message": health.message,
+        "time": str(_time(health.time)),
     }
 
 
@@ -67,42 +104,99 @@ def _print(summary: "Summary") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    console.print(
-        f"{len(summary.files)} files, {summary.size / 1e6:.1f} MB, "
-        f"{_time(summary.start)} to {_time(summary.end)} ({_duration(summary.seconds)})"
-    )
-    for path in summary.unfinished:
-        console.print(f"unfinished: {path}")
-    for stream in summary.streams:
-        model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
-        console.print(
-            f"{stream['microphone']}: {stream['device']}, features {stream['feature_set']}, "
-            f"model {model}",
-            markup=False,
-        )
+    width = None if sys.stdout.isatty() else _PLAIN_WIDTH
+    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True, width=width)
+
+    def show(table: Table) -> None:
+        if table.rows:
+            console.print(table, soft_wrap=False)
+
+    for line in _lines(summary):
+        console.print(_printable(line))
     topics = Table("topic", "type", "messages", "per second", "MB raw", box=None)
     for name, topic in sorted(summary.topics.items()):
-        rate, size = f"{topic.rate:.3g}", f"{topic.bytes / 1e6:.2f}"
-        topics.add_row(name, topic.type, str(topic.messages), rate, size)
-    console.print(topics)
-    labels = Table("microphone", "label", "minutes", box=None)
-    for microphone, found in summary.label_seconds.items():
-        for label, seconds in found.items():
-            labels.add_row(microphone, label, f"{seconds / 60:.2f}")
-    if labels.rows:
-        console.print(labels)
-    for gap in summary.gaps:
-        console.print(
-            f"gap: {gap.microphone} {_time(gap.start)} {gap.seconds:.3f} s, "
-            f"{gap.frames_lost} frames: {gap.reason}",
-            markup=False,
+        encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
+        size = "-" if topic.bytes is None else f"{topic.bytes / 1e6:.2f}"
+        count, rate = str(topic.messages), f"{topic.rate:.3g}"
+        topics.add_row(_printable(name), _printable(topic.type + encoding), count, rate, size)
+    show(topics)
+    labels = Table("microphone", "label", "minutes", "segments", box=None)
+    for microphone, label, seconds, segments in _label_rows(summary):
+        minutes = f"{seconds / 60:.2f}"
+        labels.add_row(_printable(microphone), _printable(label), minutes, str(segments))
+    show(labels)
+    for line in _gap_lines(summary):
+        console.print(_printable(line))
+
+
+def _lines(summary: "Summary") -> Iterator[str]:
+    """Say what the files are, and what they say of themselves."""
+    chunks = f", {_number(summary.chunks, 'chunk')}" if summary.chunks else ""
+    ratio = summary.compression_ratio
+    packed = f", compressed {ratio:.2f} to 1" if ratio else ""
+    yield f"{_number(len(summary.files), 'file')}, {summary.size / 1e6:.1f} MB{chunks}{packed}"
+    if summary.span is None:
+        yield "no messages"
+    else:
+        start, end = map(_time, summary.span)
+        yield f"{start} to {end} ({_duration(summary.seconds)})"
+    about = {
+        "written by": summary.libraries,
+        "profile": summary.profiles,
+        "metadata": summary.metadata,
+        "attachments": summary.attachments,
+    }
+    yield "; ".join(f"{what} {', '.join(sorted(names))}" for what, names in about.items() if names)
+    yield from _first("unfinished", [str(path) for path in summary.unfinished])
+    yield from _first("layer", [str(path) for path in summary.layers])
+    for stream in summary.streams:
+        model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
+        yield (
+            f"{stream['microphone']}: {stream['device']}, features {stream['feature_set']}, "
+            f"model {model}"
         )
+    health = _health(summary)
+    if health is not None:
+        yield f"health: {health['level']}, {health['time']} {health['name']}: {health['message']}"
 
 
-def _time(stamp: int) -> str:
-    moment = datetime.fromtimestamp(stamp / 1e9, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def _gap_lines(summary: "Summary") -> Iterator[str]:
+    if summary.gaps:
+        yield f"{_number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
+    lines = [
+        f"{gap.microphone} {_time(gap.start)} {gap.seconds:.3f} s, "
+        f"{_number(gap.frames_lost, 'frame')}: {gap.reason}"
+        for gap in summary.gaps
+    ]
+    yield from _first("gap", lines)
+
+
+def _first(what: str, lines: Sequence[str]) -> Iterator[str]:
+    for line in lines[:_SHOWN]:
+        yield f"{what}: {line}"
+    if len(lines) > _SHOWN:
+        yield f"{what}: and {len(lines) - _SHOWN} more (--json lists all)"
+
+
+def _label_rows(summary: "Summary") -> Iterator[tuple[str, str, float, int]]:
+    for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
+        seconds = summary.label_seconds.get(microphone, Counter())
+        segments = summary.segments.get(microphone, Counter())
+        for label in dict.fromkeys([*(name for name, _ in seconds.most_common()), *segments]):
+            yield microphone, label, seconds[label], segments[label]
+
+
+def _printable(text: str) -> str:
+    """Leave out what would steer the terminal: it may come from a foreign file."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _time(stamp: int | None) -> str | None:
+    return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
 
 
 def _duration(seconds: float) -> str:

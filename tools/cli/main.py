@@ -10,10 +10,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from schemas.errors import HearthlogError
+from tools.cli.cat import cat
+from tools.cli.cut import cut
 from tools.cli.demo import demo
 from tools.cli.devices import devices
+from tools.cli.doctor import doctor
+from tools.cli.export import export
 from tools.cli.info import info
+from tools.cli.merge import merge
 from tools.cli.record import record
+from tools.cli.recover import recover
+from tools.cli.replay import replay
 from tools.cli.review import review
 from tools.cli.train import train
 
@@ -23,7 +30,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (record, devices, info, train, review, demo):
+for verb in (
+    record,
+    devices,
+    info,
+    cat,
+    export,
+    merge,
+    cut,
+    doctor,
+    recover,
+    train,
+    review,
+    replay,
+    demo,
+):
     app.command()(verb)
 
 

@@ -2,12 +2,13 @@
 
 import signal
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event as Flag
 from typing import Annotated, Any
 
 import typer
+
+from tools.cli.times import parse_time
 
 
 def record(
@@ -100,10 +101,4 @@ def start_time(text: str | None, file: Path) -> int:
     """Read the time of a file's first sample, in nanoseconds of UTC."""
     if text is None:
         return file.stat().st_mtime_ns if file.exists() else 0
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise typer.BadParameter(f"--start {text}: not a time such as 2026-03-01T07:00") from error
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    return int(moment.timestamp() * 1_000_000) * 1_000
+    return parse_time(text, "--start")

@@ -1,0 +1,75 @@
+"""What the log of a replay says of itself."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+from analyzer.origin import Origin
+from models.modelfile import Model
+from recorder import features
+from recorder.log import LogDescription
+from recorder.statistics import WINDOW_FRAMES
+from recorder.stream import FRAME_NANOSECONDS
+from schemas import messages
+from schemas.messages import NANOSECONDS, header, message
+from schemas.topics import topics_of
+from schemas.writer import Attachment
+
+MODEL_CARD = "model_card.md"
+_FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
+
+
+def describe(
+    origin: Origin, model: Model | None, output: Path, replayed: Mapping[str, str]
+) -> LogDescription:
+    """Say of a new log what the recorder said of the old one.
+
+    Parameters
+    ----------
+    origin : Origin
+        Of the old one.
+    model : Model or None
+        Which gives the labels now.
+    output : Path
+        Folder of the new one.
+    replayed : mapping of str to str
+        What the `hearthlog` record says besides.
+    """
+    if model is not None and model.sha256 == origin.model_sha256:
+        model = replace(model, name=origin.model)  # whatever its file is called here
+    name, digest = ("", "") if model is None else (model.name, model.sha256)
+    classes = None if model is None else list(model.classes)
+    info = message(
+        messages.STREAM_INFO,
+        header=header(0, origin.microphone),
+        device=origin.device,
+        sample_rate=features.SAMPLE_RATE,
+        frame_seconds=_FRAME_SECONDS,
+        window_seconds=_FRAME_SECONDS * WINDOW_FRAMES,
+        feature_set=features.NAME,
+        feature_names=list(features.FEATURE_NAMES),
+        model=name,
+        model_sha256=digest,
+        labels=classes or [],
+    )
+    attachments = [item for item in origin.attachments if item.name != MODEL_CARD]
+    if model is not None:
+        attachments.append(Attachment(MODEL_CARD, "text/markdown", model.card().encode()))
+    return LogDescription(
+        root=output,
+        node=origin.node,
+        microphone=origin.microphone,
+        topics=topics_of(origin.microphone, features.FEATURE_NAMES, classes),
+        info=info,
+        metadata={
+            **origin.metadata,
+            "version": version("hearthlog"),
+            "node": origin.node,
+            "feature_set": features.NAME,
+            "model": name,
+            "model_sha256": digest,
+            **replayed,
+        },
+        attachments=attachments,
+    )

@@ -1,0 +1,58 @@
+"""Check logs: against the specification of MCAP, against docs/log.md, and with each other."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from analyzer.doctor.check import Examined, examine_file
+from analyzer.doctor.findings import Finding, Findings, printable
+from analyzer.doctor.folder import check_leftovers, check_series
+from schemas.errors import LogError
+from schemas.files import find_logs
+
+__all__ = ["Examined", "Finding", "Findings", "examine", "examine_file", "printable"]
+
+
+def examine(path: Path, progress: Callable[[float], None] = lambda _: None) -> list[Findings]:
+    """Check a log, or all logs of a folder and how they follow each other.
+
+    Parameters
+    ----------
+    path : Path
+    progress : callable
+        Told the share of the bytes that were read.
+
+    Returns
+    -------
+    list of Findings
+        One for each file; for those left behind by what was killed, too.
+
+    Raises
+    ------
+    LogError
+        If there is no log.
+    """
+    left = list(check_leftovers(path)) if path.is_dir() else []
+    try:
+        logs = find_logs(path)
+    except LogError:
+        if not left:
+            raise
+        logs = []
+    files = _examine_all(logs, progress)
+    check_series(files)
+    return [*(file.findings for file in files), *left]
+
+
+def _examine_all(logs: Sequence[Path], progress: Callable[[float], None]) -> list[Examined]:
+    sizes = [log.stat().st_size if log.is_file() else 0 for log in logs]
+    whole = max(sum(sizes), 1)
+    files = []
+    done = 0
+    for log, size in zip(logs, sizes, strict=True):
+
+        def tell(share: float, done: int = done, size: int = size) -> None:
+            progress((done + share * size) / whole)
+
+        files.append(examine_file(log, tell))
+        done += size
+    return files

@@ -1,0 +1,227 @@
+"""One file, from its first byte to its last."""
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Footer, Metadata
+
+from analyzer.doctor.about import About
+from analyzer.doctor.batch import Batch
+from analyzer.doctor.contract import Contract
+from analyzer.doctor.data import Data
+from analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from analyzer.doctor.frames import Frames
+from analyzer.doctor.index import Summary
+from analyzer.doctor.source import Source
+from analyzer.doctor.walk import Walk
+from schemas.columns import decode
+from schemas.errors import LogError
+from schemas.files import ACTIVE_SUFFIX
+from schemas.logfile import FOOTER_SIZE, LogFile
+from schemas.records import HEAD, MAGIC, parse
+from schemas.writer import METADATA
+
+_LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
+_METADATA_SIZE = 1 << 20  # bytes
+_ENCODINGS = ("ros2msg", "ros2idl")
+
+Progress = Callable[[float], None]
+
+
+@dataclass
+class Examined:
+    """What one file was found to be.
+
+    Attributes
+    ----------
+    findings : Findings
+    ours : bool
+        Whether it is a log of hearthlog, and no layer beside one.
+    node : str
+    span : tuple of int, or None
+        First and last log time.
+    frames : dict of str to Frames
+        By microphone.
+    """
+
+    findings: Findings
+    ours: bool = False
+    node: str = ""
+    span: tuple[int, int] | None = None
+    frames: dict[str, Frames] = field(default_factory=dict)
+
+
+def examine_file(path: Path, progress: Progress = lambda _: None) -> Examined:
+    """Check one file against the specification of MCAP and, if it is ours, against the contract.
+
+    Parameters
+    ----------
+    path : Path
+    progress : callable
+        Told the share of the file that was read.
+    """
+    examined = Examined(Findings(path))
+    try:
+        with Source(path) as source:
+            _examine(source, examined, progress)
+    except OSError as error:
+        examined.findings.error("unreadable", f"cannot be read ({error.strerror})")
+    return examined
+
+
+class _Known(NamedTuple):
+    """What can be known of a file before it is read from its beginning.
+
+    Attributes
+    ----------
+    places : list of int
+        Offsets of records, ascending.
+    summary_start : int
+        0 if there is no summary.
+    ours : bool
+    """
+
+    places: list[int]
+    summary_start: int
+    ours: bool
+
+
+def _examine(source: Source, examined: Examined, progress: Progress) -> None:
+    findings = examined.findings
+    active = findings.path.name.endswith(ACTIVE_SUFFIX)
+    magic = source.take(len(MAGIC))
+    if magic != MAGIC and not (active and MAGIC.startswith(magic)):
+        findings.error("magic", "is no MCAP file: it does not begin as one")
+        return
+    finished = source.size > len(MAGIC) and source.at(source.size - len(MAGIC), 8) == MAGIC
+    known = _known(findings.path, source)
+    data = Data(findings, ours=known.ours)
+    contract = Contract(data, findings) if known.ours else _Plain(data, findings)
+    walk = Walk(source, findings, known.places, finished=finished)
+    complete = _walk(walk, data, contract, known, lambda offset: progress(offset / source.size))
+    if complete:
+        _check_end(source, findings)
+    elif finished:
+        findings.error("footer", "there is no Footer at the end", RECOVER)
+    else:
+        _say_unfinished(source, findings, active=active)
+    if isinstance(contract, Contract):
+        contract.finish()
+        whole = data.whole and not walk.damaged
+        About(data, contract, findings, finished=complete, whole=whole).check()
+        examined.ours, examined.frames = True, contract.frames
+        about = data.metadata.get(METADATA, [{}])[0]
+        examined.node = about.get("node", "")
+    examined.span = data.span
+
+
+def _known(path: Path, source: Source) -> _Known:
+    """Look at the index of a file, as far as it has one."""
+    start = 0
+    tail = source.at(max(source.size - FOOTER_SIZE, 0), FOOTER_SIZE)
+    if tail[:1] == bytes([Opcode.FOOTER]) and tail.endswith(MAGIC):
+        footer = parse(Opcode.FOOTER, tail[HEAD.size :])
+        assert isinstance(footer, Footer)
+        start = footer.summary_start
+    try:
+        with LogFile(path) as file:
+            ours = file.header is not None and file.header.library == "hearthlog"
+            for place in file.places:
+                if not ours and place.opcode == Opcode.METADATA and place.length < _METADATA_SIZE:
+                    record = file.record(place)
+                    ours = isinstance(record, Metadata) and record.name == METADATA
+            places = [*file.chunks["offset"].tolist(), *(place.offset for place in file.places)]
+    except LogError:
+        places, ours = [], False
+    if HEAD.size < start < source.size:
+        places += [start]
+    return _Known(sorted(places), start, ours and not _LAYER.fullmatch(path.name))
+
+
+def _walk(
+    walk: Walk, data: Data, contract: "Contract | _Plain", known: _Known, at: Callable[[int], None]
+) -> bool:
+    """Go through all records; tell whether the last one is a footer."""
+    summary: Summary | None = None
+    losses = 0
+    for record in walk:
+        if walk.losses > losses:
+            losses = walk.losses
+            _hand_on([*data.finish(cut=True), None], contract)
+        if (
+            summary is None
+            and not data.ended
+            and (record.opcode == Opcode.FOOTER or record.offset == known.summary_start)
+        ):
+            what = "the data section has no Data End"
+            data.findings.error("data-end", what, REINDEX, offset=record.offset)
+            data.ended = True
+        if summary is None and data.ended:
+            _hand_on(data.finish(cut=False), contract)
+            summary = Summary(data, data.findings, whole=data.whole and not walk.damaged)
+        if summary is None:
+            _hand_on(data.add(record), contract)
+            at(record.offset)
+        elif record.opcode == Opcode.FOOTER:
+            summary.finish(record)
+            return True
+        else:
+            summary.add(record)
+    _hand_on(data.finish(cut=True), contract)
+    return False
+
+
+def _hand_on(batches: "Iterable[Batch | None]", contract: "Contract | _Plain") -> None:
+    for batch in batches:
+        if batch is None:
+            contract.interrupt()
+        else:
+            contract.add(batch)
+
+
+def _check_end(source: Source, findings: Findings) -> None:
+    offset = source.offset
+    rest = source.size - offset
+    if source.take(len(MAGIC)) != MAGIC:
+        findings.error("magic", "the Footer is not followed by the magic", REINDEX, offset=offset)
+    elif rest > len(MAGIC):
+        what = f"{rest - len(MAGIC)} bytes follow the end"
+        findings.error("after-end", what, REINDEX, offset=offset + len(MAGIC))
+
+
+def _say_unfinished(source: Source, findings: Findings, *, active: bool) -> None:
+    what = "is unfinished"
+    if active:
+        advice = "unless a recorder is writing it, `hearthlog recover` completes it"
+        findings.warning("unfinished", what, advice)
+    else:
+        findings.error("cut", f"{what}: it was cut off", "`hearthlog recover` completes it")
+
+
+class _Plain:
+    """The messages of a file that is not ours: they must be of the types that it says."""
+
+    def __init__(self, data: Data, findings: Findings) -> None:
+        self._data = data
+        self._findings = findings
+
+    def add(self, batch: Batch) -> None:
+        """Take the next messages of the file."""
+        definitions = self._data.definitions
+        for raw in batch.by_channel(definitions.channels, definitions.schemas):
+            if raw.channel.message_encoding != "cdr":
+                continue
+            if raw.schema is None or raw.schema.encoding not in _ENCODINGS:
+                continue
+            try:
+                decode([raw])
+            except LogError as error:
+                what = f"cannot be read: {error}"
+                self._findings.error("cdr", what, time=int(raw.log_times[0]))
+
+    def interrupt(self) -> None:
+        """Take note that messages are missing here."""

@@ -1,0 +1,141 @@
+"""What is wrong with a log: one finding a line, and not more lines of a kind than help."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Level = Literal["error", "warning"]
+_SHOWN = 5  # findings of one kind in one file
+
+RECOVER = "`hearthlog recover` saves what is whole"
+REINDEX = "the messages are not affected; `hearthlog recover` makes a log with a new index"
+DISTRUST = "do not train from it; if hearthlog wrote it as it is, report that"
+
+
+class Finding(NamedTuple):
+    """One thing that is wrong.
+
+    Attributes
+    ----------
+    path : Path
+    level : "error" or "warning"
+    rule : str
+        Which rule of docs/doctor.md is broken.
+    what : str
+    advice : str
+        What to do; empty where the finding says it all.
+    offset : int or None
+        Byte of the file at which the record begins.
+    time : int or None
+        Log time in nanoseconds.
+    """
+
+    path: Path
+    level: Level
+    rule: str
+    what: str
+    advice: str = ""
+    offset: int | None = None
+    time: int | None = None
+
+    def __str__(self) -> str:
+        parts = [f"{self.level}: {self.path}"]
+        if self.offset is not None:
+            parts.append(f"byte {self.offset}")
+        if self.time is not None:
+            parts.append(time_text(self.time))
+        parts.append(f"{self.what} [{self.rule}]")
+        return printable(": ".join(parts) + (f"; {self.advice}" if self.advice else ""))
+
+
+@dataclass
+class Findings:
+    """What was found in one file; of every kind the first few and the number of all.
+
+    Attributes
+    ----------
+    path : Path
+    shown : list of Finding
+    counts : Counter of (level, rule)
+    """
+
+    path: Path
+
+    def __post_init__(self) -> None:
+        self.shown: list[Finding] = []
+        self.counts: Counter[tuple[Level, str]] = Counter()
+
+    def error(
+        self,
+        rule: str,
+        what: str,
+        advice: str = "",
+        *,
+        offset: int | None = None,
+        time: int | None = None,
+    ) -> None:
+        """Note what violates the specification of MCAP, or the contract."""
+        self._add(Finding(self.path, "error", rule, what, advice, offset, time))
+
+    def warning(
+        self,
+        rule: str,
+        what: str,
+        advice: str = "",
+        *,
+        offset: int | None = None,
+        time: int | None = None,
+    ) -> None:
+        """Note what is incomplete, or was lost."""
+        self._add(Finding(self.path, "warning", rule, what, advice, offset, time))
+
+    def rows(
+        self,
+        rule: str,
+        wrong: NDArray[np.bool_],
+        times: NDArray[np.int64],
+        what: Callable[[int], str],
+        level: Level = "error",
+        advice: str = DISTRUST,
+    ) -> None:
+        """Note the rows of a column that break a rule; `what` describes one of them."""
+        places = np.flatnonzero(wrong)
+        for row in places[:_SHOWN].tolist():
+            time = int(times[row])
+            self._add(Finding(self.path, level, rule, what(row), advice, None, time))
+        if len(places) > _SHOWN:
+            self.counts[level, rule] += len(places) - _SHOWN
+
+    def more(self) -> dict[tuple[Level, str], int]:
+        """Count, by kind, the findings that are not shown."""
+        shown = Counter((finding.level, finding.rule) for finding in self.shown)
+        return {kind: n - shown[kind] for kind, n in self.counts.items() if n > shown[kind]}
+
+    def _add(self, finding: Finding) -> None:
+        kind = finding.level, finding.rule
+        self.counts[kind] += 1
+        if self.counts[kind] <= _SHOWN:
+            self.shown.append(finding)
+
+
+def time_text(stamp: int) -> str:
+    """Write a time in UTC, to the millisecond; one that no calendar has as its nanoseconds."""
+    try:
+        moment = datetime.fromtimestamp(stamp / 1e9, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{stamp} ns"
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def printable(text: Any) -> str:
+    """Return a text of a file so that it stays on its line, and leaves the terminal alone."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text)[:_LINE])
+
+
+_LINE = 600  # characters

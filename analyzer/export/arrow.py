@@ -1,0 +1,95 @@
+"""Messages as Arrow record batches."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from analyzer.pieces import DURATION, TIME, Field, Piece
+from analyzer.selection import Selection
+from schemas.errors import LogError
+
+_MOMENT = pa.timestamp("ns", "UTC")
+_TYPES = {
+    "bool": pa.bool_(), "byte": pa.uint8(), "char": pa.uint8(), "string": pa.string(),
+    "int8": pa.int8(), "uint8": pa.uint8(), "int16": pa.int16(), "uint16": pa.uint16(),
+    "int32": pa.int32(), "uint32": pa.uint32(), "int64": pa.int64(), "uint64": pa.uint64(),
+    "float32": pa.float32(), "float64": pa.float64(), TIME: _MOMENT, DURATION: pa.duration("ns"),
+}  # fmt: skip
+_HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
+
+
+def schema_of(topic: str, fields: Mapping[str, Field], selection: Selection) -> pa.Schema:
+    """Return the Arrow schema of a topic.
+
+    Its metadata are those of the channel, as far as all logs agree on them, and, as JSON list,
+    the `hearthlog` records of the logs.
+    """
+    channels = [channel for channel, _ in selection.channels[topic]]
+    agreed = set.intersection(*(set(channel.metadata.items()) for channel in channels))
+    about = {"topic": topic, "hearthlog": json.dumps(selection.metadata)}
+    columns = _HEADS | {column_name(path): type_of(field) for path, field in fields.items()}
+    return pa.schema(columns.items(), metadata=dict(agreed) | about)
+
+
+def column_name(path: str) -> str:
+    """Name the column of a field; those of the message's own times come first."""
+    return f"message.{path}" if path in _HEADS else path
+
+
+def type_of(field: Field) -> pa.DataType:
+    """Return the Arrow type of a field."""
+    if field.elements:
+        element = pa.struct([(path, type_of(part)) for path, part in field.elements.items()])
+    else:
+        element = _TYPES[field.type]
+    if field.size is None:
+        return element
+    return pa.list_(element, field.size or -1)
+
+
+def batch_of(piece: Piece, schema: pa.Schema) -> pa.RecordBatch:
+    """Turn messages into a record batch.
+
+    Raises
+    ------
+    LogError
+        If their type is defined otherwise than the schema has it.
+    """
+    columns = piece.columns
+    types = [type_of(piece.fields[path]) for path in columns.fields]
+    if types != schema.types[len(_HEADS) :]:
+        raise LogError(f"{columns.topic}: {columns.type} is defined in two ways; choose one log")
+    arrays = [
+        pa.array(columns.log_times).cast(_MOMENT),
+        pa.array(columns.publish_times).cast(_MOMENT),
+        pa.array(columns.sequences),
+        *(array_of(columns[path], piece.fields[path]) for path in columns.fields),
+    ]
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+
+def array_of(values: NDArray[Any], field: Field) -> pa.Array:
+    """Turn a column of messages into an Arrow array."""
+    kind = type_of(field)
+    if field.elements or (field.size is not None and field.type == "string"):
+        return pa.array(values.tolist(), kind)
+    if field.size is None:
+        return (
+            pa.array(values, pa.int64()).cast(kind)
+            if field.type in {TIME, DURATION}
+            else (pa.array(values, kind))
+        )
+    if values.dtype == object:
+        ends = np.cumsum([len(row) for row in values])
+        flat = np.concatenate(list(values))
+    else:
+        ends = np.arange(1, len(values) + 1) * values.shape[1]
+        flat = values.reshape(-1)
+    if field.size:
+        return pa.FixedSizeListArray.from_arrays(pa.array(flat, kind.value_type), type=kind)
+    offsets = pa.array(np.concatenate([[0], ends]), pa.int32())
+    return pa.ListArray.from_arrays(offsets, pa.array(flat, kind.value_type))

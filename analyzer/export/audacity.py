@@ -1,0 +1,64 @@
+"""Segments as a label track of Audacity."""
+
+from typing import BinaryIO
+
+from analyzer.pieces import Piece
+from analyzer.selection import Selection
+from schemas.columns import iterate_columns
+from schemas.errors import LogError
+from schemas.messages import NANOSECONDS
+from schemas.topics import topic as topic_of
+
+_FIELDS = {"header.stamp", "duration", "label"}
+
+
+class LabelTrack:
+    """A label track being written: start, end, label, with tabs between them.
+
+    Times are seconds from the first frame of the microphone in the span, and where there are no
+    frames, from the first segment. A segment that began before is cut.
+    """
+
+    def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
+        self._stream = stream
+        self._zero = _first_frame(topic, selection)
+
+    def write(self, piece: Piece) -> None:
+        """Append segments.
+
+        Raises
+        ------
+        LogError
+            If the messages are none.
+        """
+        columns = piece.columns
+        missing = _FIELDS - columns.fields.keys()
+        if missing:
+            raise LogError(f"{columns.topic}: {columns.type} has no field {min(missing)}")
+        starts = columns["header.stamp"]
+        if self._zero is None:
+            self._zero = int(starts.min())
+        ends = (starts + columns["duration"] - self._zero) / NANOSECONDS
+        rows = zip(
+            ((starts - self._zero) / NANOSECONDS).tolist(),
+            ends.tolist(),
+            columns["label"].tolist(),
+            strict=True,
+        )
+        lines = [
+            f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(label.split())}\n"
+            for start, end, label in rows
+        ]
+        self._stream.write("".join(lines).encode())
+
+    def finish(self) -> None:
+        """Complete the file, which needs nothing."""
+
+
+def _first_frame(topic: str, selection: Selection) -> int | None:
+    features = topic_of(topic.split("/")[1] if topic.startswith("/") else "", "features")
+    found = iterate_columns(
+        selection.logs, {features}, selection.start, selection.end, {"header.stamp"}
+    )
+    first = next(found, None)
+    return None if first is None else int(first[0]["header.stamp"].min())

@@ -1,0 +1,109 @@
+"""A topic as CSV: a column a number, named by the channel where it names them."""
+
+from itertools import zip_longest
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from analyzer.export.arrow import array_of, column_name, type_of
+from analyzer.export.names import names_of
+from analyzer.lines import json_texts
+from analyzer.pieces import DURATION, Field, Piece
+from analyzer.selection import Selection
+from schemas.errors import LogError
+from schemas.messages import NANOSECONDS
+
+_OPTIONS = csv.WriteOptions(quoting_style="needed")
+
+
+class CsvFile:
+    """A CSV file being written.
+
+    Arrays are spread into columns, such as `mean.energy` where the channel has names for the
+    elements, otherwise `values[0]`; arrays of messages are JSON, and bytes are in base64. Stamps
+    are UTC, durations are in seconds.
+    """
+
+    def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
+        self._stream = stream
+        self._metadata = [channel.metadata for channel, _ in selection.channels[topic]]
+        self._schema: pa.Schema | None = None
+        self._writer: csv.CSVWriter | None = None
+
+    def write(self, piece: Piece) -> None:
+        """Append messages.
+
+        Raises
+        ------
+        LogError
+            If they have values for which there is no column.
+        """
+        columns = self._columns(piece)
+        if self._writer is None:
+            self._schema = pa.schema([(name, array.type) for name, array in columns.items()])
+            self._writer = csv.CSVWriter(self._stream, self._schema, write_options=_OPTIONS)
+        assert self._schema is not None
+        more = columns.keys() - set(self._schema.names)
+        if more:
+            raise LogError(
+                f"{piece.columns.topic}: {min(more)} is not in all messages, which CSV has no "
+                "column for; choose ndjson or parquet"
+            )
+        count = len(piece.columns)
+        arrays = [
+            columns[field.name] if field.name in columns else pa.nulls(count, field.type)
+            for field in self._schema
+        ]
+        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
+
+    def finish(self) -> None:
+        """Complete the file."""
+        if self._writer is not None:
+            self._writer.close()
+
+    def _columns(self, piece: Piece) -> dict[str, pa.Array]:
+        columns = piece.columns
+        moment = pa.timestamp("ns", "UTC")
+        found = {
+            "log_time": pa.array(columns.log_times).cast(moment),
+            "publish_time": pa.array(columns.publish_times).cast(moment),
+            "sequence": pa.array(columns.sequences),
+        }
+        for path, values in columns.fields.items():
+            field = piece.fields[path]
+            name = column_name(path)
+            if field.elements or (field.size is not None and field.type == "uint8"):
+                found[name] = pa.array(json_texts(values, field), pa.string())
+            elif field.size is not None:
+                found |= self._spread(piece, path)
+            elif field.type == DURATION:
+                found[name] = pa.array(values / NANOSECONDS)
+            else:
+                found[name] = array_of(values, field)
+        return found
+
+    def _spread(self, piece: Piece, path: str) -> dict[str, pa.Array]:
+        """Make columns of the elements of an array, those that other logs name among them."""
+        elements = _elements(piece.columns[path], piece.fields[path])
+        own = names_of(piece.columns.metadata, path)
+        if not own:
+            return {f"{path}[{i}]": element for i, element in enumerate(elements)}
+        if len(own) != len(elements):
+            raise LogError(f"{piece.columns.topic}: {len(elements)} {path}, but {len(own)} names")
+        all_names = dict.fromkeys(name for each in self._metadata for name in names_of(each, path))
+        named = dict(zip(own, elements, strict=True))
+        missing = pa.nulls(len(piece.columns), elements[0].type)
+        return {f"{path}.{name}": named.get(name, missing) for name in all_names}
+
+
+def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
+    """Turn an array in every message into one column for each of its elements."""
+    element = field._replace(size=None)
+    if values.ndim == 2:
+        return [array_of(column, element) for column in np.ascontiguousarray(values.T)]
+    rows = [list(row) for row in values]
+    columns = zip_longest(*rows)  # None where a row is shorter
+    return [pa.array(column, type_of(element)) for column in columns]

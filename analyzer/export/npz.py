@@ -1,0 +1,101 @@
+"""A topic as NumPy arrays, in one file that loads without pickle."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analyzer.export.names import file_stem, names_of
+from analyzer.lines import json_texts
+from analyzer.pieces import DURATION, TIME, Field, fields_of
+from analyzer.selection import Selection
+from schemas.columns import Columns, read_columns
+from schemas.errors import LogError
+from schemas.layout import message_type
+
+_TEXTS_LIMIT = 1 << 30  # bytes
+
+
+def save_npz(topic: str, selection: Selection, name: Callable[[str], Path]) -> bool:
+    """Write an array a field, by its path, and `log_time`, `publish_time` and `sequence`.
+
+    Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths lie one
+    after the other, their lengths in `<field>.lengths`; arrays of messages are JSON. The names
+    that the channel has for the elements of an array are in `<field>_names`.
+
+    Parameters
+    ----------
+    topic : str
+    selection : Selection
+    name : callable
+        Gives a path for the stem of a file name; it is called if there is a message.
+
+    Returns
+    -------
+    bool
+        Whether there was a message.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, or if texts are too long for NumPy.
+    """
+    found = read_columns(selection.logs, {topic}, selection.start, selection.end)
+    if topic not in found:
+        return False
+    arrays = _arrays(found.pop(topic), _fields(topic, selection))
+    with ZipFile(name(file_stem(topic)), "x") as archive:
+        for key, array in arrays.items():  # np.savez has no place for a field named `file`
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as part:
+                np.lib.format.write_array(part, array, allow_pickle=False)
+    return True
+
+
+def _fields(topic: str, selection: Selection) -> dict[str, Field]:
+    kinds = {
+        message_type(schema.name, schema.encoding, schema.data)
+        for _, schema in selection.channels[topic]
+        if schema is not None
+    }
+    found = [fields_of(kind) for kind in kinds]
+    if any(fields != found[0] for fields in found):
+        raise LogError(f"{topic}: is defined in two ways; choose one log")
+    return found[0]
+
+
+def _arrays(columns: Columns, fields: dict[str, Field]) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    for path, values in columns.fields.items():
+        arrays |= _column(path, values, fields[path])
+        names = names_of(columns.metadata, path)
+        if names:
+            arrays[f"{path}_names"] = np.array(names)
+    return arrays | {
+        "log_time": columns.log_times.view("M8[ns]"),
+        "publish_time": columns.publish_times.view("M8[ns]"),
+        "sequence": columns.sequences,
+    }
+
+
+def _column(path: str, values: NDArray[Any], field: Field) -> dict[str, NDArray[Any]]:
+    if field.size is None and field.type in {TIME, DURATION}:
+        return {path: values.view("M8[ns]" if field.type == TIME else "m8[ns]")}
+    if values.dtype != object:
+        return {path: values}
+    if field.type == "string" and (field.size is None or values.ndim == 2):
+        return {path: _texts(path, values)}
+    if field.elements or field.type == "string":
+        return {path: _texts(path, np.array(json_texts(values, field), object))}
+    lengths = np.array([len(row) for row in values])
+    return {path: np.concatenate(list(values)), f"{path}.lengths": lengths}
+
+
+def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:
+    """Give all texts the same room, which is how NumPy has them."""
+    longest = max(map(len, values.reshape(-1).tolist()), default=0)
+    if values.size * longest * 4 > _TEXTS_LIMIT:
+        raise LogError(f"{path}: texts are too long for NPZ; choose parquet")
+    return values.astype(f"U{max(longest, 1)}")

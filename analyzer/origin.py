@@ -1,0 +1,166 @@
+"""What a log says of the recorder that wrote it."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap import records
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from analyzer.known import decode_known, is_of_type
+from schemas import messages
+from schemas.chunks import read_chunks
+from schemas.errors import LogError
+from schemas.files import check_node_name
+from schemas.logfile import LogFile
+from schemas.topics import check_microphone_name, topic
+from schemas.writer import METADATA, Attachment
+
+CONFIGURATION = "configuration.json"
+TYPES = {"features": messages.FEATURES, "audio": messages.RAW_AUDIO}
+_DIGEST = re.compile("[0-9a-f]{64}")
+_FRAME = ("frame", "header.stamp")
+_INFO = ("device", "feature_set", "model", "model_sha256")
+
+
+class Configuration(BaseModel):
+    """Of what the recorder was asked to do, that which shapes its log."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+    max_bag_duration: int = Field(default=3600, ge=1, le=86_400)
+    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)
+    sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)
+    statistics_every: int = Field(default=1, ge=1, le=1 << 32)
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What a log says of the recorder that wrote it.
+
+    Attributes
+    ----------
+    path : Path
+    complete : bool
+        Whether the log is finished.
+    node, microphone : str
+    device, feature_set, model, model_sha256 : str
+        As in `AudioStreamInfo`; empty where the log does not say.
+    configuration : Configuration
+    metadata : mapping of str to str
+        The `hearthlog` record.
+    attachments : sequence of Attachment
+    first_frame : (int, int) or None
+        Number and time of the first frame of its features; None if they are not wanted, or it has
+        none.
+    """
+
+    path: Path
+    complete: bool
+    node: str
+    microphone: str
+    device: str
+    feature_set: str
+    model: str
+    model_sha256: str
+    configuration: Configuration
+    metadata: Mapping[str, str]
+    attachments: Sequence[Attachment]
+    first_frame: tuple[int, int] | None
+
+
+def read_origin(path: Path, kind: str) -> Origin | None:
+    """Read what a log says of its recorder.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        One of `TYPES`, the sort of topic by which the microphone is known.
+
+    Returns
+    -------
+    Origin or None
+        None if the log has no such topic, as layers have not.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, of more than one microphone, or says what cannot be.
+    """
+    with LogFile(path) as file:
+        if not file.channels:
+            read_chunks(file, file.chunks[:1])  # a log without an index says it there
+        microphones = _microphones(file, kind)
+        if not microphones:
+            return None
+        if len(microphones) > 1:
+            names = ", ".join(sorted(microphones))
+            raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
+        found = [file.record(place) for place in file.places]
+        complete = file.complete
+        (microphone,) = microphones
+        info = _first(file, topic(microphone, "info"), messages.STREAM_INFO, _INFO)
+        heard = _first(file, topic(microphone, "features"), messages.FEATURES, _FRAME)
+    about = {r.name: r.metadata for r in found if isinstance(r, records.Metadata)}.get(METADATA, {})
+    attachments = [
+        Attachment(r.name, r.media_type, r.data) for r in found if isinstance(r, records.Attachment)
+    ]
+    info = {**about, **info}
+    digest = info.get("model_sha256", "")
+    first = None
+    if heard and kind == "features":
+        first = int(heard["frame"]), int(heard["header.stamp"])
+    try:
+        node = check_node_name(about.get("node", "home"))
+        check_microphone_name(microphone)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    return Origin(
+        path=path,
+        complete=complete,
+        node=node,
+        microphone=microphone,
+        device=info.get("device", ""),
+        feature_set=info.get("feature_set", ""),
+        model=info.get("model", ""),
+        model_sha256=digest if _DIGEST.fullmatch(digest) else "",
+        configuration=_configuration(path, attachments),
+        metadata=about,
+        attachments=attachments,
+        first_frame=first,
+    )
+
+
+def _microphones(file: LogFile, kind: str) -> set[str]:
+    found = set()
+    for channel in file.channels.values():
+        schema = file.schemas.get(channel.schema_id)
+        name = channel.topic.removeprefix("/").removesuffix("/" + kind)
+        if channel.topic == topic(name, kind) and is_of_type(channel, schema, TYPES[kind]):
+            found.add(name)
+    return found
+
+
+def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict[str, Any]:
+    """Return the fields of the first message of a topic; nothing if it has none."""
+    ids = {i for i, channel in file.channels.items() if channel.topic == name}
+    for i, number in enumerate(file.chunks["channels"].tolist()):
+        if file.channel_sets[number] and not file.channel_sets[number] & ids:
+            continue
+        found = read_chunks(file, file.chunks[i : i + 1], [name])
+        for columns in decode_known(file.path, found, {kind: fields}):
+            return {field: values[0] for field, values in columns.fields.items()}
+    return {}
+
+
+def _configuration(path: Path, attachments: Sequence[Attachment]) -> Configuration:
+    text = next((item.data for item in attachments if item.name == CONFIGURATION), b"{}")
+    try:
+        return Configuration.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(["", *(str(part)[:64] for part in first["loc"])])
+        raise LogError(f"{path}: {CONFIGURATION}{where}: {first['msg']}") from error

@@ -1,0 +1,168 @@
+"""What a recorder heard and how it was, read back from its log as what its pipeline was given."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analyzer.known import is_of_type
+from analyzer.origin import Origin
+from recorder.features import FEATURE_NAMES
+from recorder.stream import Gap, Health
+from schemas import messages
+from schemas.chunks import RawMessages
+from schemas.columns import Columns, decode
+from schemas.errors import LogError
+from schemas.rows import Fields
+from schemas.series import iterate_messages
+from schemas.topics import DIAGNOSTICS, topic
+
+_TYPES = {
+    "features": messages.FEATURES,
+    "gap": messages.GAP,
+    "label": messages.LABEL,
+    "segment": messages.SEGMENT,
+}
+_LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be made of
+_LARGEST_FRAME = 1 << 62
+_PLACE_BITS = 40
+
+_Found = dict[str, list[RawMessages]]
+
+
+class Features(NamedTuple):
+    """Features of successive frames, as `Pipeline.push_features` takes them."""
+
+    first: int
+    values: NDArray[np.float32]
+    stamps: NDArray[np.int64]
+
+
+class Piece(NamedTuple):
+    """A span of time of a log.
+
+    Attributes
+    ----------
+    events : list of Features, Gap or Health
+        In the order in which they were written.
+    labels, segments : list of RawMessages
+        What the recorder made of them.
+    """
+
+    events: list[Features | Gap | Health]
+    labels: list[RawMessages]
+    segments: list[RawMessages]
+
+
+def read_recorded(origin: Origin, start: int, end: int) -> Iterator[Piece]:
+    """Read a log piece by piece.
+
+    Parameters
+    ----------
+    origin : Origin
+        Of the log.
+    start, end : int
+        Log times, in nanoseconds: from `start` on, before `end`.
+
+    Raises
+    ------
+    LogError
+        If the log is damaged, or its messages are not those of a recorder.
+    """
+    topics = {topic(origin.microphone, kind): type_ for kind, type_ in _TYPES.items()}
+    topics[DIAGNOSTICS] = messages.DIAGNOSTICS
+    for batch in iterate_messages([origin.path], topics, start, end):
+        found: _Found = {type_: [] for type_ in topics.values()}
+        for raw in batch:
+            type_ = topics[raw.channel.topic]
+            if is_of_type(raw.channel, raw.schema, type_):
+                found[type_].append(raw)
+        buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
+        try:
+            events = _events(found, origin.microphone, buffers)
+        except LogError as error:
+            raise LogError(f"{origin.path}: {error}") from error
+        yield Piece(events, found[messages.LABEL], found[messages.SEGMENT])
+
+
+def _events(
+    found: _Found, microphone: str, buffers: Sequence[int]
+) -> list[Features | Gap | Health]:
+    """Put features, gaps and states into the order in which they were written."""
+    heard = [_features(raw) for raw in found[messages.FEATURES]]
+    others: list[Gap | Health | None] = [gap for raw in found[messages.GAP] for gap in _gaps(raw)]
+    others += [state for raw in found[messages.DIAGNOSTICS] for state in _health(raw, microphone)]
+    raws = found[messages.FEATURES] + found[messages.GAP] + found[messages.DIAGNOSTICS]
+    if not raws:
+        return []
+    times = np.concatenate([raw.log_times for raw in raws])
+    places = [raw.offsets + (buffers.index(id(raw.buffer)) << _PLACE_BITS) for raw in raws]
+    order = np.lexsort((np.concatenate(places), times))
+    frames = {
+        path: np.concatenate([fields[path] for fields in heard])
+        for path in (heard[0] if heard else ())
+    }
+    count = len(times) - len(others)
+    events: list[Features | Gap | Health] = []
+    begin = 0
+    for position in [*np.flatnonzero(order >= count).tolist(), len(order)]:
+        if position > begin:
+            events += _runs(frames, order[begin:position])
+        if position < len(order) and (event := others[order[position] - count]) is not None:
+            events.append(event)
+        begin = position + 1
+    return events
+
+
+def _runs(frames: Fields, rows: NDArray[np.intp]) -> Iterator[Features]:
+    """Cut features where a frame does not follow the one before."""
+    numbers = frames["frame"][rows]
+    for run in np.split(rows, np.flatnonzero(np.diff(numbers) != 1) + 1):
+        first = int(frames["frame"][run[0]])
+        yield Features(first, frames["values"][run], frames["header.stamp"][run])
+
+
+def _features(raw: RawMessages) -> Fields:
+    (columns,) = decode([raw], ("header.stamp", "frame", "values"))
+    values, numbers = columns["values"], columns["frame"]
+    if values.shape[1:] != (len(FEATURE_NAMES),):
+        raise LogError(f"{columns.topic}: frames are not of {len(FEATURE_NAMES)} values")
+    if not np.abs(values).max() < _LARGEST_VALUE:  # a NaN compares as false
+        raise LogError(f"{columns.topic}: holds values that no sound has")
+    if numbers.max() > _LARGEST_FRAME:
+        raise LogError(f"{columns.topic}: holds a frame of number {numbers.max()}")
+    _check_times(columns, columns["header.stamp"])
+    return columns.fields | {"frame": numbers.astype(np.int64)}
+
+
+def _gaps(raw: RawMessages) -> list[Gap]:
+    (columns,) = decode([raw], ("header.stamp", "duration", "reason", "frames_lost"))
+    starts = columns["header.stamp"]
+    ends = starts + columns["duration"]
+    _check_times(columns, ends)
+    lists = (starts, ends, columns["reason"], columns["frames_lost"])
+    return [Gap(*row) for row in zip(*(values.tolist() for values in lists), strict=True)]
+
+
+def _health(raw: RawMessages, microphone: str) -> list[Health | None]:
+    """Read the states of the source; None for messages about something else."""
+    (columns,) = decode([raw], ("status",))
+    name = f"hearthlog: {microphone}"
+    return [
+        next((_state(time, status) for status in array if status["name"] == name), None)
+        for time, array in zip(columns.log_times.tolist(), columns["status"], strict=True)
+    ]
+
+
+def _state(time: int, status: dict[str, Any]) -> Health:
+    values = {pair["key"]: pair["value"] for pair in status["values"]}
+    return Health(time, status["level"], status["message"], values)
+
+
+def _check_times(columns: Columns, times: NDArray[np.int64]) -> None:
+    if not np.array_equal(columns.log_times, times):
+        raise LogError(
+            f"{columns.topic}: log times are not those of the sound; this was not written by "
+            "`hearthlog record`"
+        )

@@ -1,0 +1,485 @@
+"""What is exported is opened by the tools it is for, and holds what the log holds, bit for bit."""
+
+import csv
+import io
+import json
+import struct
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import soundfile
+from rosbags import rosbag1, rosbag2
+from rosbags.highlevel import AnyReader
+from spliced import raw_messages, record_logs, run, small_disk, write_log
+
+from recorder.sources.files import read_audio
+from schemas import messages
+from schemas.chunkwriter import ChunkWriter
+from schemas.columns import read_columns
+from schemas.files import find_logs
+from schemas.messages import NANOSECONDS, header, message, nanoseconds, time_message
+from schemas.reader import LogReader
+
+KINDS = ("features", "statistics", "label", "segment", "gap", "info")
+RATE = 16_000
+
+
+@pytest.fixture(scope="module", params=["simulated home", "real household"])
+def recorded(request, tmp_path_factory, model_file):
+    if request.param == "simulated home":
+        paths = [request.getfixturevalue("day")]
+    else:
+        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::30]
+    return record_logs(paths, tmp_path_factory.mktemp("logs"), model_file)
+
+
+@pytest.fixture(scope="module", params=["simulated home", "real household"])
+def sound(request):
+    """Some seconds of sound, 16 bits a sample."""
+    if request.param == "simulated home":
+        path = request.getfixturevalue("day")
+    else:
+        path = min(request.getfixturevalue("household").glob("*/*.flac"))
+    samples = np.concatenate(list(read_audio(path)))[: 4 * RATE]
+    return (samples * 32767).clip(-32768, 32767).astype("<i2")
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command and return what came of it."""
+    return partial(run, capfd)
+
+
+@pytest.fixture
+def exported(hearthlog, tmp_path):
+    """Export what must be exported without a word, and return the output."""
+
+    def export(logs, name, *options):
+        output = tmp_path / name
+        result = hearthlog("export", logs, "--output", output, *options)
+        assert (result.returncode, result.stdout, result.stderr) == (0, f"{output}\n", "")
+        assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+        return output
+
+    return export
+
+
+@pytest.fixture
+def refused(hearthlog, tmp_path):
+    """Export what must fail with one line, and return that line."""
+
+    def export(logs, name, *options, status=1):
+        before = sorted(tmp_path.rglob("*"))
+        result = hearthlog("export", logs, "--output", tmp_path / name, *options)
+        assert (result.returncode, result.stdout) == (status, "")
+        assert result.stderr.count("\n") == 1
+        assert sorted(tmp_path.rglob("*")) == before
+        return result.stderr.removeprefix("hearthlog: ").rstrip()
+
+    return export
+
+
+def items_of(logs, topic):
+    return [item for log in find_logs(logs) for item in LogReader(log).messages([topic])]
+
+
+def bits(value):
+    """A value of a message, such that equal ones are the same bit for bit."""
+    if hasattr(value, "nanosec"):
+        return nanoseconds(value)
+    if hasattr(value, "__msgtype__"):
+        names = [name for name in value.__dataclass_fields__ if not name.isupper()]
+        return {name: bits(getattr(value, name)) for name in names if name != "__msgtype__"}
+    if isinstance(value, float):
+        return struct.pack("<d", value)
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        return value.tobytes()
+    if isinstance(value, list | np.ndarray):
+        return [bits(part) for part in value]
+    return value
+
+
+def clip(stamp, data, **fields):
+    about = {"format": "pcm-s16", "sample_rate": RATE, "number_of_channels": 1} | fields
+    content = np.frombuffer(data.tobytes(), np.uint8)
+    return message(messages.RAW_AUDIO, timestamp=time_message(stamp), data=content, **about)
+
+
+def clips(samples, start, size=800):
+    """Sound as messages of 50 ms, with their log times."""
+    stamps = [start + i * NANOSECONDS // RATE for i in range(0, len(samples), size)]
+    parts = [samples[i : i + size] for i in range(0, len(samples), size)]
+    return [(stamp, clip(stamp, part)) for stamp, part in zip(stamps, parts, strict=True)]
+
+
+def test_parquet_has_every_bit_and_says_where_it_is_from(recorded, exported):
+    folder = exported(recorded, "tables", "--format", "parquet")
+    assert {path.name for path in folder.iterdir()} == {f"mic_{kind}.parquet" for kind in KINDS} | {
+        "diagnostics.parquet",
+        "rosout.parquet",
+    }
+    columns = read_columns(find_logs(recorded))
+    for topic, expected in columns.items():
+        table = pq.read_table(folder / f"{topic[1:].replace('/', '_')}.parquet")
+        assert table.num_rows == len(expected)
+        assert table["log_time"].type == pa.timestamp("ns", "UTC")
+        assert table["log_time"].cast(pa.int64()).to_numpy().tolist() == expected.log_times.tolist()
+        assert table["sequence"].to_numpy().tolist() == expected.sequences.tolist()
+        assert table.column_names[3:] == list(expected.fields)
+        about = {key.decode(): text.decode() for key, text in table.schema.metadata.items()}
+        assert about.items() >= expected.metadata.items()
+        (made,) = json.loads(about["hearthlog"])
+        assert made == LogReader(find_logs(recorded)[0]).metadata["hearthlog"]
+    for kind, names in (("features", ["values"]), ("statistics", ["mean", "std"])):
+        table = pq.read_table(folder / f"mic_{kind}.parquet")
+        for name in names:
+            values = table[name].combine_chunks().flatten().to_numpy()
+            assert values.dtype == np.float32
+            assert values.tobytes() == columns[f"/mic/{kind}"][name].tobytes()
+    labels = pq.read_table(folder / "mic_label.parquet").to_pandas()
+    assert labels["label"].tolist() == columns["/mic/label"]["label"].tolist()
+    assert labels["novelty"].isna().all()
+    gaps = pq.read_table(folder / "mic_gap.parquet").to_pandas()
+    assert gaps["header.stamp"].dt.tz is not None
+    assert gaps["duration"].tolist() == [pd.Timedelta("350ms"), pd.Timedelta("2s")]
+    health = pq.read_table(folder / "diagnostics.parquet")["status"].to_pylist()
+    assert health == columns["/diagnostics"]["status"].tolist()
+
+
+def test_parquet_of_one_topic_and_a_span_is_one_file(recorded, exported):
+    times = [item.log_time for item in items_of(recorded, "/mic/label")]
+    start, end = (str(np.datetime64(times[i], "ns")) for i in (7, 99))
+    options = ("--topics", "/mic/label", "--start", start, "--end", end)
+    table = pq.read_table(exported(recorded, "label.parquet", *options))
+    assert table["log_time"].cast(pa.int64()).to_pylist() == times[7:99]
+
+
+def test_csv_is_what_cat_prints_and_pandas_reads_it(recorded, exported, hearthlog):
+    folder = exported(recorded, "tables", "--format", "csv")
+    for kind in KINDS:
+        text = (folder / f"mic_{kind}.csv").read_text()
+        assert (
+            text == hearthlog("cat", recorded, "--format", "csv", "--topics", f"/mic/{kind}").stdout
+        )
+    frame = pd.read_csv(folder / "mic_features.csv", parse_dates=["log_time"], dtype={})
+    expected = read_columns(find_logs(recorded), {"/mic/features"})["/mic/features"]
+    names = json.loads(expected.metadata["values_names"])
+    values = frame[[f"values.{name}" for name in names]].to_numpy(np.float32)
+    assert values.tobytes() == expected["values"].tobytes()
+    stamps = frame["log_time"].dt.tz_localize(None).to_numpy("M8[ns]")
+    assert stamps.astype(np.int64).tolist() == expected.log_times.tolist()
+
+
+def test_npz_is_loaded_without_pickle(recorded, exported):
+    folder = exported(recorded, "arrays", "--format", "npz")
+    for topic, expected in read_columns(find_logs(recorded)).items():
+        with np.load(folder / f"{topic[1:].replace('/', '_')}.npz", allow_pickle=False) as arrays:
+            found = dict(arrays)
+        assert found["log_time"].astype(np.int64).tolist() == expected.log_times.tolist()
+        assert found["log_time"].dtype == np.dtype("M8[ns]")
+        for path, values in expected.fields.items():
+            if path == "status":
+                assert [json.loads(text) for text in found[path]] == values.tolist()
+            elif values.dtype == object:
+                assert found[path].tolist() == values.tolist()
+            else:
+                assert found[path].tobytes() == values.tobytes()
+            names = f"{path}_names"
+            assert (names in found) == (names in expected.metadata)
+            if names in found:
+                assert found[names].tolist() == json.loads(expected.metadata[names])
+
+
+def test_npz_of_arrays_of_different_lengths(exported, tmp_path):
+    rows = [np.arange(n, dtype=np.uint8) for n in (3, 0, 5)]
+    made = [
+        message("sensor_msgs/msg/CompressedImage", header=header(i, "x" * i), format="", data=row)
+        for i, row in enumerate(rows)
+    ]
+    log = write_log(tmp_path / "x.mcap", {"/image": list(enumerate(made))})
+    with np.load(exported(log, "x.npz"), allow_pickle=False) as arrays:
+        assert np.split(arrays["data"], np.cumsum(arrays["data.lengths"]))[2].tolist() == [
+            *range(5)
+        ]
+        assert arrays["header.frame_id"].tolist() == ["", "x", "xx"]
+
+
+def test_audacity_labels_are_in_seconds_of_the_sound(recorded, exported):
+    path = exported(recorded, "labels.txt")
+    lines = [line.split("\t") for line in path.read_text().splitlines()]
+    items = [item.decode() for item in items_of(recorded, "/mic/segment")]
+    first = nanoseconds(items_of(recorded, "/mic/features")[0].decode().header.stamp)
+    assert len(lines) == len(items) > 3
+    for (start, end, label), item in zip(lines, items, strict=True):
+        begin = nanoseconds(item.header.stamp) - first
+        assert float(start) == pytest.approx(begin / NANOSECONDS, abs=1e-6)
+        length = nanoseconds(item.duration) / NANOSECONDS
+        assert float(end) - float(start) == pytest.approx(length, abs=2e-6)
+        assert label == item.label
+
+
+def test_audacity_labels_of_a_part_start_with_it_and_have_one_line_each(exported, tmp_path):
+    def segment(start, label):
+        return message(
+            messages.SEGMENT,
+            header=header(start * NANOSECONDS, "mic"),
+            duration=messages_duration(2),
+            label=label,
+            confidence=1.0,
+        )
+
+    def messages_duration(seconds):
+        return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=0)
+
+    frames = [
+        message(messages.FEATURES, header=header(i * NANOSECONDS, "mic"), frame=i,
+                values=np.zeros(1, np.float32))
+        for i in range(10)
+    ]  # fmt: skip
+    topics = {
+        "/mic/segment": [
+            (4 * NANOSECONDS, segment(2, "a\tb\nc")),
+            (8 * NANOSECONDS, segment(6, "d")),
+        ],
+        "/mic/features": [(i * NANOSECONDS, frame) for i, frame in enumerate(frames)],
+    }
+    log = write_log(tmp_path / "x.mcap", topics)
+    text = exported(log, "x.txt", "--start", "1970-01-01T00:00:03").read_text()
+    assert text == "0.000000\t1.000000\ta b c\n3.000000\t5.000000\td\n"
+    alone = exported(log, "folder", "--format", "txt") / "mic_segment.txt"
+    assert alone.read_text() == "2.000000\t4.000000\ta b c\n6.000000\t8.000000\td\n"
+
+
+def test_clips_are_the_sound_that_was_heard(sound, exported, tmp_path):
+    start = 1_772_348_400_250_000_000
+    later = start + 7 * NANOSECONDS
+    log = write_log(
+        tmp_path / "x.mcap", {"/mic/audio": clips(sound, start) + clips(sound[:1000], later)}
+    )
+    folder = exported(log, "clips", "--format", "wav")
+    names = ["mic_audio_20260301T070000.250000Z.wav", "mic_audio_20260301T070007.250000Z.wav"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    for name, expected in zip(names, (sound, sound[:1000]), strict=True):
+        samples, rate = soundfile.read(folder / name, dtype="int16")
+        assert rate == RATE
+        assert samples.tobytes() == expected.tobytes()
+    one = exported(log, "one.wav", "--end", "2026-03-01T07:00:05")
+    assert soundfile.read(one, dtype="int16")[0].tobytes() == sound.tobytes()
+
+
+def test_a_hole_or_another_format_begins_another_clip(sound, exported, tmp_path):
+    def times(*starts, **fields):
+        return [(start, clip(start, sound[:800], **fields)) for start in starts]
+
+    ms = 1_000_000
+    topics = {
+        "/mic/audio": times(0, 50 * ms, 151 * ms) + times(201 * ms, sample_rate=8000),
+        "/mic_audio": times(53 * ms, 104 * ms, number_of_channels=2),
+    }
+    log = write_log(tmp_path / "x.mcap", topics)
+    found = {
+        path.name: (soundfile.info(path).frames, soundfile.info(path).channels)
+        for path in exported(log, "clips", "--format", "wav").iterdir()
+    }
+    assert found == {
+        "mic_audio_19700101T000000.000000Z.wav": (1600, 1),
+        "mic_audio_19700101T000000.053000Z.wav": (400, 2),
+        "mic_audio_19700101T000000.104000Z.wav": (400, 2),
+        "mic_audio_19700101T000000.151000Z.wav": (800, 1),
+        "mic_audio_19700101T000000.201000Z.wav": (800, 1),
+    }
+
+
+def test_more_than_one_clip_is_no_wav_file(sound, refused, tmp_path):
+    log = write_log(
+        tmp_path / "x.mcap", {"/mic/audio": clips(sound[:800], 0) + clips(sound, 10**10)}
+    )
+    message = refused(log, "one.wav")
+    assert message.endswith("there is more than one clip; name a folder, with --format wav")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"format": "opus"}, "its format is 'opus', not 'pcm-s16'"),
+        ({"sample_rate": 0}, "0 samples a second"),
+        ({"sample_rate": 2**32 - 1}, "4294967295 samples a second"),
+        ({"number_of_channels": 0}, "0 channels"),
+        ({"number_of_channels": 2**32 - 1}, "4294967295 channels"),
+        ({"number_of_channels": 7}, "1600 bytes are no whole samples of 7 channels"),
+    ],
+)
+def test_clips_that_cannot_be(refused, tmp_path, fields, words):
+    samples = np.zeros(800, "<i2")
+    log = write_log(
+        tmp_path / "x.mcap", {"/a": [(0, clip(0, samples)), (1, clip(1, samples, **fields))]}
+    )
+    message = refused(log, "clips", "--format", "wav")
+    assert message == f"/a: no sound that can be saved as WAV ({words})"
+
+
+def test_a_rosbag2_folder_is_opened_by_rosbags(recorded, exported):
+    folder = exported(recorded, "bag", "--format", "rosbag2")
+    assert sorted(path.name for path in folder.iterdir()) == ["bag.mcap", "metadata.yaml"]
+    expected = sorted(row for log in find_logs(recorded) for row in raw_messages(log))
+    assert sorted(raw_messages(folder / "bag.mcap")) == expected
+    with rosbag2.Reader(folder) as bag:
+        assert bag.message_count == len(expected) == len(list(bag.messages()))
+        assert all(c.digest.startswith("RIHS01_") for c in bag.connections)
+        times = [row[4] for row in expected]
+        assert (bag.start_time, bag.end_time - 1) == (min(times), max(times))
+    items = iter(sorted((i.log_time, i.data) for i in items_of(recorded, "/mic/label")))
+    with AnyReader([folder]) as reader:
+        labels = [c for c in reader.connections if c.topic == "/mic/label"]
+        for connection, time, data in reader.messages(labels):
+            assert (time, data) == next(items)
+            assert reader.deserialize(data, connection.msgtype).label
+    assert next(items, None) is None
+
+
+def test_a_ros_1_bag_holds_the_same_values(recorded, exported):
+    path = exported(recorded, "all.bag")
+    expected = {}
+    for log in find_logs(recorded):
+        for item in LogReader(log).messages():
+            expected.setdefault(item.topic, []).append((item.log_time, bits(item.decode())))
+    found = {}
+    with AnyReader([path]) as reader:
+        times = []
+        for connection, time, data in reader.messages():
+            content = bits(reader.deserialize(data, connection.msgtype))
+            if "header" in content:
+                assert content["header"].pop("seq") == 0
+            found.setdefault(connection.topic, []).append((time, content))
+            times.append(time)
+        assert times == sorted(times)
+    assert found == expected
+    with rosbag1.Reader(path) as bag:
+        latched = {c.topic for c in bag.connections if c.ext.latching}
+        assert bag.message_count == len(times)
+    assert latched == {"/mic/info"}
+
+
+def test_a_ros_1_bag_of_types_that_only_the_file_knows(exported, tmp_path):
+    data = struct.pack("<4sIii", b"\0\1\0\0", 7, -5, 3)
+    big = struct.pack(">4sIii", b"\0\0\0\0", 7, -5, 3)
+    with (tmp_path / "x.mcap").open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("my_msgs/msg/Own", "ros2msg", b"uint32 a\nint32[2] b\n")
+        channel = writer.register_channel("/own", "cdr", schema, {})
+        writer.add_message(channel, 1, data, 1)
+        writer.add_message(channel, 2, big, 2)
+        writer.finish()
+    with AnyReader([exported(tmp_path / "x.mcap", "x.bag")]) as reader:
+        for connection, _, raw in reader.messages():
+            content = reader.deserialize(raw, connection.msgtype)
+            assert (content.a, content.b.tolist()) == (7, [-5, 3])
+        assert reader.message_count == 2
+
+
+def test_a_type_whose_name_is_code_is_refused(refused, tmp_path):
+    with (tmp_path / "x.mcap").open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        name = "a/msg/B:\n    open('owned', 'w')\nclass C"
+        schema = writer.register_schema(name, "ros2msg", b"uint32 a\n")
+        writer.add_message(writer.register_channel("/own", "cdr", schema, {}), 1, bytes(8), 1)
+        writer.finish()
+    assert refused(tmp_path / "x.mcap", "x.bag").endswith(" cannot be read")
+
+
+def test_one_file_is_for_one_topic(recorded, refused):
+    for suffix in ("parquet", "csv", "npz"):
+        message = refused(recorded, f"x.{suffix}", "--topics", "/mic/*t*", status=2)
+        assert message.endswith(
+            f"x.{suffix} is for one topic: choose one with --topics "
+            "(/mic/features, /mic/segment, /mic/statistics)"
+        )
+
+
+def test_wrong_use_is_one_line(recorded, refused):
+    assert "choose one of parquet, csv" in refused(recorded, "x.xml", status=2)
+    assert "is not --format csv" in refused(recorded, "x.npz", "--format", "csv", status=2)
+    assert "a bag is one file" in refused(recorded, "folder", "--format", "bag", status=2)
+
+
+def test_an_output_that_exists_is_left_alone(recorded, refused, tmp_path):
+    (tmp_path / "mine.npz").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    message = refused(recorded, "mine.npz", "--topics", "/mic/info")
+    assert message.startswith(f"{tmp_path / 'mine.npz'}: exists already")
+    message = refused(recorded, "folder", "--format", "rosbag2")
+    assert message.startswith(f"{tmp_path / 'folder'}: exists already")
+    assert (tmp_path / "mine.npz").read_text() == "mine"
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz", "txt", "rosbag2"])
+def test_nothing_is_made_of_nothing(recorded, refused, form):
+    message = refused(recorded, "folder", "--format", form, "--start", "2031-01-01")
+    assert message.startswith("no message")
+    assert refused(recorded, "x.bag", "--end", "1999-01-01").startswith("no message in this span")
+
+
+def test_a_topic_that_is_not_there(recorded, refused):
+    message = refused(recorded, "x.csv", "--topics", "/mic/lable")
+    assert message.startswith("no topic /mic/lable; there are /diagnostics, ")
+    message = refused(recorded, "x.wav")
+    assert message.startswith("no topic of type foxglove_msgs/msg/RawAudio; there are /")
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz", "txt", "rosbag2", "bag"])
+def test_a_damaged_log_leaves_no_output(recorded, hearthlog, tmp_path, form):
+    data = bytearray(find_logs(recorded)[0].read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    options = ("--output", tmp_path / ("x.bag" if form == "bag" else "x"), "--format", form)
+    result = hearthlog("export", damaged, *options)
+    assert result.returncode == 1
+    assert result.stderr.startswith(f"hearthlog: {damaged}: damaged at byte ")
+    assert result.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [damaged]
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz", "txt", "rosbag2", "bag", "wav"])
+def test_a_full_disk_leaves_no_output(recorded, sound, hearthlog, tmp_path, form):
+    logs = recorded
+    if form == "wav":
+        logs = write_log(tmp_path / "x.mcap", {"/mic/audio": clips(sound, 0)})
+    with small_disk(tmp_path / "disk", "100k") as disk:
+        (disk / "full").write_bytes(bytes(100 << 10 if form == "txt" else 0))  # labels are short
+        output = disk / ("x.bag" if form == "bag" else "x")
+        result = hearthlog("export", logs, "--output", output, "--format", form)
+        assert (result.returncode, result.stdout) == (1, "")
+        assert (
+            result.stderr == f"hearthlog: {output}: cannot be written (No space left on device)\n"
+        )
+        assert list(disk.iterdir()) == [disk / "full"]
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv", "npz", "txt", "rosbag2", "bag"])
+def test_an_unfinished_log_is_exported_as_far_as_it_is_there(recorded, hearthlog, tmp_path, form):
+    unfinished = recorded.parent / "unfinished.mcap.active"
+    output = tmp_path / ("x.bag" if form == "bag" else "x")
+    result = hearthlog("export", unfinished, "--output", output, "--format", form)
+    assert (result.returncode, result.stdout) == (3, f"{output}\n")
+    assert result.stderr.count("\n") == 1
+    assert str(unfinished) in result.stderr
+    if form == "parquet":
+        rows = pq.read_table(output / "mic_features.parquet").num_rows
+        assert rows == len(items_of(unfinished, "/mic/features")) > 0
+
+
+def test_names_of_files_are_harmless_and_differ(exported, tmp_path):
+    text = message("std_msgs/msg/Bool", data=True)
+    topics = {name: [(1, text)] for name in ("/../../x", "/x", "x", "/" + "y" * 500, "/ü", "")}
+    folder = exported(write_log(tmp_path / "x.mcap", topics), "tables", "--format", "csv")
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["topic-2.csv", "topic.csv", "x-2.csv", "x-3.csv", "x.csv", "y" * 100 + ".csv"]
+    for path in folder.iterdir():
+        assert next(csv.DictReader(io.StringIO(path.read_text())))["data"] == "true"

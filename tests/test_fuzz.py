@@ -1,0 +1,260 @@
+"""Whatever a file holds, whoever reads it gets data or one clear error, soon and in little memory."""
+
+import struct
+import zlib
+from threading import Event as Flag
+
+import lz4.frame
+import pytest
+import soundfile
+import zstandard
+from fuzzing import Victim
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from lossy import LossySource
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from rewriting import HEAD, Raw, as_raw, joined, parsed, split
+
+from recorder.config import Settings
+from recorder.service import record
+from recorder.sources.replayed import FileSource
+from schemas.messages import NANOSECONDS
+
+START = 1_772_348_400 * NANOSECONDS
+NUMBERS = st.one_of(
+    st.sampled_from([0, 1, 21, 22, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1, 1 << 63, (1 << 64) - 1]),
+    st.integers(0, (1 << 64) - 1),
+    st.integers(0, 1 << 20),
+)
+PLACES = st.integers(0, 1 << 24)  # taken modulo what there is
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory, day, model_file) -> bytes:
+    """A real log of 30 seconds with a gap, in four chunks."""
+    folder = tmp_path_factory.mktemp("log")
+    samples, rate = soundfile.read(day, frames=30 * 16_000, dtype="int16")
+    soundfile.write(folder / "sound.wav", samples, rate)
+    source = LossySource(FileSource([folder / "sound.wav"], START), {1: 7})
+    (path,) = record(Settings(output=folder, model=model_file), source, Flag()).logs
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def victim(tmp_path_factory):
+    victim = Victim(tmp_path_factory.mktemp("victim"))
+    yield victim
+    victim.close()
+
+
+# Mutations of bytes: of a whole file, or of the content of a chunk.
+
+
+def flip(data, place, bit):
+    data[place % len(data)] ^= 1 << bit
+
+
+def cut(data, place):
+    del data[place % len(data) :]
+
+
+def leave_out(data, place, length):
+    start = place % len(data)
+    del data[start : start + length]
+
+
+def copy_block(data, place, length, to):
+    start, to = place % len(data), to % len(data)
+    data[to:to] = data[start : start + length]
+
+
+def overwrite(data, place, length, to):
+    start, to = place % len(data), to % len(data)
+    block = data[start : start + length]
+    data[to : to + len(block)] = block
+
+
+def put_number(data, place, number, size):
+    start = place % len(data)
+    data[start : start + size] = (number % (1 << 8 * size)).to_bytes(size, "little")
+
+
+LENGTHS = st.integers(0, 5000)
+BYTES = st.one_of(
+    st.tuples(st.just(flip), PLACES, st.integers(0, 7)),
+    st.tuples(st.just(cut), PLACES),
+    st.tuples(st.just(leave_out), PLACES, LENGTHS),
+    st.tuples(st.just(copy_block), PLACES, LENGTHS, PLACES),
+    st.tuples(st.just(overwrite), PLACES, LENGTHS, PLACES),
+    st.tuples(st.just(put_number), PLACES, NUMBERS, st.sampled_from([1, 2, 4, 8])),
+)
+
+
+def of_bytes(data, mutations):
+    for mutation, *arguments in mutations:
+        if data:
+            mutation(data, *arguments)
+
+
+# Mutations of records: of the file, or inside a chunk.
+
+
+def drop(records, place):
+    del records[place % len(records)]
+
+
+def double(records, place, to):
+    records.insert(to % len(records), records[place % len(records)])
+
+
+def swap(records, place, to):
+    place, to = place % len(records), to % len(records)
+    records[place], records[to] = records[to], records[place]
+
+
+def change(records, place, mutations):
+    """Change the content of a record, and its length with it."""
+    raw = records[place % len(records)]
+    content = bytearray(raw.content)
+    of_bytes(content, mutations)
+    records[place % len(records)] = Raw(raw.opcode, bytes(content))
+
+
+def start_of(records, place, at, number, size):
+    """Change a number in the first bytes of a record, where its fields are."""
+    change(records, place, [(put_number, at, number, size)])
+
+
+def rename(records, place, opcode):
+    records[place % len(records)] = Raw(opcode, records[place % len(records)].content)
+
+
+RECORDS = st.one_of(
+    st.tuples(st.just(drop), PLACES),
+    st.tuples(st.just(double), PLACES, PLACES),
+    st.tuples(st.just(swap), PLACES, PLACES),
+    st.tuples(st.just(change), PLACES, st.lists(BYTES, min_size=1, max_size=3)),
+    st.tuples(
+        st.just(start_of), PLACES, st.integers(0, 60), NUMBERS, st.sampled_from([1, 2, 4, 8])
+    ),
+    st.tuples(st.just(rename), PLACES, st.integers(0, 255)),
+)
+
+
+def of_records(records, mutations):
+    for mutation, *arguments in mutations:
+        if records:
+            mutation(records, *arguments)
+
+
+# Mutations of what is inside a chunk, which is compressed again with the right checksum.
+
+COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
+
+
+def chunk_content(records, place, mutations, compression):
+    _in_chunk(records, place, lambda content: of_bytes(content, mutations), compression)
+
+
+def chunk_records(records, place, mutations, compression):
+    def mutate(content):
+        inner, start = [], 0
+        while start + HEAD.size <= len(content):
+            opcode, length = HEAD.unpack_from(content, start)
+            inner.append(Raw(opcode, bytes(content[start + HEAD.size :][:length])))
+            start += HEAD.size + length
+        of_records(inner, mutations)
+        content[:] = joined(inner, ends=False)
+
+    _in_chunk(records, place, mutate, compression)
+
+
+def _in_chunk(records, place, mutate, compression):
+    chunks = [i for i, raw in enumerate(records) if raw.opcode == Opcode.CHUNK]
+    if not chunks:
+        return
+    number = chunks[place % len(chunks)]
+    try:
+        chunk = parsed(records[number], Chunk)
+        content = bytearray(zstandard.decompress(chunk.data, max_output_size=1 << 22))
+    except Exception:  # noqa: BLE001 - another mutation has been here before
+        return
+    mutate(content)
+    chunk.data = COMPRESS[compression](bytes(content))
+    chunk.compression = compression
+    chunk.uncompressed_size = len(content)
+    chunk.uncompressed_crc = zlib.crc32(content)
+    records[number] = as_raw(chunk)
+
+
+COMPRESSIONS = st.sampled_from([*COMPRESS])
+CHUNKS = st.one_of(
+    st.tuples(
+        st.just(chunk_content), PLACES, st.lists(BYTES, min_size=1, max_size=3), COMPRESSIONS
+    ),
+    st.tuples(
+        st.just(chunk_records), PLACES, st.lists(RECORDS, min_size=1, max_size=3), COMPRESSIONS
+    ),
+)
+
+NAMES = st.sampled_from(["home_20260301T070000Z.mcap", "home_20260301T070000Z.mcap.active"])
+FEW = settings(
+    max_examples=40,
+    deadline=None,
+    database=None,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@FEW
+@given(mutations=st.lists(BYTES, min_size=1, max_size=5), name=NAMES)
+def test_a_file_whose_bytes_were_changed(log, victim, mutations, name):
+    data = bytearray(log)
+    of_bytes(data, mutations)
+    assert not victim.read(bytes(data), name)
+
+
+@FEW
+@given(mutations=st.lists(RECORDS, min_size=1, max_size=5), name=NAMES)
+def test_a_file_whose_records_were_changed(log, victim, mutations, name):
+    records = split(log)
+    of_records(records, mutations)
+    assert not victim.read(_written(records), name)
+
+
+@FEW
+@given(mutations=st.lists(CHUNKS, min_size=1, max_size=3), name=NAMES)
+def test_a_file_whose_chunks_were_changed_and_have_the_right_checksum(log, victim, mutations, name):
+    records = split(log)
+    of_records(records, mutations)
+    assert not victim.read(_written(records), name)
+
+
+@FEW
+@given(place=PLACES, length=NUMBERS, name=NAMES)
+def test_a_file_with_a_record_that_lies_about_its_length(log, victim, place, length, name):
+    records, data = split(log), bytearray(log)
+    start = 8
+    for raw in records[: place % len(records)]:
+        start += HEAD.size + len(raw.content)
+    struct.pack_into("<Q", data, start + 1, length)
+    assert not victim.read(bytes(data), name)
+
+
+@FEW
+@given(tail=st.lists(BYTES, max_size=2), content=st.binary(max_size=300), name=NAMES)
+def test_a_file_that_consists_of_anything(log, victim, tail, content, name):
+    data = bytearray(log[:8] + content + log[-3000:])
+    of_bytes(data, tail)
+    assert not victim.read(bytes(data), name)
+
+
+def _written(records):
+    """Put records together; the footer keeps its checksum only where it can be made anew."""
+    try:
+        return joined(records)
+    except (struct.error, IndexError):  # there is no footer any more, or only a part of one
+        body = b"".join(HEAD.pack(raw.opcode, len(raw.content)) + raw.content for raw in records)
+        return b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n"

@@ -1,0 +1,701 @@
+"""Of a log that is cut or damaged anywhere, all that is whole is saved, and the rest is named."""
+
+import io
+import json
+import random
+import struct
+import subprocess
+import sys
+import zlib
+from itertools import pairwise
+from pathlib import Path
+from threading import Event
+from typing import NamedTuple
+
+import lz4.frame
+import numpy as np
+import pytest
+import soundfile
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+from rosbags.typesys import Stores, get_typestore
+
+from recorder.config import load_settings
+from recorder.recovery import NothingWholeError, recover_log
+from recorder.service import record_files
+from recorder.sources.replayed import FileSource
+from schemas.reader import LogReader
+from schemas.topics import Topic
+from schemas.writer import LogWriter
+
+HEADER, MESSAGE, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END = 1, 5, 6, 7, 9, 12, 15
+MAGIC = b"\x89MCAP0\r\n"
+
+
+class Record(NamedTuple):
+    """A record of a file; `messages` of a chunk are (topic, log time, payload)."""
+
+    start: int
+    end: int
+    opcode: int
+    messages: list[tuple[str, int, bytes]]
+
+
+def framing(data):
+    """Offset, end and opcode of records, one after the other."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = struct.unpack_from("<BQ", data, offset)
+        yield offset, offset + 9 + length, opcode
+        offset += 9 + length
+
+
+def structure(data):
+    """List the records of a whole file, found by nothing but the specification."""
+    found, topics = [], {}
+    for start, end, opcode in framing(data[8:-8]):
+        record = Record(start + 8, end + 8, opcode, [])
+        found.append(record)
+        if opcode != CHUNK:
+            continue
+        size, _, text = struct.unpack_from("<QII", data, record.start + 25)
+        first = record.start + 41 + text + 8
+        name = data[record.start + 41 : first - 8]
+        inner = DECOMPRESS[name](data[first : record.end], size)
+        for a, b, kind in framing(inner):
+            content = inner[a + 9 : b]
+            if kind == 4:
+                number, _, length = struct.unpack_from("<HHI", content)
+                topics[number] = content[8 : 8 + length].decode()
+            elif kind == MESSAGE:
+                number, _, time, _ = struct.unpack_from("<HIQQ", content)
+                record.messages.append((topics[number], time, content[22:]))
+    return found
+
+
+DECOMPRESS = {
+    b"": lambda data, _: data,
+    b"lz4": lambda data, _: lz4.frame.decompress(data),
+    b"zstd": lambda data, size: zstandard.ZstdDecompressor().decompress(data, size),
+}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory, day, model_file):
+    """A log of a minute as the recorder wrote it: its bytes and its records."""
+    folder = tmp_path_factory.mktemp("minute")
+    sound, rate = soundfile.read(day, frames=60 * 16_000)
+    soundfile.write(folder / "minute.wav", sound, rate)
+    settings = load_settings(
+        None, {"output": tmp_path_factory.mktemp("logs"), "model": model_file}, {}
+    )
+    (path,) = record_files(settings, FileSource([folder / "minute.wav"], 10**18), Event()).logs
+    data = path.read_bytes()
+    return data, structure(data)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A log of three small chunks, of which every byte can be tried."""
+    path = tmp_path_factory.mktemp("small") / "small.mcap"
+    topics = [Topic("/a", "std_msgs/msg/Header"), Topic("/b", "std_msgs/msg/Header")]
+    writer = LogWriter(path, topics, {"version": "1"})
+    for number in range(9):
+        writer.write("/ab"[:1] + "ab"[number % 2], 1000 + number, bytes(range(number, 40)))
+        if number % 3 == 2:
+            writer.flush()
+    writer.finish()
+    data = path.read_bytes()
+    return data, structure(data)
+
+
+class Result(NamedTuple):
+    """What was saved, and what was said of the rest."""
+
+    recovery: object
+    messages: list[tuple[str, int, bytes]]
+
+    @property
+    def lost(self):
+        return sum(sum(damage.messages.values()) for damage in self.recovery.damages)
+
+    @property
+    def exact(self):
+        return all(damage.exact for damage in self.recovery.damages)
+
+    @property
+    def some_lost(self):
+        return self.lost or not self.exact
+
+
+@pytest.fixture
+def recover(tmp_path):
+    """Recover bytes, and read what was saved with the official reader and our own."""
+
+    def run(data):
+        source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+        source.write_bytes(data)
+        try:
+            recovery = recover_log(source, copy, "copy.mcap")
+        except NothingWholeError:
+            return None
+        reader = LogReader(copy)
+        messages = [(m.topic, m.log_time, m.data) for m in reader.messages()]
+        assert reader.complete
+        by_topic = {n: t.messages for n, t in recovery.topics.items() if t.messages}
+        assert by_topic == {n: [m[0] for m in messages].count(n) for n in {m[0] for m in messages}}
+        with copy.open("rb") as stream:
+            official = make_reader(stream, validate_crcs=True)
+            assert sum(1 for _ in official.iter_messages()) == len(messages)
+        return Result(recovery, messages)
+
+    return run
+
+
+def messages_of(records, without=-1):
+    """Messages of the chunks that do not contain a certain byte."""
+    kept = [r for r in records if not r.start <= without < r.end]
+    return [message for record in kept for message in record.messages]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_of_a_log_cut_anywhere_every_chunk_is_saved(log, recover, seed):
+    data, records = log
+    rng = random.Random(seed)
+    for length in [rng.randrange(len(data)) for _ in range(15)]:
+        result = recover(data[:length])
+        whole = [r for r in records if r.end <= length]
+        expected = messages_of(whole)
+        if result is None:
+            assert not any(r.opcode in {CHUNK, METADATA, ATTACHMENT} for r in whole)
+            continue
+        assert result.messages == expected, length
+        within_chunk = any(r.opcode == CHUNK and r.start < length < r.end for r in records)
+        assert bool(result.some_lost) == within_chunk, length
+        assert all(damage.cut for damage in result.recovery.damages)
+
+
+@pytest.mark.parametrize("finished", [True, False], ids=["finished", "unfinished"])
+@pytest.mark.parametrize("seed", range(10))
+def test_with_any_byte_changed_every_other_chunk_is_saved_and_the_lost_messages_counted(
+    log, recover, seed, finished
+):
+    data, records = log
+    if not finished:
+        data = data[: next(r.start for r in records if r.opcode == DATA_END)]
+    rng = random.Random(seed)
+    for place in [rng.randrange(len(data)) for _ in range(8)]:
+        damaged = bytearray(data)
+        damaged[place] ^= rng.randrange(1, 256)
+        result = recover(bytes(damaged))
+        assert result.messages == messages_of(records, without=place), place
+        assert result.exact
+        assert len(result.messages) + result.lost == len(messages_of(records)), place
+
+
+@pytest.mark.parametrize("finished", [True, False], ids=["finished", "unfinished"])
+def test_every_byte_of_a_log_can_be_changed(small, recover, finished):
+    data, records = small
+    if not finished:
+        data = data[: next(r.start for r in records if r.opcode == DATA_END)]
+    everything = messages_of(records)
+    first = next(r for r in records if r.opcode == CHUNK)
+    for place in range(0, len(data), 1):
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << place % 8
+        result = recover(bytes(damaged))
+        others = messages_of(records, without=place)
+        if first.start <= place < first.end and not finished and result.messages != everything:
+            others = []  # what they are was said there only
+        assert result.messages in (others, everything), place
+        assert result.exact, place
+        assert len(result.messages) + result.lost == len(everything), place
+        if result.messages == everything:
+            assert not result.some_lost
+
+
+def test_a_wrong_head_of_a_chunk_loses_nothing(log, recover):
+    data, records = log
+    chunk = [r for r in records if r.opcode == CHUNK][4]
+    for place in [0, *range(1, 9), *range(9, 25)]:  # opcode, length, times
+        damaged = bytearray(data)
+        damaged[chunk.start + place] ^= 0x21
+        result = recover(bytes(damaged))
+        assert result.messages == messages_of(records), place
+        assert [d.start for d in result.recovery.damages] == [chunk.start]
+        assert result.recovery.lossless
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("kind", ["zeros", "noise", "removed", "inserted", "repeated"])
+def test_pages_that_are_lost_take_no_other_chunk_with_them(log, recover, seed, kind):
+    data, records = log
+    rng = random.Random(seed)
+    start = rng.randrange(3000, len(data) - 40_000)
+    length = rng.choice([512, 4096, 65_536])
+    end = min(start + length, len(data) - 20_000)
+    noise = rng.randbytes(end - start)
+    middle = {"zeros": bytes(end - start), "noise": noise, "removed": b""}
+    middle |= {"inserted": noise + data[start:end], "repeated": data[start:end] * 2}
+    result = recover(data[:start] + middle[kind] + data[end:])
+    if kind == "inserted":
+        end = start
+    untouched = [r for r in records if r.end <= start or r.start >= end]
+    saved = set(result.messages)
+    assert saved <= set(messages_of(records))
+    assert set(messages_of(untouched)) <= saved
+    if len(saved) < len(messages_of(records)):
+        assert result.some_lost
+
+
+def test_what_was_lost_is_said_with_its_place_its_times_and_its_topics(log, recover):
+    data, records = log
+    chunk = [r for r in records if r.opcode == CHUNK][3]
+    damaged = bytearray(data)
+    damaged[chunk.end - 100] ^= 1
+    times = [m[1] for m in chunk.messages]
+    topics = [m[0] for m in chunk.messages]
+    for end in (len(data), next(r.start for r in records if r.opcode == DATA_END)):
+        (damage,) = recover(bytes(damaged[:end])).recovery.damages
+        assert (damage.start, damage.end) == (chunk.start, chunk.end)
+        assert damage.times == (min(times), max(times))
+        assert damage.messages == {topic: topics.count(topic) for topic in topics}
+        assert damage.exact
+        assert not damage.cut
+        text = str(damage)
+        assert text.startswith(f"damaged at byte {chunk.start} (a chunk ")
+        assert f"{topics.count('/mic/features')} of /mic/features" in text
+
+
+def test_messages_without_an_index_behind_their_chunk_are_lost_in_unknown_number(log, recover):
+    data, records = log
+    chunk, behind = next(
+        (a, b) for a, b in pairwise(records) if a.opcode == CHUNK and a.start > 50_000
+    )
+    assert behind.opcode == INDEX
+    damaged = bytearray(data[: next(r.start for r in records if r.opcode == DATA_END)])
+    damaged[chunk.end - 100] ^= 1
+    damaged[behind.start] ^= 0x80
+    result = recover(bytes(damaged))
+    assert not result.exact
+    assert "perhaps more" in str(result.recovery.damages[0]) or "unknown number" in str(
+        result.recovery.damages[0]
+    )
+
+
+def test_messages_whose_channel_nothing_defines_are_counted(log, recover):
+    data, records = log
+    chunks = [r for r in records if r.opcode == CHUNK]
+    damaged = bytearray(data[: next(r.start for r in records if r.opcode == DATA_END)])
+    damaged[chunks[0].end - 50] ^= 1
+    result = recover(bytes(damaged))
+    assert result.messages == []
+    assert result.lost == len(messages_of(records))
+    assert any("nothing that is left says what channel" in str(d) for d in result.recovery.damages)
+
+
+def test_definitions_that_come_too_late_are_used_all_the_same(recover):
+    stream = io.BytesIO()
+    writer = Writer(stream, chunk_size=50)
+    writer.start("ros2", "test")
+    schema = writer.register_schema("a/msg/B", "ros2msg", b"int32 a")
+    first = writer.register_channel("/first", "cdr", schema)
+    for number in range(3):
+        writer.add_message(first, number, bytes(40), number)
+    second = writer.register_channel("/second", "cdr", schema)
+    for number in range(3, 6):
+        writer.add_message(second, number, bytes(40), number)
+    writer.finish()
+    data = bytearray(stream.getvalue())
+    records = structure(bytes(data))
+    defining = next(r for r in records if r.opcode == CHUNK)
+    data[defining.end - 1] ^= 1
+    data[-20] ^= 1  # the checksum of the index is wrong now
+    result = recover(bytes(data))
+    assert result.messages == messages_of(records, without=defining.start)
+
+
+def test_a_file_whose_header_is_lost_is_still_of_ros_2(small, recover, tmp_path):
+    data, records = small
+    damaged = bytearray(data)
+    damaged[10] ^= 0xFF
+    for end in (len(data), next(r.start for r in records if r.opcode == DATA_END)):
+        assert recover(bytes(damaged[:end])).messages == messages_of(records)
+        with (tmp_path / "copy.mcap").open("rb") as stream:
+            assert make_reader(stream).get_header().profile == "ros2"
+
+
+def test_a_log_of_which_the_beginning_is_missing(log, recover):
+    data, records = log
+    chunk = [r for r in records if r.opcode == CHUNK][3]
+    result = recover(data[chunk.start + 11 :])
+    assert result.messages == messages_of([r for r in records if r.start > chunk.start])
+
+
+def test_two_logs_in_one_file_are_not_mixed_up(small, recover, tmp_path):
+    data, records = small
+    writer = LogWriter(tmp_path / "other.mcap", [Topic("/b", "std_msgs/msg/Header")], {})
+    writer.write("/b", 5, b"other")
+    writer.flush()
+    other = writer.finish().read_bytes()
+    result = recover(data + other)
+    assert set(result.messages) <= {*messages_of(records), ("/b", 5, b"other")}
+    assert len(result.messages) + result.lost == len(messages_of(records)) + 1
+
+
+def test_an_attachment_is_saved_only_if_it_has_its_checksum(small, recover, tmp_path):
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    writer.add_attachment(1, 1, "first", "text/plain", b"one" * 99)
+    writer.add_attachment(1, 1, "inner", "application/mcap", small[0])
+    writer.add_attachment(1, 1, "third", "text/plain", b"three" * 99)
+    writer.finish()
+    data = bytearray(stream.getvalue())
+    data[data.index(b"one") + 7] ^= 1
+    data[data.index(small[0]) + 40] ^= 1
+    result = recover(bytes(data))
+    assert result.messages == []  # those of the file that was attached are not ours
+    assert [damage.others for damage in result.recovery.damages] == [
+        ("the attachment 'first'",),
+        ("the attachment 'inner'",),
+    ]
+    assert LogReader(tmp_path / "copy.mcap").attachments == {"third": b"three" * 99}
+
+
+def written(compression, *, chunked=True, indexed=True, crcs=True):
+    stream = io.BytesIO()
+    writer = Writer(
+        stream,
+        chunk_size=2000,
+        compression=compression,
+        use_chunking=chunked,
+        index_types=IndexType.ALL if indexed else IndexType.NONE,
+        enable_crcs=crcs,
+    )
+    writer.start("", "test")
+    schema = writer.register_schema("thing", "jsonschema", b"{}")
+    channels = [writer.register_channel(f"/t{n}", "json", schema) for n in range(3)]
+    rng = np.random.default_rng(0)
+    for number in range(300):
+        data = rng.bytes(number % 90) + b"text" * (number % 7)
+        writer.add_message(channels[number % 3], 10_000 + number, data, number, number)
+    writer.add_metadata("about", {"a": "b"})
+    writer.finish()
+    data = stream.getvalue()
+    stream.seek(0)
+    found = make_reader(stream).iter_messages(log_time_order=False)
+    return data, [(c.topic, m.log_time, m.data) for _, c, m in found]
+
+
+FORMS = {
+    "lz4": {"compression": CompressionType.LZ4},
+    "zstd": {"compression": CompressionType.ZSTD},
+    "uncompressed": {"compression": CompressionType.NONE},
+    "unindexed": {"compression": CompressionType.ZSTD, "indexed": False},
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_files_of_other_writers_are_recovered_in_the_same_way(recover, form):
+    data, everything = written(**FORMS[form])
+    records = structure(data)
+    assert messages_of(records) == everything
+    whole = recover(data)
+    assert (whole.messages, whole.recovery.damages) == (everything, [])
+    rng = random.Random(form)
+    for _ in range(20):
+        place = rng.randrange(len(data))
+        result = recover(data[:place])
+        expected = messages_of([r for r in records if r.end <= place])
+        assert (result.messages if result else []) == expected, place
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << rng.randrange(8)
+        result = recover(bytes(damaged))
+        kept = messages_of(records, without=place)
+        assert result.messages in (kept, everything), place
+        assert len(result.messages) == len(everything) or result.some_lost, place
+
+
+def test_messages_outside_of_chunks_are_saved_up_to_a_wrong_length_and_from_there_on(recover):
+    data, everything = written(CompressionType.NONE, chunked=False)
+    records = [r for r in structure(data) if r.opcode == MESSAGE]
+    assert recover(data).messages == everything
+    rng = random.Random(0)
+    for _ in range(60):
+        number = rng.randrange(len(records))
+        damaged = bytearray(data)
+        damaged[records[number].start + rng.randrange(9)] ^= 1 << rng.randrange(8)
+        result = recover(bytes(damaged))
+        others = everything[: max(number - 1, 0)] + everything[number + 1 :]
+        assert [m for m in result.messages if m in others] == others, number
+        assert set(result.messages) <= set(everything), number
+        assert len(result.messages) == len(everything) or result.some_lost, number
+
+
+@pytest.mark.parametrize("mode", ["none", "storage"])
+def test_a_bag_of_rosbags(recover, tmp_path, mode):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "std_msgs/msg/Int32"
+    writer = RosbagWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    if mode == "storage":
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/number", kind, typestore=store)
+        for number in range(500):
+            data = store.serialize_cdr(store.types[kind](number), kind)
+            writer.write(connection, 1000 + number, bytes(data))
+    (path,) = (tmp_path / "bag").glob("*.mcap")
+    data = path.read_bytes()
+    whole = recover(data)
+    assert len(whole.messages) == 500
+    assert whole.recovery.damages == []
+    assert set(recover(data[: len(data) // 2]).messages) <= set(whole.messages)
+
+
+# Files that lie.
+
+
+def record(opcode, content, length=None):
+    return struct.pack("<BQ", opcode, len(content) if length is None else length) + content
+
+
+def chunk(inner, compression=b"zstd", *, packed=None, size=None, crc=None):
+    packed = zstandard.compress(inner) if packed is None else packed
+    crc = zlib.crc32(inner) if crc is None else crc
+    size = len(inner) if size is None else size
+    head = struct.pack("<QQQII", 1, 2, size, crc, len(compression)) + compression
+    content = head + struct.pack("<Q", len(packed)) + packed
+    return record(CHUNK, content)
+
+
+def claiming(length, data):
+    return data[:1] + struct.pack("<Q", length) + data[9:]
+
+
+def message(channel=1, time=1, data=b"data"):
+    return record(MESSAGE, struct.pack("<HIQQ", channel, 0, time, time) + data)
+
+
+def text(value):
+    return struct.pack("<I", len(value)) + value
+
+
+DEFINITIONS = record(3, struct.pack("<H", 1) + text(b"n") + text(b"e") + text(b"d")) + record(
+    4, struct.pack("<HH", 1, 1) + text(b"/topic") + text(b"cdr") + text(b"")
+)
+START = MAGIC + record(HEADER, text(b"") + text(b""))
+GOOD = chunk(DEFINITIONS + message(data=b"good"))
+HUGE = 1 << 63
+
+
+def bomb(size):
+    frame = zstandard.ZstdCompressor().compress(bytes(size))
+    return chunk(b"", packed=frame, size=size, crc=1)
+
+
+LIES = {
+    "chunk lengths": lambda: claiming(HUGE, chunk(b"x")) + chunk(b"x", size=HUGE),
+    "stored length": lambda: record(
+        CHUNK, struct.pack("<QQQII4sQ", 1, 2, 9, 1, 4, b"zstd", HUGE) + b"xx"
+    ),
+    "chunk that has the file": lambda: record(CHUNK, bytes(40), 10_000_000),
+    "metadata": lambda: record(METADATA, text(b"a") + struct.pack("<I", 1 << 31) + b"x"),
+    "attachment": lambda: record(ATTACHMENT, bytes(16) + text(b"a") * 2 + struct.pack("<Q", HUGE)),
+    "schema": lambda: record(3, b"\1\0" + struct.pack("<I", (1 << 32) - 1) + b"xx" * 20),
+    "message index": lambda: record(INDEX, b"\1\0" + struct.pack("<I", (1 << 32) - 16)),
+    "zstd bomb": lambda: bomb(90 << 20) * 20,
+    "zstd bomb beyond the limit": lambda: bomb(300 << 20),
+    "zstd without a size": lambda: chunk(
+        b"",
+        packed=zstandard.ZstdCompressor(write_content_size=False).compress(bytes(9 << 20)),
+        size=50,
+    ),
+    "zstd that claims more than its chunk": lambda: chunk(
+        b"", packed=zstandard.ZstdCompressor().compress(bytes(300 << 20)), size=50
+    ),
+    "lz4 bomb": lambda: chunk(
+        b"", b"lz4", packed=lz4.frame.compress(bytes(300 << 20)), size=60 << 20
+    ),
+    "lz4 that claims less": lambda: chunk(
+        b"", b"lz4", packed=lz4.frame.compress(bytes(90 << 20)), size=9
+    ),
+    "unknown compression": lambda: chunk(b"x", b"brotli"),
+    "records in a chunk": lambda: chunk(record(MESSAGE, b"x", HUGE)) + chunk(record(MESSAGE, b"")),
+    "a chunk in a chunk": lambda: chunk(GOOD, b"", packed=GOOD),
+    "times": lambda: chunk(message(time=(1 << 64) - 1)),
+    "nested chunks": lambda: b"".join(
+        claiming(40 + (1 << 20), chunk(b"", b"", packed=bytes(8), size=1 << 20))[:-8]
+        for _ in range(20_000)
+    ),
+    "nested stored chunks": lambda: b"".join(
+        record(CHUNK, struct.pack("<QQQIIQ", 1, 2, n := (20_000 - i) * 49, 1, 0, n), 40 + n)
+        for i in range(20_000)
+    ),
+    "messages that are none": lambda: struct.pack("<BQ", MESSAGE, 22) * 50_000,
+    "chained messages": lambda: message(channel=9) * 20_000,
+    "empty records": lambda: bytes(1 << 20),
+    "ones": lambda: b"\1" * (1 << 20),
+    "indexes": lambda: record(INDEX, struct.pack("<HI", 1, 0)) * 20_000,
+    "channels": lambda: b"".join(
+        record(4, struct.pack("<HH", n % 65536, 0) + text(b"/t") + text(b"") * 2)
+        for n in range(2, 20_000)
+    ),
+    "definitions that would not fit": lambda: b"".join(
+        chunk(record(3, struct.pack("<H", n) + text(b"n") + text(b"e") + text(bytes(60 << 20))))
+        for n in range(2, 6)
+    ),
+    "many small messages": lambda: chunk(message(data=b"") * 3_000_000) * 3,
+    "a large message": lambda: message(data=bytes(90 << 20)),
+    "a large attachment": lambda: record(
+        ATTACHMENT, bytes(16) + text(b"a") * 2 + struct.pack("<Q", 90 << 20) + bytes((90 << 20) + 4)
+    ),
+    "a large chunk": lambda: chunk(big := message(data=bytes(99 << 20)), b"", packed=big),
+    "footers": lambda: record(2, struct.pack("<QQI", 8, 0, 0)) * 1000,
+}
+CHECK = """
+import resource, sys
+from pathlib import Path
+from recorder.recovery import recover_log
+resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
+recovery = recover_log(Path(sys.argv[1]), Path(sys.argv[2]), "copy.mcap")
+most = next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]
+print(recovery.messages, int(most) >> 10)
+"""
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_whatever_a_file_claims_memory_is_bounded_and_what_follows_is_saved(tmp_path, lie):
+    source, copy = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    last = chunk(message(data=b"last") * 2)
+    source.write_bytes(START + GOOD + LIES[lie]() + last)
+    result = subprocess.run(
+        [sys.executable, "-c", CHECK, source, copy],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=True,
+        env={"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])},
+    )
+    messages, megabytes = map(int, result.stdout.split())
+    assert messages >= 3
+    assert megabytes < 500
+
+
+# The command.
+
+
+def test_the_command_writes_a_log_beside_the_damaged_one_and_says_what_is_lost(
+    log, hearthlog, tmp_path
+):
+    data, records = log
+    lost = [r for r in records if r.opcode == CHUNK][2]
+    damaged = bytearray(data)
+    damaged[lost.end - 9] ^= 1
+    path = tmp_path / "a.mcap"
+    path.write_bytes(damaged)
+    result = hearthlog("recover", path)
+    new = tmp_path / "a.recovered.mcap"
+    assert (result.returncode, result.stdout) == (3, f"{new}\n")
+    saved, loss = result.stderr.splitlines()
+    total = len(messages_of(records))
+    assert saved == f"hearthlog: {path}: {total - len(lost.messages)} of {total} messages saved"
+    assert loss.startswith(f"hearthlog: {path}: damaged at byte {lost.start} (")
+    assert path.read_bytes() == damaged
+    assert hearthlog("info", new).returncode == 0
+    again = hearthlog("recover", path)
+    assert again.returncode == 1
+    assert again.stderr.startswith(f"hearthlog: {new}: exists already")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.recovered.mcap"]
+
+
+def test_the_command_prints_json(log, hearthlog, tmp_path):
+    data, records = log
+    cut = [r for r in records if r.opcode == CHUNK][5].start + 1000
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(data[:cut])
+    result = hearthlog("recover", path, "--json", "-o", tmp_path / "b.mcap")
+    assert result.returncode == 3
+    (report,) = json.loads(result.stdout)
+    assert report["recovered"] == str(tmp_path / "b.mcap")
+    assert report["topics"]["/mic/features"]["messages"] == sum(
+        m[0] == "/mic/features" for m in messages_of([r for r in records if r.end <= cut])
+    )
+    (damage,) = report["damages"]
+    assert damage["cut"]
+    assert not damage["exact"]
+    assert (damage["start_byte"], damage["end_byte"]) == (cut - 1000, cut)
+
+
+def test_a_log_that_only_lacks_its_end_loses_nothing(log, hearthlog, tmp_path):
+    data, records = log
+    path = tmp_path / "a.mcap"
+    path.write_bytes(data[: next(r.start for r in records if r.opcode == DATA_END) + 40])
+    result = hearthlog("recover", path, "--in-place")
+    assert (result.returncode, result.stdout) == (0, f"{path}\n")
+    assert "the log had no end" in result.stderr
+    assert (tmp_path / "a.mcap.damaged").stat().st_size < path.stat().st_size
+    assert hearthlog("recover", path, "--in-place").returncode == 1  # there is an original
+
+
+def test_a_whole_log_is_recovered_to_the_same_messages_and_records(log, recover, tmp_path):
+    data, records = log
+    result = recover(data)
+    assert result.recovery.damages == []
+    copy = (tmp_path / "copy.mcap").read_bytes()
+    chunks = [
+        [d[r.start : r.end] for r in f if r.opcode in {CHUNK, INDEX}]
+        for d, f in ((data, records), (copy, structure(copy)))
+    ]
+    assert chunks[0] == chunks[1]
+    original = LogReader(tmp_path / "source.mcap")
+    again = LogReader(tmp_path / "copy.mcap")
+    assert again.attachments == original.attachments
+    about = [json.loads(r.metadata["rosbag2"]["serialized_metadata"]) for r in (original, again)]
+    assert about[0]["topics_with_message_count"] == about[1]["topics_with_message_count"]
+    assert about[1]["relative_file_paths"] == ["copy.mcap"]
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF", b"x" * 9999, MAGIC, bytes(5000)])
+def test_what_is_no_log_is_refused_and_nothing_is_written(hearthlog, tmp_path, content):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    for option in ([], ["--in-place"]):
+        result = hearthlog("recover", path, *option)
+        assert (result.returncode, result.stdout) == (1, "")
+        assert result.stderr.startswith(f"hearthlog: {path}: ")
+        assert result.stderr.count("\n") == 1
+        assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_of_several_logs_each_is_recovered_on_its_own(small, hearthlog, tmp_path):
+    (tmp_path / "a.mcap").write_bytes(small[0])
+    (tmp_path / "b.mcap").write_bytes(b"none")
+    (tmp_path / "c.mcap").write_bytes(small[0][:-100])
+    paths = [tmp_path / f"{name}.mcap" for name in "abc"]
+    result = hearthlog("recover", *paths)
+    assert result.returncode == 1
+    assert f"{paths[1]}: is no MCAP file" in result.stderr
+    assert len(result.stdout.splitlines()) == 2
+    assert hearthlog("recover", *paths, "-o", tmp_path / "x.mcap").returncode == 2
+
+
+def test_a_log_that_is_being_written_keeps_its_place(hearthlog, tmp_path):
+    writer = LogWriter(tmp_path / "a.mcap", [Topic("/a", "std_msgs/msg/Header")], {})
+    writer.write("/a", 1, b"data")
+    writer.flush()
+    result = hearthlog("recover", writer.active_path, "--in-place")
+    assert result.returncode == 1
+    assert "is being written" in result.stderr
+    assert hearthlog("recover", writer.active_path).returncode == 0
+    writer.finish()
+
+
+def test_an_abandoned_log_gets_its_name_in_place(small, hearthlog, tmp_path):
+    path = tmp_path / "a.mcap.active"
+    path.write_bytes(small[0][:-200])
+    assert hearthlog("recover", path, "--in-place").stdout == f"{tmp_path / 'a.mcap'}\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.damaged"]

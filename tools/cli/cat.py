@@ -1,0 +1,75 @@
+"""`hearthlog cat`: the messages of logs as text."""
+
+import os
+import sys
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
+from tools.cli.times import parse_span
+
+if TYPE_CHECKING:
+    from analyzer.selection import Selection
+
+
+class Format(StrEnum):
+    """What messages are printed as."""
+
+    text = "text"
+    ndjson = "ndjson"
+    csv = "csv"
+
+
+def cat(
+    logs: Logs,
+    *,
+    output_format: Annotated[
+        Format, typer.Option("--format", help="csv is for one topic.")
+    ] = Format.text,
+    topics: Topics = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """Print the messages of logs in the order of their log times.
+
+    Exit status 3: a log is unfinished.
+    """
+    from analyzer.selection import select
+
+    selection = select(logs, topics or [], *parse_span(start, end))
+    if output_format is Format.csv and len(selection.channels) > 1:
+        names = ", ".join(sorted(selection.channels))
+        wrong_use(f"csv is for one topic: choose one with --topics ({names})")
+    try:
+        if output_format is Format.csv:
+            _print_table(selection)
+        else:
+            _print_lines(selection, output_format)
+        sys.stdout.flush()
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return
+    report_unfinished(selection)
+
+
+def _print_lines(selection: "Selection", output_format: Format) -> None:
+    from analyzer.lines import in_order, json_lines, text_lines
+    from analyzer.pieces import pieces
+
+    lines = json_lines if output_format is Format.ndjson else text_lines
+    for batch in selection.messages():
+        sys.stdout.write("\n".join([*in_order(pieces(batch), lines), ""]))
+
+
+def _print_table(selection: "Selection") -> None:
+    from analyzer.export.csvfile import CsvFile
+    from analyzer.pieces import pieces
+
+    for topic in selection.channels:
+        table = CsvFile(sys.stdout.buffer, topic, selection)
+        for batch in selection.messages():
+            for piece in pieces(batch):
+                table.write(piece)
+        table.finish()

@@ -1,0 +1,34 @@
+"""`hearthlog cut`: a part of some logs as a log of its own."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.cli.selection import End, Logs, Start, Topics, check_log_name, report_unfinished
+from tools.cli.times import parse_span
+
+
+def cut(
+    logs: Logs,
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Log to make, *.mcap.")],
+    topics: Topics = None,
+    start: Start = None,
+    end: End = None,
+) -> None:
+    """Cut a span of time out of logs, message for message.
+
+    It begins with what describes the streams (`/mic/info`) as it was at the start of the span.
+    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    """
+    from analyzer.selection import select
+    from analyzer.splice import splice
+    from tools.cli.progress import share_done
+
+    check_log_name(output)
+    selection = select(logs, topics or [], *parse_span(start, end))
+    with share_done("cutting") as progress:
+        splice(selection, output, progress, latched=True)
+    print(output)
+    report_unfinished(selection)

@@ -1,0 +1,69 @@
+"""`hearthlog doctor`: whether logs are what they should be."""
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from analyzer.doctor import Findings
+
+
+def doctor(
+    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Check logs: MCAP, the contract, and how they follow each other.
+
+    Exit status 1: a log is damaged, or not what hearthlog writes; 3: one has gaps, or is unfinished.
+    """
+    from analyzer.doctor import examine
+    from tools.cli.progress import share_done
+
+    with share_done("reading logs") as progress:
+        files = examine(path, progress)
+    if as_json:
+        print(json.dumps(_as_json(files), indent=2))
+    else:
+        _print(files)
+    levels = {level for findings in files for level, _ in findings.counts}
+    if levels:
+        raise typer.Exit(1 if "error" in levels else 3)
+
+
+def _print(files: "list[Findings]") -> None:
+    from analyzer.doctor import printable
+
+    errors, warnings = _count(files, "error"), _count(files, "warning")
+    for findings in files:
+        for finding in findings.shown:
+            print(finding)
+        for (level, rule), count in findings.more().items():
+            print(printable(f"{level}: {findings.path}: {count} more of this kind [{rule}]"))
+    # Nobody who reads the findings with a program wants this among them.
+    print(f"{len(files)} files: {errors} errors, {warnings} warnings", file=sys.stderr)
+
+
+def _as_json(files: "list[Findings]") -> dict[str, Any]:
+    return {
+        "files": [str(findings.path) for findings in files],
+        "errors": _count(files, "error"),
+        "warnings": _count(files, "warning"),
+        "findings": [
+            finding._asdict() | {"path": str(finding.path)}
+            for findings in files
+            for finding in findings.shown
+        ],
+        "more": [
+            {"path": str(findings.path), "level": level, "rule": rule, "count": count}
+            for findings in files
+            for (level, rule), count in findings.more().items()
+        ],
+    }
+
+
+def _count(files: "list[Findings]", level: str) -> int:
+    return sum(n for f in files for (kind, _), n in f.counts.items() if kind == level)

@@ -1,0 +1,104 @@
+"""`hearthlog recover`: a log that was cut or damaged, to a valid one."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from recorder.recovery import Recovery
+
+
+def recover(
+    logs: Annotated[list[Path], typer.Argument(help="Logs that were cut or damaged.")],
+    *,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Name of the new log.  [default: LOG.recovered.mcap]"),
+    ] = None,
+    in_place: Annotated[
+        bool,
+        typer.Option(
+            "--in-place", help="Give it the log's own name; that one is kept as *.damaged."
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Save what is whole in a log that was cut or damaged, and say what is lost.
+
+    The log itself is not touched. Exit status 3: something was lost.
+    """
+    from schemas.errors import LogError
+
+    if output is not None and (len(logs) > 1 or in_place):
+        raise typer.BadParameter("--output goes with one log, and not with --in-place")
+    report = []
+    failed = lost = False
+    for log in logs:
+        try:
+            path, recovery = _recover(log, output, in_place=in_place)
+        except LogError as error:
+            if len(logs) == 1:
+                raise
+            typer.echo(f"hearthlog: {error}", err=True)
+            failed = True
+            continue
+        lost |= not recovery.lossless
+        _say(log, recovery)
+        report.append(_as_json(log, path, recovery))
+        if not as_json:
+            print(path)
+    if as_json:
+        print(json.dumps(report, indent=2))
+    if failed or lost:
+        raise typer.Exit(1 if failed else 3)
+
+
+def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
+    from recorder.recovery import recover_in_place, recover_log
+    from schemas.files import ACTIVE_SUFFIX, SUFFIX, new_file
+    from tools.cli.progress import share_done
+
+    with share_done(f"recovering {log.name}") as progress:
+        if in_place:
+            return recover_in_place(log, progress)
+        stem = log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+        path = output or log.with_name(f"{stem}.recovered{SUFFIX}")
+        with new_file(path) as temporary:
+            return path, recover_log(log, temporary, path.name, progress)
+
+
+def _say(log: Path, recovery: "Recovery") -> None:
+    expected = [topic.expected for topic in recovery.topics.values() if topic.expected is not None]
+    of = f" of {sum(expected)}" if expected else ""
+    end = "" if recovery.complete else "; the log had no end, or a damaged one"
+    typer.echo(f"hearthlog: {log}: {recovery.messages}{of} messages saved{end}", err=True)
+    for damage in recovery.damages:
+        typer.echo(f"hearthlog: {log}: {damage}", err=True)
+
+
+def _as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:
+    return {
+        "log": str(log),
+        "recovered": str(path),
+        "lossless": recovery.lossless,
+        "topics": {
+            name: {"type": topic.type, "messages": topic.messages, "expected": topic.expected}
+            for name, topic in recovery.topics.items()
+        },
+        "damages": [
+            {
+                "start_byte": damage.start,
+                "end_byte": damage.end,
+                "why": damage.why,
+                "cut": damage.cut,
+                "messages": damage.messages,
+                "exact": damage.exact,
+                "first_log_time": None if damage.times is None else damage.times[0],
+                "last_log_time": None if damage.times is None else damage.times[1],
+                "others": damage.others,
+            }
+            for damage in recovery.damages
+        ],
+    }

@@ -1,0 +1,272 @@
+"""`hearthlog replay`: recorded logs once more through the pipeline."""
+
+import json
+import math
+import shlex
+import signal
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from threading import Event as Flag
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tools.cli.selection import wrong_use
+
+if TYPE_CHECKING:
+    from analyzer.origin import Origin
+    from analyzer.player import Replay, Wanted
+    from analyzer.replay import LogSet
+    from models.modelfile import Model
+
+_MAX_RATE = "max"
+
+
+class Source(StrEnum):
+    """What the sound is taken from."""
+
+    features = "features"
+    clips = "clips"
+
+
+def replay(
+    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of one microphone.")],
+    *,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="New folder for a new log, or a Rerun recording to make, *.rrd; without it what "
+            "came of the replay is counted and compared with what was recorded.",
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Model file, the one that was recorded with or another. Without it the one that "
+            "was recorded with is looked for in the current folder and beside the logs; if it is "
+            "not there, there are statistics but no labels (exit status 3)."
+        ),
+    ] = None,
+    source: Annotated[
+        Source, typer.Option("--from", help="Replay the features, or the clips of sound.")
+    ] = Source.features,
+    rate: Annotated[
+        str, typer.Option("--rate", "-r", help="Multiple of real time, or max.")
+    ] = _MAX_RATE,
+    start_offset: Annotated[float, typer.Option(help="Start so many seconds into the logs.")] = 0.0,
+    playback_duration: Annotated[
+        float | None, typer.Option(help="End after so many seconds of the logs.")
+    ] = None,
+    loop: Annotated[
+        bool, typer.Option("--loop", "-l", help="Begin anew at the end, until Ctrl-C.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what came of it as JSON.")] = False,
+) -> None:
+    """Run logs through the pipeline again: with the recorded model, bit for bit as recorded.
+
+    SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
+    unfinished, sound before or between the logs is missing, or labels were not to be had.
+    """
+    from analyzer.player import Wanted
+    from analyzer.replay import LogSet
+    from schemas.files import find_logs
+
+    if not 0 <= start_offset < math.inf:
+        wrong_use(f"--start-offset {start_offset}: not a number of seconds from 0")
+    if playback_duration is not None and not 0 < playback_duration < math.inf:
+        wrong_use(f"--playback-duration {playback_duration}: not a number of seconds above 0")
+    if loop and output is not None:
+        wrong_use("--loop writes no log: it would be written again and again; leave out --output")
+    wanted = Wanted(
+        kind="audio" if source is Source.clips else "features",
+        output=output,
+        start_offset=start_offset,
+        duration=playback_duration,
+        rate=_parse_rate(rate),
+        loop=loop,
+    )
+    _check_output(output, path)
+    logs = LogSet(find_logs(path), wanted.kind)
+    models = _Models(model, (Path(), path if path.is_dir() else path.parent))
+    models.report(logs.chosen(wanted))
+    stop = Flag()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    began = time.monotonic()
+    result = _run(logs, replace(wanted, model=models), stop)
+    took = time.monotonic() - began
+    if as_json:
+        print(json.dumps(_as_json(result, took), indent=2))
+    elif output is None:
+        print(*_figures(result, took), sep="\n")
+    else:
+        _print_output(result, output)
+        typer.echo("\n".join(f"hearthlog: {line}" for line in _figures(result, took)), err=True)
+    warnings = _warnings(result)
+    if models.are_recorded and not warnings and not result.compared.identical:
+        warnings.append("with the recorded model not all is as recorded: is this another version?")
+    for line in warnings:
+        typer.echo(f"hearthlog: {line}", err=True)
+    if warnings or models.are_lacking:
+        raise typer.Exit(3)
+
+
+class _Models:
+    """The model that was given, or those that logs were recorded with.
+
+    After `report`, `are_recorded` and `are_lacking` say whether all, and whether one is not there.
+    """
+
+    def __init__(self, given: Path | None, folders: Sequence[Path]) -> None:
+        from models.modelfile import load_model
+
+        self._given = None if given is None else load_model(given)
+        self._folders = folders
+        self._found: dict[tuple[str, str], Model | None] = {}
+        self.are_recorded = True
+        self.are_lacking = False
+
+    def __call__(self, origin: "Origin") -> "Model | None":
+        """Return the model for what a recorder wrote."""
+        from analyzer.replay import find_model
+
+        if self._given is not None:
+            return self._given
+        key = origin.model, origin.model_sha256
+        if key not in self._found:
+            self._found[key] = find_model(*key, self._folders) if origin.model_sha256 else None
+        return self._found[key]
+
+    def report(self, origins: Sequence["Origin"]) -> None:
+        """Say where the model is not the recorded one."""
+        for origin in {(o.model, o.model_sha256): o for o in origins}.values():
+            model = self(origin)
+            digest = "" if model is None else model.sha256
+            if digest == origin.model_sha256:
+                continue
+            self.are_recorded = False
+            recorded = "recorded without a model"
+            if origin.model_sha256:
+                short = origin.model_sha256[:12]
+                recorded = f"recorded with model {origin.model!r} (sha256 {short})"
+            if model is None:
+                self.are_lacking = True
+                what = "which was not found; no labels: give it, or another, with --model"
+            else:
+                what = f"replayed with {model.name!r} (sha256 {digest[:12]})"
+            typer.echo(f"hearthlog: {recorded}, {what}", err=True)
+
+
+def _parse_rate(text: str) -> float | None:
+    try:
+        rate = None if text == _MAX_RATE else float(text)
+    except ValueError:
+        rate = math.nan
+    if rate is not None and not 0 < rate < math.inf:
+        wrong_use(f"--rate {text}: not a multiple of real time such as 1 or 0.5, nor {_MAX_RATE}")
+    return rate
+
+
+def _check_output(output: Path | None, source: Path) -> None:
+    """Refuse an output that exists, or that would get among what is replayed."""
+    from schemas.errors import LogError
+    from schemas.files import check_new
+
+    if output is None:
+        return
+    if output.suffix == ".rrd":
+        from analyzer.timeline import check_output
+
+        check_output(output)
+        return
+    if output.suffix == ".mcap":
+        wrong_use(f"--output {output}: name a folder, the logs in it have their names by time")
+    if output.resolve().is_relative_to(source.resolve()):
+        raise LogError(f"{output}: is in the folder that is replayed; choose another one")
+    if not output.is_dir() or any(output.iterdir()):
+        check_new(output)
+
+
+def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
+    from analyzer.replay import replay as replay_logs
+    from tools.cli.progress import share_done
+
+    def run(wanted: "Wanted") -> "Replay":
+        with share_done("replaying") as progress:
+            return replay_logs(logs, wanted, stop, progress)
+
+    if wanted.output is None or wanted.output.suffix != ".rrd":
+        return run(wanted)
+    from analyzer.timeline import save_timeline
+
+    output = wanted.output
+    with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
+        result = run(replace(wanted, output=Path(folder) / "logs"))
+        save_timeline(result.logs, output)
+    return replace(result, logs=[])
+
+
+def _print_output(result: "Replay", output: Path) -> None:
+    if output.suffix != ".rrd":
+        print(*result.logs, sep="\n")
+        return
+    print(output)
+    # Otherwise the viewer listens to the whole network.
+    print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(output))}")
+
+
+def _figures(result: "Replay", took: float) -> list[str]:
+    compared = result.compared
+    speed = result.seconds / max(took, 1e-9)
+    lines = [f"{result.seconds:.1f} s of sound in {took:.1f} s ({speed:.0f} times real time)"]
+    if result.labels:
+        same = compared.same_labels, compared.identical_labels, compared.labels
+        lines.append(f"{result.labels} labels, {_agreement(*same)}")
+    if result.segments:
+        identical = compared.identical_segments
+        same = identical, identical, compared.segments
+        lines.append(f"{result.segments} segments, {_agreement(*same)}")
+    if result.gaps:
+        lines.append(f"{result.gaps} gaps")
+    return lines
+
+
+def _agreement(same: int, identical: int, recorded: int) -> str:
+    """Say how much of what was recorded came out again."""
+    if not recorded:
+        return "none were recorded"
+    bits = "; bit for bit" if identical == recorded else ""
+    return f"{same} of the {recorded} recorded ones again ({same / recorded:.2%}){bits}"
+
+
+def _warnings(result: "Replay") -> list[str]:
+    lines = [
+        f"unfinished, replayed up to the last whole chunk: {path}" for path in result.unfinished
+    ]
+    if result.missing:
+        count = len(result.missing)
+        where = datetime.fromtimestamp(result.missing[0] / 1e9, UTC).isoformat(timespec="seconds")
+        more = f" (and {count - 1} more times)" if count > 1 else ""
+        lines.append(
+            f"sound before {where}{more} is not in these logs: the first second there has no "
+            "labels, and the segment that was open begins too late; add the logs before"
+        )
+    if result.interrupted:
+        lines.append(f"interrupted after {result.seconds:.1f} s of sound")
+    return lines
+
+
+def _as_json(result: "Replay", took: float) -> dict[str, object]:
+    found = asdict(result)
+    for key in ("sources", "logs", "unfinished"):
+        found[key] = [str(path) for path in found[key]]
+    found["compared"] = {k: v for k, v in found["compared"].items() if not k.startswith("_")}
+    found["compared"]["bit_for_bit"] = result.compared.identical
+    return {"seconds": result.seconds, "took_seconds": took} | found
