@@ -18,7 +18,7 @@ from schemas.logfile import time_span
 from schemas.messages import NANOSECONDS
 from schemas.topics import topic
 
-_REWOUND = 0
+_REWOUND = 60 * NANOSECONDS
 _EVER = (1 << 63) - 1
 _LONGEST_NAME = 200
 

@@ -192,6 +192,8 @@ class IntactReader:
         if opcode == Opcode.MESSAGE_INDEX:  # it is made anew
             return Found(offset, inner, None, wrong)
         raw = self.read(offset, inner - offset)
+        if wrong:
+            raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         if opcode == Opcode.ATTACHMENT:
             return Found(offset, inner, _attachment(raw), wrong)
         return Found(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)

@@ -253,7 +253,7 @@ class Salvage:
         if self._astray and isinstance(found.record, records.Message | Definition):
             raise McapError("what is in a damaged chunk is not proved")
         if isinstance(found.record, records.Message) and self._has_chunks:
-            if searching:
+            if searching or self._ended:
                 raise McapError("messages are in chunks here")
             if self._reader.like_message_index(found.offset):
                 raise McapError("a message index has become a message")

@@ -95,6 +95,14 @@ def foreign(tmp_path_factory):
         "/flag": [message("std_msgs/msg/Bool", data=bool(n)) for n in range(3)],
         "/nothing": [message("std_msgs/msg/Empty") for _ in range(3)],
         "/time": [message("builtin_interfaces/msg/Time", sec=-1, nanosec=5)] * 3,
+        "/floats": [
+            message(
+                "sensor_msgs/msg/ChannelFloat32",
+                name="",
+                values=np.array([-0.0, 1 / 3, value, -1e-30, -10], np.float32),
+            )
+            for value in (0.0, np.nan, -np.inf)
+        ],
         "/stamps": [
             message("rosgraph_msgs/msg/Clock", clock=stamp),
         ],

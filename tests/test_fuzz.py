@@ -1,4 +1,4 @@
-"""Whatever a file holds, whoever reads it gets data or one clear error, soon and in little memory."""
+"""Whatever a file holds, who reads it gets data or one clear error, soon and in little memory."""
 
 import struct
 import zlib
@@ -23,7 +23,8 @@ from schemas.messages import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 NUMBERS = st.one_of(
-    st.sampled_from([0, 1, 21, 22, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1, 1 << 63, (1 << 64) - 1]),
+    st.sampled_from([0, 1, 21, 22, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1]),
+    st.sampled_from([(1 << 63) - 1, 1 << 63, (1 << 64) - 1]),
     st.integers(0, (1 << 64) - 1),
     st.integers(0, 1 << 20),
 )
@@ -31,14 +32,14 @@ PLACES = st.integers(0, 1 << 24)  # taken modulo what there is
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory, day, model_file) -> bytes:
+def log(tmp_path_factory, day, model_file):
     """A real log of 30 seconds with a gap, in four chunks."""
     folder = tmp_path_factory.mktemp("log")
     samples, rate = soundfile.read(day, frames=30 * 16_000, dtype="int16")
     soundfile.write(folder / "sound.wav", samples, rate)
     source = LossySource(FileSource([folder / "sound.wav"], START), {1: 7})
     (path,) = record(Settings(output=folder, model=model_file), source, Flag()).logs
-    return path.read_bytes()
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +212,7 @@ FEW = settings(
 @FEW
 @given(mutations=st.lists(BYTES, min_size=1, max_size=5), name=NAMES)
 def test_a_file_whose_bytes_were_changed(log, victim, mutations, name):
-    data = bytearray(log)
+    data = bytearray(log.read_bytes())
     of_bytes(data, mutations)
     assert not victim.read(bytes(data), name)
 
@@ -219,7 +220,7 @@ def test_a_file_whose_bytes_were_changed(log, victim, mutations, name):
 @FEW
 @given(mutations=st.lists(RECORDS, min_size=1, max_size=5), name=NAMES)
 def test_a_file_whose_records_were_changed(log, victim, mutations, name):
-    records = split(log)
+    records = split(log.read_bytes())
     of_records(records, mutations)
     assert not victim.read(_written(records), name)
 
@@ -227,7 +228,7 @@ def test_a_file_whose_records_were_changed(log, victim, mutations, name):
 @FEW
 @given(mutations=st.lists(CHUNKS, min_size=1, max_size=3), name=NAMES)
 def test_a_file_whose_chunks_were_changed_and_have_the_right_checksum(log, victim, mutations, name):
-    records = split(log)
+    records = split(log.read_bytes())
     of_records(records, mutations)
     assert not victim.read(_written(records), name)
 
@@ -235,7 +236,7 @@ def test_a_file_whose_chunks_were_changed_and_have_the_right_checksum(log, victi
 @FEW
 @given(place=PLACES, length=NUMBERS, name=NAMES)
 def test_a_file_with_a_record_that_lies_about_its_length(log, victim, place, length, name):
-    records, data = split(log), bytearray(log)
+    records, data = split(log.read_bytes()), bytearray(log.read_bytes())
     start = 8
     for raw in records[: place % len(records)]:
         start += HEAD.size + len(raw.content)
@@ -246,7 +247,8 @@ def test_a_file_with_a_record_that_lies_about_its_length(log, victim, place, len
 @FEW
 @given(tail=st.lists(BYTES, max_size=2), content=st.binary(max_size=300), name=NAMES)
 def test_a_file_that_consists_of_anything(log, victim, tail, content, name):
-    data = bytearray(log[:8] + content + log[-3000:])
+    data = log.read_bytes()
+    data = bytearray(data[:8] + content + data[-3000:])
     of_bytes(data, tail)
     assert not victim.read(bytes(data), name)
 

@@ -485,6 +485,17 @@ def test_a_hole_between_clips_is_a_gap(real_frames, model_file, tmp_path):
     assert len(labels) == len(read(tmp_path / "alone", "label"))
 
 
+def test_clips_of_a_sound_card_that_runs_slow_are_one_sound_on_their_clock(tmp_path):
+    sound = np.ones((16_000, 1), np.int16)
+    slow = SECOND + 50_000  # 50 ppm
+    clips = write_clips(tmp_path / "clips.mcap", [(START + i * slow, sound) for i in range(30)])
+    replay(clips, tmp_path / "again", kind="audio")
+    assert read(tmp_path / "again", "gap") == []
+    frames, stamps, _ = features(tmp_path / "again")
+    assert len(frames) == 600
+    assert np.abs(stamps - START - frames * slow / 20).max() < 50_000
+
+
 def test_a_part_of_clips_is_as_in_the_whole(real_frames, model_file, tmp_path):
     sound = (real_frames.ravel()[: 30 * 16_000] * 32767).astype(np.int16)[:, np.newaxis]
     clips = write_clips(tmp_path / "clips.mcap", pieces(sound, 16_000, [70_001] * 8))

@@ -9,7 +9,7 @@ from typing import Any
 
 from mcap.records import Channel
 
-from analyzer.doctor.contract import Contract, place_of, type_of
+from analyzer.doctor.contract import NAME, Contract, place_of, type_of
 from analyzer.doctor.data import ATTACHMENTS, Data
 from analyzer.doctor.findings import DISTRUST, Findings
 from recorder import features
@@ -19,7 +19,6 @@ from schemas.rosbag2 import METADATA as ROSBAG2
 from schemas.topics import Topic, topics_of
 from schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
 
-_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
 _CONFIGURATION, _MODEL_CARD = ATTACHMENTS
@@ -57,8 +56,8 @@ class About:
         self._check_name()
         if not self._data.counts:
             return
-        for microphone, infos in self._contract.infos.items():
-            self._check_info(microphone, infos)
+        for microphone, info in self._contract.infos.items():
+            self._check_info(microphone, info)
         self._check_topics()
         if self._finished:
             self._check_rosbag2()
@@ -92,7 +91,7 @@ class About:
     def _check_name(self) -> None:
         """Compare the name, if it is one as the recorder gives it, with the contents."""
         path = self._findings.path
-        named = _NAME.fullmatch(path.name)
+        named = NAME.fullmatch(path.name)
         if named is None:
             return
         records = self._data.metadata.get(METADATA, [])
@@ -111,10 +110,7 @@ class About:
         if _FOLDERS.fullmatch(folders) and folders != f"{start:%Y/%m/%d}":
             self._error("name", f"the folder says {folders}, the first message {start:%Y/%m/%d}")
 
-    def _check_info(self, microphone: str, infos: list[dict[str, Any]]) -> None:
-        info = infos[0]
-        if len(infos) > 1:
-            self._error("info-twice", f"{microphone}: there is more than one AudioStreamInfo")
+    def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
         expected: dict[str, Any] = {
             "sample_rate": features.SAMPLE_RATE,
             "frame_seconds": features.FRAME_SAMPLES / features.SAMPLE_RATE,
@@ -136,7 +132,7 @@ class About:
     def _check_topics(self) -> None:
         """Compare the channels with those that a recorder writes."""
         expected: dict[str, Topic] = {}
-        for microphone, (info, *_) in self._contract.infos.items():
+        for microphone, info in self._contract.infos.items():
             classes = list(info["labels"]) or None
             found = topics_of(microphone, list(info["feature_names"]), classes)
             expected |= {topic.name: topic for topic in found}
@@ -204,9 +200,11 @@ class About:
             return
         channels = self._data.definitions.channels
         actual = {channel.topic: self._data.counts[i] for i, channel in channels.items()}
+        counts |= dict.fromkeys(actual.keys() - counts.keys(), 0)
+        actual |= dict.fromkeys(counts.keys() - actual.keys(), 0)
         if counts != actual or total != sum(actual.values()):
             wrong = [topic for topic in actual if counts.get(topic) != actual[topic]]
-            what = ", ".join(sorted(wrong)) or "in all"
+            what = ", ".join(sorted(map(str, wrong))) or "in all"
             self._error("rosbag2", f"metadata {ROSBAG2} has other counts than the file: {what}")
         if span != self._data.span:
             self._error("rosbag2", f"metadata {ROSBAG2} has other times than the file")

@@ -11,7 +11,7 @@ from mcap.records import Footer, Metadata
 
 from analyzer.doctor.about import About
 from analyzer.doctor.batch import Batch
-from analyzer.doctor.contract import Contract
+from analyzer.doctor.contract import ALWAYS, NAME, Contract, place_of
 from analyzer.doctor.data import Data
 from analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from analyzer.doctor.frames import Frames
@@ -25,6 +25,7 @@ from schemas.logfile import FOOTER_SIZE, LogFile
 from schemas.records import HEAD, MAGIC, parse
 from schemas.writer import METADATA
 
+LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
 _METADATA_SIZE = 1 << 20  # bytes
 _ENCODINGS = ("ros2msg", "ros2idl")
@@ -108,7 +109,7 @@ def _examine(source: Source, examined: Examined, progress: Progress) -> None:
     elif finished:
         findings.error("footer", "there is no Footer at the end", RECOVER)
     else:
-        _say_unfinished(source, findings, active=active)
+        _say_unfinished(findings, active=active)
     if isinstance(contract, Contract):
         contract.finish()
         whole = data.whole and not walk.damaged
@@ -129,17 +130,31 @@ def _known(path: Path, source: Source) -> _Known:
         start = footer.summary_start
     try:
         with LogFile(path) as file:
-            ours = file.header is not None and file.header.library == "hearthlog"
-            for place in file.places:
-                if not ours and place.opcode == Opcode.METADATA and place.length < _METADATA_SIZE:
-                    record = file.record(place)
-                    ours = isinstance(record, Metadata) and record.name == METADATA
+            ours = _is_ours(file)
             places = [*file.chunks["offset"].tolist(), *(place.offset for place in file.places)]
     except LogError:
         places, ours = [], False
     if HEAD.size < start < source.size:
         places += [start]
-    return _Known(sorted(places), start, ours and not _LAYER.fullmatch(path.name))
+    return _Known(sorted(places), start, ours)
+
+
+def _is_ours(file: LogFile) -> bool:
+    """Tell whether a recorder wrote this file, and not what merges logs or cuts parts out."""
+    if _LAYER.fullmatch(file.path.name):
+        return False
+    records: list[dict[str, str]] = []
+    for place in file.places:
+        if place.opcode == Opcode.METADATA and place.length < _METADATA_SIZE and len(records) < 2:
+            record = file.record(place)
+            if isinstance(record, Metadata) and record.name == METADATA:
+                records += [record.metadata] if record.metadata not in records else []
+    made = file.header is not None and file.header.library == LIBRARY
+    if NAME.fullmatch(file.path.name):
+        return made or len(records) > 0
+    kinds = {place_of(channel.topic)[1] for channel in file.channels.values()}
+    part = bool(file.channels) and not kinds >= ALWAYS
+    return (made or len(records) > 0) and len(records) < 2 and not part
 
 
 def _walk(
@@ -193,13 +208,13 @@ def _check_end(source: Source, findings: Findings) -> None:
         findings.error("after-end", what, REINDEX, offset=offset + len(MAGIC))
 
 
-def _say_unfinished(source: Source, findings: Findings, *, active: bool) -> None:
-    what = "is unfinished"
+def _say_unfinished(findings: Findings, *, active: bool) -> None:
     if active:
         advice = "unless a recorder is writing it, `hearthlog recover` completes it"
-        findings.warning("unfinished", what, advice)
+        findings.warning("unfinished", "is unfinished", advice)
     else:
-        findings.error("cut", f"{what}: it was cut off", "`hearthlog recover` completes it")
+        what = "is unfinished: it was cut off"
+        findings.error("cut", what, "`hearthlog recover` completes it")
 
 
 class _Plain:

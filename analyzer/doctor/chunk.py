@@ -120,7 +120,7 @@ class Chunk:
         if end != len(records):
             self._error("chunk-records", "the last record of a chunk is longer than the chunk")
             self.whole = False
-        new = {}
+        new: dict[int, int] = {}
         for opcode, start, length in others:
             content = records[start + HEAD.size : start + HEAD.size + length]
             new |= self._other(opcode, start, content)

@@ -30,8 +30,11 @@ TYPES = {
     SEGMENT: messages.SEGMENT,
     GAP: messages.GAP,
 }
+ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
+NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
 SHARED = {DIAGNOSTICS: messages.DIAGNOSTICS, ROSOUT: messages.LOG}
 _TOPIC = re.compile(r"/([a-z](?:_?[a-z0-9])*)/(\w+)")
+_STAMP = "header.stamp"
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _CLOCK_SET = "the clock was set"
 _SUM_TOLERANCE = 1e-4
@@ -53,18 +56,20 @@ class Contract:
 
     Attributes
     ----------
-    infos : dict of str to list of dict
-        By microphone: the `AudioStreamInfo` messages, field by field.
+    infos : dict of str to dict
+        By microphone: the `AudioStreamInfo`, field by field.
     frames : dict of str to Frames
         By microphone.
     """
 
     def __init__(self, data: Data, findings: Findings) -> None:
-        self.infos: dict[str, list[dict[str, Any]]] = {}
+        self.infos: dict[str, dict[str, Any]] = {}
         self.frames: dict[str, Frames] = {}
         self._data = data
         self._findings = findings
         self._last: int | None = None
+        self._parts: dict[str, list[int]] = {}  # where further ones begin, in a merged log
+        self._named = NAME.fullmatch(findings.path.name) is not None
 
     def add(self, batch: Batch) -> None:
         """Take the next messages of the file."""
@@ -83,7 +88,9 @@ class Contract:
         for kind in ("info", *TYPES, *SHARED):  # the rest builds on what the first says
             for columns in by_kind.pop(kind, ()):
                 self._check(kind, columns)
-        for frames in self.frames.values():
+        for microphone, frames in self.frames.items():
+            for time in self._parts.pop(microphone, []):
+                frames.begin_anew(time)
             frames.settle(self._last)
 
     def finish(self) -> None:
@@ -120,6 +127,7 @@ class Contract:
             lambda i: f"log time runs backwards by {(before[i] - times[i]) / 1e9:.3f} s",
         )
         late = heads["publish_time"] - times
+        late[self._may_be_older(heads["channel"])] = 0
         report(
             "publish-time",
             late != 0,
@@ -127,6 +135,18 @@ class Contract:
             lambda i: f"publish time is not log time, but {late[i] / 1e9:+.3f} s later",
         )
         self._last = int(times[-1])
+
+    def _may_be_older(self, channels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        """Tell which messages may be older than their log time: what `cut` puts at the beginning.
+
+        A log that bears the name of a recorder's has none of these.
+        """
+        infos = [
+            identity
+            for identity, channel in self._data.definitions.channels.items()
+            if place_of(channel.topic)[1] == "info"
+        ]
+        return np.isin(channels, [] if self._named else infos)
 
     def _check_begin(self, heads: NDArray[np.void]) -> None:
         channel = self._data.definitions.channels.get(int(heads["channel"][0]))
@@ -139,12 +159,11 @@ class Contract:
     def _check(self, kind: str, columns: Columns) -> None:
         microphone = place_of(columns.topic)[0]
         self._check_stamps(kind, columns, microphone)
-        if kind == "info":
-            rows = [dict(zip(columns.fields, row, strict=True)) for row in _rows(columns)]
-            self.infos.setdefault(microphone, []).extend(rows[:2])
         if not microphone:
             return
-        info = next(iter(self.infos.get(microphone, [])), None)
+        if kind == "info":
+            self._check_infos(columns, microphone)
+        info = self.infos.get(microphone)
         if microphone not in self.frames:
             every = statistics_every(self._data)
             labelled = info is not None and len(info["labels"]) > 0
@@ -161,12 +180,27 @@ class Contract:
         if rows is not None:
             self.frames[microphone].add(kind, rows)
 
+    def _check_infos(self, columns: Columns, microphone: str) -> None:
+        """Keep what a file says of itself; where it says so again another recording begins."""
+        for row, values in enumerate(_rows(columns)):
+            info = dict(zip(columns.fields, values, strict=True)) | {_STAMP: 0}
+            time = int(columns.log_times[row])
+            if microphone not in self.infos:
+                self.infos[microphone] = info
+            elif self._named or info != self.infos[microphone]:
+                what = f"{columns.topic}: another AudioStreamInfo in one log"
+                self._findings.error("info-twice", what, DISTRUST, time=time)
+            elif microphone in self.frames:
+                self._parts.setdefault(microphone, []).append(time)
+
     def _check_stamps(self, kind: str, columns: Columns, microphone: str) -> None:
         times = columns.log_times
-        stamps = columns["stamp" if kind == ROSOUT else "header.stamp"]
+        stamps = columns["stamp" if kind == ROSOUT else _STAMP]
         if kind in {SEGMENT, GAP}:
             stamps = stamps + columns["duration"]
         late = times - stamps
+        if kind == "info" and not self._named:
+            late = np.minimum(late, 0)
         self._findings.rows(
             "stamp",
             late != 0,
@@ -179,7 +213,7 @@ class Contract:
             names = columns["header.frame_id"]
             self._findings.rows(
                 "frame-id",
-                names != microphone,
+                np.asarray(names != microphone, bool),
                 times,
                 lambda i: f"{columns.topic}: frame_id is {names[i]!r}",
             )
@@ -267,17 +301,17 @@ class Contract:
         lost, reasons = columns["frames_lost"], columns["reason"]
         report(
             "gap",
-            durations == durations,
+            np.ones(len(times), bool),
             times,
             lambda i: (
                 f"{columns.topic}: {durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: "
                 f"{reasons[i]}"
             ),
             level="warning",
-            advice="",
         )
         moved = np.array([reason.startswith(_CLOCK_SET) for reason in reasons], bool)
-        differ = np.abs(durations / FRAME_NANOSECONDS - lost.astype(np.float64)) > 1
+        frames = durations.astype(np.float64) / FRAME_NANOSECONDS
+        differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
         report(
             "gap-duration",
             differ & ~moved & (durations >= 0),
@@ -304,7 +338,7 @@ def _rows(columns: Columns) -> Any:
 
 def _of_frames(kind: str, columns: Columns) -> Int64 | None:
     """Return what `Frames.add` wants of a kind, None if that is nothing."""
-    times, stamps = columns.log_times, columns["header.stamp"]
+    times, stamps = columns.log_times, columns[_STAMP]
     if kind == GAP:
         parts = times, stamps, columns["frames_lost"]
     elif kind == SEGMENT:

@@ -102,10 +102,10 @@ class Findings:
         times: NDArray[np.int64],
         what: Callable[[int], str],
         level: Level = "error",
-        advice: str = DISTRUST,
     ) -> None:
         """Note the rows of a column that break a rule; `what` describes one of them."""
         places = np.flatnonzero(wrong)
+        advice = DISTRUST if level == "error" else ""
         for row in places[:_SHOWN].tolist():
             time = int(times[row])
             self._add(Finding(self.path, level, rule, what(row), advice, None, time))

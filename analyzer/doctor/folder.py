@@ -61,10 +61,10 @@ def _check_overlaps(files: Sequence[Examined]) -> None:
 
 
 def _set_back(file: Examined) -> bool:
-    return any(_ends_back(frames) for frames in file.frames.values())
+    return any(_begins_back(frames) for frames in file.frames.values())
 
 
-def _ends_back(frames: Frames) -> bool:
+def _begins_back(frames: Frames) -> bool:
     """Tell whether a file begins with the setting back of the clock."""
     return frames.gap_before is not None and frames.gap_before[1] < frames.gap_before[0]
 
@@ -75,12 +75,13 @@ def _check_frames(microphone: str, files: Sequence[Examined]) -> None:
     for file in files:
         if (last := file.frames[microphone].last) is not None:
             by_end[last[1] + FRAME_NANOSECONDS] = file
-    for previous, file in pairwise(files):
+    for earlier, file in pairwise(files):
         frames = file.frames[microphone]
         if frames.first is None or frames.first[0] == 0:
             continue
-        if _ends_back(frames) and frames.gap_before is not None:
-            previous = by_end.get(frames.gap_before[0], previous)
+        previous = earlier
+        if _begins_back(frames) and frames.gap_before is not None:
+            previous = by_end.get(frames.gap_before[0], earlier)
         last = previous.frames[microphone].last
         if last is None:
             continue

@@ -1,5 +1,8 @@
 """Frame numbers, stamps and gaps of one microphone: what the messages must say together."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +19,29 @@ _GAP_TOLERANCE = 1_000_000  # ns
 _NONE = np.empty((0, 3), np.int64)
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
+
+
+class _Steps(NamedTuple):
+    """The way to each frame from the one before it; arrays of one row a frame.
+
+    Attributes
+    ----------
+    rows : np.ndarray [shape=(n, 3)]
+        Log time, frame and stamp.
+    known : np.ndarray [shape=(n,)], bool
+        Whether there is one before it.
+    numbers, elapsed : np.ndarray [shape=(n,)], int64
+        By how much the frame number and the stamp (ns) have grown.
+    gaps, lost : np.ndarray [shape=(n,)], int64
+        How many gaps lie between, and the frames that they lost.
+    """
+
+    rows: Int64
+    known: NDArray[np.bool_]
+    numbers: Int64
+    elapsed: Int64
+    gaps: Int64
+    lost: Int64
 
 
 class Frames:
@@ -60,6 +86,7 @@ class Frames:
         self._heard = 0  # frames since then
         self._segment_end: int | None = None
         self._gap_ends: Int64 = np.empty(0, np.int64)
+        self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
 
     def add(self, kind: str, rows: Int64) -> None:
         """Add messages of one kind [shape=(n, 3)], in the order of their log times."""
@@ -69,6 +96,11 @@ class Frames:
         """Take note that messages are missing here, because the file is damaged."""
         self.finish()
         self._pending.clear()
+        self._previous = self._run = self._segment_end = None
+
+    def begin_anew(self, time: int) -> None:
+        """Take note that from a log time on this is another recording, or its next log."""
+        self.settle(time)
         self._previous = self._run = self._segment_end = None
 
     def finish(self) -> None:
@@ -101,89 +133,86 @@ class Frames:
 
     def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
         """Compare frame numbers, stamps and gaps; return at which frames a known gap ends."""
-        if not len(rows):
-            if len(gaps):  # of the next frame
-                self._pending[GAP] = [gaps, *self._pending.get(GAP, [])]
-            return np.empty(0, bool)
-        times, frames, stamps = rows.T
-        following = np.searchsorted(stamps, gaps[:, 0])
+        following = np.searchsorted(rows[:, 2], gaps[:, 0])
         waiting = following == len(rows)
-        if waiting.any():
+        if waiting.any():  # for the next frame
             self._pending[GAP] = [gaps[waiting], *self._pending.get(GAP, [])]
+        if not len(rows):
+            self._begins = np.empty(0, bool)
+            return self._begins
         gaps, following = gaps[~waiting], following[~waiting]
+        self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
         count = np.bincount(following, minlength=len(rows))
         lost = np.zeros(len(rows), np.int64)
         np.add.at(lost, following, gaps[:, 2])
-        self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
         if self.first is None:
-            self.first = int(frames[0]), int(stamps[0])
+            self.first = int(rows[0, 1]), int(rows[0, 2])
             self.lost_before = int(lost[0])
             if count[0]:
                 self.gap_before = int(gaps[0, 1]), int(gaps[0, 0])
-        before = (int(frames[0]) - 1, int(stamps[0])) if self._previous is None else self._previous
-        steps = np.diff(frames, prepend=before[0])
-        elapsed = np.diff(stamps, prepend=before[1])
+        # Before the first frame of which the one before is not known, one is made up.
+        before = self._previous or (int(rows[0, 1]) - 1, int(rows[0, 2]))
         known = np.ones(len(rows), bool)
         known[0] = self._previous is not None
-        report = self._findings.rows
+        numbers = np.diff(rows[:, 1], prepend=before[0])
+        elapsed = np.diff(rows[:, 2], prepend=before[1])
+        steps = _Steps(rows, known, numbers, elapsed, count, lost)
+        self._check_steps(steps)
+        self._check_gaps(steps, gaps, following)
+        self._begins = (count > 0) | (numbers != 1) | ~known
+        self._check_rate(rows)
+        self._previous = self.last = int(rows[-1, 1]), int(rows[-1, 2])
+        return (count > 0) | (rows[:, 1] == 0)
+
+    def _check_steps(self, steps: _Steps) -> None:
+        """Check numbers and stamps, and that a gap speaks of every jump."""
+        rows, known, numbers, elapsed, gaps, lost = steps
+        times, frames, _ = rows.T
+        report = self._report
         report(
             "frame-order",
-            known & (steps <= 0),
+            known & (numbers <= 0),
             times,
-            lambda i: f"{self._name}: frame {frames[i]} follows frame {frames[i] - steps[i]}",
+            lambda i: f"frame {frames[i]} follows frame {frames[i] - numbers[i]}",
         )
         report(
             "frame-jump",
-            known & (steps > 1) & (count == 0),
+            known & (numbers > 1) & (gaps == 0),
             times,
-            lambda i: (
-                f"{self._name}: {steps[i] - 1} frames are missing before frame {frames[i]}, and no "
-                "gap says so"
-            ),
+            lambda i: f"frame {frames[i]} comes after {numbers[i] - 1} others that no gap explains",
         )
         report(
             "gap-frames",
-            known & (count > 0) & (steps > 0) & (steps != lost + 1),
+            known & (gaps > 0) & (numbers > 0) & (numbers != lost + 1),
             times,
-            (
-                lambda i: (
-                    f"{self._name}: a gap says that {lost[i]} frames were lost, and the numbers "
-                    f"jump by {steps[i] - 1}"
-                )
-            ),
+            lambda i: f"a gap of {lost[i]} frames where the numbers jump by {numbers[i] - 1}",
         )
-        wrong = known & (steps == 1) & (count == 0)
-        wrong &= np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
+        wrong = np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
         report(
             "stamp-step",
-            wrong,
+            known & (numbers == 1) & (gaps == 0) & wrong,
             times,
-            lambda i: (
-                f"{self._name}: frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before"
-            ),
+            lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
         )
-        alone = count[following] == 1
-        early = stamps[following] - elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
-        late = stamps[following] - gaps[:, 0]
-        wrong = (np.abs(early) > _GAP_TOLERANCE) & known[following]
-        wrong = alone & (wrong | (np.abs(late) > _GAP_TOLERANCE))
-        report(
-            "gap-times",
-            wrong,
-            gaps[:, 0],
-            lambda i: f"{self._name}: a gap does not lie between the frames before and behind it",
-        )
-        begins = (count > 0) | (steps != 1)
-        begins[0] |= self._previous is None
-        self._check_rate(rows, begins)
-        self._begins, known_start = begins, (count > 0) | (frames == 0)
-        self._previous = self.last = int(frames[-1]), int(stamps[-1])
-        return known_start
 
-    def _check_rate(self, rows: Int64, begins: NDArray[np.bool_]) -> None:
+    def _check_gaps(self, steps: _Steps, gaps: Int64, following: NDArray[np.intp]) -> None:
+        """Check that gaps begin where the frame before them ends, and end where the next begins."""
+        alone = steps.gaps[following] == 1
+        stamps = steps.rows[following, 2]
+        early = stamps - steps.elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
+        wrong = steps.known[following] & (np.abs(early) > _GAP_TOLERANCE)
+        wrong |= np.abs(stamps - gaps[:, 0]) > _GAP_TOLERANCE
+        self._report(
+            "gap-times",
+            alone & wrong,
+            gaps[:, 0],
+            lambda _: "a gap does not lie between the frames before and behind it",
+        )
+
+    def _check_rate(self, rows: Int64) -> None:
         """Compare stamps with frame numbers, from the last gap on."""
         times, frames, stamps = rows.T
-        starts = np.flatnonzero(begins)
+        starts = np.flatnonzero(self._begins)
         if len(starts):
             self._run = int(frames[starts[-1]]), int(stamps[starts[-1]])
         if self._run is None:
@@ -233,29 +262,28 @@ class Frames:
         self, features: Int64, rows: Int64, kind: str, wanted: NDArray[np.bool_] | None
     ) -> None:
         """Compare messages of another kind with the features of the same frames."""
-        report = self._findings.rows
-        frames, stamps = rows[:, 1], rows[:, 2]
+        times, frames, stamps = rows.T
+        expected = features if wanted is None else features[wanted]
+        extra = ~np.isin(frames, expected[:, 1])
+        report = self._report
         report(
             "frame-order",
             np.diff(frames, prepend=frames[:1] - 1) <= 0,
-            rows[:, 0],
-            lambda i: f"{self._name}: {kind} of frame {frames[i]} follow a later frame",
+            times,
+            lambda i: f"{kind} of frame {frames[i]} follow a later frame",
         )
-        expected = features if wanted is None else features[wanted]
-        extra = ~np.isin(frames, expected[:, 1])
         report(
             f"{kind}-frames",
             extra,
-            rows[:, 0],
-            lambda i: f"{self._name}: there should be no {kind} of frame {frames[i]}",
+            times,
+            lambda i: f"there should be no {kind} of frame {frames[i]}",
         )
         if wanted is not None:
-            missing = ~np.isin(expected[:, 1], frames)
             report(
                 f"{kind}-frames",
-                missing,
+                ~np.isin(expected[:, 1], frames),
                 expected[:, 0],
-                lambda i: f"{self._name}: there is no {kind} of frame {expected[i, 1]}",
+                lambda i: f"there is no {kind} of frame {expected[i, 1]}",
             )
         order = np.argsort(expected[:, 1], kind="stable")
         same = np.flatnonzero(~extra)
@@ -265,10 +293,8 @@ class Frames:
         report(
             "frame-stamp",
             wrong,
-            rows[:, 0],
-            lambda i: (
-                f"{self._name}: {kind} of frame {frames[i]} have another stamp than its features"
-            ),
+            times,
+            lambda i: f"{kind} of frame {frames[i]} have another stamp than its features",
         )
 
     def _check_segments(self, rows: Int64) -> None:
@@ -278,25 +304,25 @@ class Frames:
         ends, starts = rows[:, 0], rows[:, 1]
         first = int(starts[0]) if self._segment_end is None else self._segment_end
         before = np.concatenate([[first], ends[:-1]])
-        report = self._findings.rows
-        report(
+        late = starts - before
+        self._report(
             "segment-overlap",
-            starts < before,
+            late < 0,
             ends,
-            lambda i: (
-                f"{self._name}: a segment begins {(before[i] - starts[i]) / 1e9:.3f} s before the last "
-                "one has ended"
-            ),
+            lambda i: f"a segment begins {-late[i] / 1e9:.3f} s before the last one has ended",
         )
         gaps = np.searchsorted(self._gap_ends, starts, "right")
         gaps -= np.searchsorted(self._gap_ends, before, "right")
-        report(
+        self._report(
             "segment-hole",
-            (starts > before) & (gaps <= 0),
+            (late > 0) & (gaps <= 0),
             ends,
-            lambda i: (
-                f"{self._name}: nothing is said of {(starts[i] - before[i]) / 1e9:.3f} s before a segment"
-            ),
+            lambda i: f"nothing is said of the {late[i] / 1e9:.3f} s before a segment",
         )
         self._segment_end = int(ends[-1])
         self._gap_ends = self._gap_ends[self._gap_ends > self._segment_end]
+
+    def _report(
+        self, rule: str, wrong: NDArray[np.bool_], times: Int64, what: Callable[[int], str]
+    ) -> None:
+        self._findings.rows(rule, wrong, times, lambda row: f"{self._name}: {what(row)}")

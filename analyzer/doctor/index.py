@@ -58,7 +58,7 @@ class Summary:
         self._copies: dict[type, dict[int, McapRecord]] = {Schema: {}, Channel: {}}
         self._unseen = {opcode: dict(places) for opcode, places in data.places.items()}
         self._indexed: set[int] = set()  # channels of which the chunk indexes speak
-        self._statistics = 0
+        self._statistics: list[tuple[int, Statistics]] = []
         self._crc = 0
 
     def add(self, record: Record) -> None:
@@ -101,6 +101,9 @@ class Summary:
                 self._error("summary-crc", what, record.offset)
         self._check_offsets()
         self._check_complete(record.offset)
+        if self._whole:
+            for offset, statistics in self._statistics:
+                self._check_statistics(offset, statistics)
 
     def _error(self, rule: str, what: str, offset: int) -> None:
         self._findings.error(rule, what, REINDEX, offset=offset)
@@ -132,9 +135,14 @@ class Summary:
 
     def _copy(self, found: Any, originals: Any, record: Record) -> None:
         self._copies[type(found)][found.id] = found
-        if self._whole and originals.get(found.id) != found:
-            what = f"{name_of(record.opcode)} {found.id} is not the one of the data section"
-            self._error("summary-copy", what, record.offset)
+        if not self._whole or originals.get(found.id) == found:
+            return
+        name = f"{name_of(record.opcode)} {found.id}"
+        if found.id in originals:
+            self._error("summary-copy", f"{name} is not that of the data section", record.offset)
+        else:
+            what = f"{name} is in the summary alone"
+            self._findings.warning("summary-only", what, offset=record.offset)
 
     def _add_index(self, record: Record) -> None:
         """Compare an index record with what is at the place of which it speaks."""
@@ -180,30 +188,33 @@ class Summary:
         return not found.message_index_offsets
 
     def _add_statistics(self, found: Statistics, offset: int) -> None:
-        self._statistics += 1
-        if self._statistics > 1:
+        self._statistics.append((offset, found))
+        if len(self._statistics) > 1:
             self._error("statistics", "more than one record of statistics", offset)
-        data, counts = self._data, found.channel_message_counts
-        if counts and not data.definitions.channels.keys() <= self._copies[Channel].keys():
+            self._statistics.pop()
+        channels = self._data.definitions.channels.keys()
+        if found.channel_message_counts and not channels <= self._copies[Channel].keys():
             what = "statistics with counts stand before copies of all channels"
             self._error("statistics-channels", what, offset)
-        if not self._whole:
-            return
+
+    def _check_statistics(self, offset: int, found: Statistics) -> None:
+        data = self._data
         start, end = data.span or (0, 0)
-        wanted = {
+        schemas = (data.definitions.schemas.keys() | self._copies[Schema].keys()) - {0}
+        channels = data.definitions.channels.keys() | self._copies[Channel].keys()
+        wanted: dict[str, Any] = {
             "message_count": sum(data.counts.values()),
-            "schema_count": len(data.definitions.schemas),
-            "channel_count": len(data.definitions.channels),
+            "schema_count": len(schemas),
+            "channel_count": len(channels),
             "attachment_count": len(data.places[Opcode.ATTACHMENT_INDEX]),
             "metadata_count": len(data.places[Opcode.METADATA_INDEX]),
             "chunk_count": len(data.places[Opcode.CHUNK_INDEX]),
             "message_start_time": start,
             "message_end_time": end,
         }
-        if counts:
+        if counts := found.channel_message_counts:
             found.channel_message_counts = {k: n for k, n in counts.items() if n}
-            wanted_counts = {k: n for k, n in data.counts.items() if n}
-            wanted |= {"channel_message_counts": wanted_counts}  # type: ignore[dict-item]
+            wanted["channel_message_counts"] = {k: n for k, n in data.counts.items() if n}
         differing = [
             f"{name} {getattr(found, name)} and should say {value}"
             for name, value in wanted.items()

@@ -77,12 +77,10 @@ def array_of(values: NDArray[Any], field: Field) -> pa.Array:
     kind = type_of(field)
     if field.elements or (field.size is not None and field.type == "string"):
         return pa.array(values.tolist(), kind)
+    if field.size is None and field.type in {TIME, DURATION}:
+        return pa.array(values).cast(kind)
     if field.size is None:
-        return (
-            pa.array(values, pa.int64()).cast(kind)
-            if field.type in {TIME, DURATION}
-            else (pa.array(values, kind))
-        )
+        return pa.array(values, kind)
     if values.dtype == object:
         ends = np.cumsum([len(row) for row in values])
         flat = np.concatenate(list(values))

@@ -18,7 +18,8 @@ def doctor(
 ) -> None:
     """Check logs: MCAP, the contract, and how they follow each other.
 
-    Exit status 1: a log is damaged, or not what hearthlog writes; 3: one has gaps, or is unfinished.
+    Exit status 1: a log is damaged, or not as hearthlog writes them; 3: one has gaps, or is
+    unfinished.
     """
     from analyzer.doctor import examine
     from tools.cli.progress import share_done
