@@ -19,9 +19,9 @@ from conftest import HEARTHLOG
 from logs import features, read
 from lossy import LossySource
 
-from analyzer.player import Wanted
-from analyzer.replay import LogSet, find_model
-from analyzer.replay import replay as replay_logs
+from analyzer.replay.player import Wanted
+from analyzer.replay.replay import LogSet, find_model
+from analyzer.replay.replay import replay as replay_logs
 from analyzer.train import train_model
 from models.modelfile import load_model, save_model
 from recorder.config import Settings

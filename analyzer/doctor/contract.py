@@ -238,8 +238,8 @@ class Contract:
         bad = ~np.isfinite(values).all(axis=1)
         report("finite", bad, times, lambda _: f"{columns.topic}: {field} is not finite")
         if field == "std":
-            bad = (values < 0).any(axis=1)
-            report("negative-std", bad, times, lambda _: f"{columns.topic}: std is negative")
+            negative = np.asarray((values < 0).any(axis=1))
+            report("negative-std", negative, times, lambda _: f"{columns.topic}: std is negative")
 
     def _check_labels(self, columns: Columns, classes: list[str]) -> None:
         times, report = columns.log_times, self._findings.rows

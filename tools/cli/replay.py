@@ -19,9 +19,9 @@ import typer
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.origin import Origin
-    from analyzer.player import Replay, Wanted
-    from analyzer.replay import LogSet
+    from analyzer.replay.origin import Origin
+    from analyzer.replay.player import Replay, Wanted
+    from analyzer.replay.replay import LogSet
     from models.modelfile import Model
 
 _MAX_RATE = "max"
@@ -74,8 +74,8 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from analyzer.player import Wanted
-    from analyzer.replay import LogSet
+    from analyzer.replay.player import Wanted
+    from analyzer.replay.replay import LogSet
     from schemas.files import find_logs
 
     if not 0 <= start_offset < math.inf:
@@ -135,7 +135,7 @@ class _Models:
 
     def __call__(self, origin: "Origin") -> "Model | None":
         """Return the model for what a recorder wrote."""
-        from analyzer.replay import find_model
+        from analyzer.replay.replay import find_model
 
         if self._given is not None:
             return self._given
@@ -195,7 +195,7 @@ def _check_output(output: Path | None, source: Path) -> None:
 
 
 def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
-    from analyzer.replay import replay as replay_logs
+    from analyzer.replay.replay import replay as replay_logs
     from tools.cli.progress import share_done
 
     def run(wanted: "Wanted") -> "Replay":

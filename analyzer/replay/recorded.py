@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analyzer.known import is_of_type
-from analyzer.origin import Origin
+from analyzer.replay.origin import Origin
 from recorder.features import FEATURE_NAMES
 from recorder.stream import Gap, Health
 from schemas import messages

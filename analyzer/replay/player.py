@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event as Flag
 
-from analyzer.comparison import Comparison
-from analyzer.description import describe
-from analyzer.origin import Origin
-from analyzer.recorded import Features, Piece
+from analyzer.replay.comparison import Comparison
+from analyzer.replay.description import describe
+from analyzer.replay.origin import Origin
+from analyzer.replay.recorded import Features, Piece
 from models.classifier import Classifier
 from models.modelfile import Model
 from recorder import features

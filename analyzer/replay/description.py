@@ -5,7 +5,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-from analyzer.origin import Origin
+from analyzer.replay.origin import Origin
 from models.modelfile import Model
 from recorder import features
 from recorder.log import LogDescription

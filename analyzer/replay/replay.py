@@ -6,10 +6,10 @@ from threading import Event as Flag
 
 import numpy as np
 
-from analyzer.clips import ClipFramer, read_clips
-from analyzer.origin import Origin, read_origin
-from analyzer.player import Player, Replay, Wanted
-from analyzer.recorded import read_recorded
+from analyzer.replay.clips import ClipFramer, read_clips
+from analyzer.replay.origin import Origin, read_origin
+from analyzer.replay.player import Player, Replay, Wanted
+from analyzer.replay.recorded import read_recorded
 from models.errors import ModelError
 from models.modelfile import SUFFIX, Model, load_model
 from recorder.stream import Frames, Gap

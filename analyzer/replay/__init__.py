@@ -1,0 +1,1 @@
+"""Recorded logs once more through the pipeline."""
