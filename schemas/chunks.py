@@ -187,12 +187,14 @@ def _walk(file: LogFile, content: memoryview) -> dict[int, bytes]:
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
     """Look for channels that nothing read so far defines, from the first chunk on."""
-    for chunk in np.sort(file.chunks, order="offset"):
-        if identities <= file.channels.keys():
-            return
+    if identities <= file.channels.keys():
+        return
+    for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
         with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
             content, _ = _read(file, chunk, check=False)
             _walk(file, memoryview(content))
+        if identities <= file.channels.keys():
+            return
 
 
 class _Batch(NamedTuple):

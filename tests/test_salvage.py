@@ -206,7 +206,7 @@ def test_with_any_byte_changed_every_other_chunk_is_saved_and_the_lost_messages_
         outcome(data, records, rng.randrange(len(data)), rng.randrange(1, 256), recover)
 
 
-@pytest.mark.parametrize(("finished", "step"), [(True, 7), (False, 3)])
+@pytest.mark.parametrize(("finished", "step"), [(True, 17), (False, 7)])
 def test_no_byte_of_a_log_is_so_dear_that_its_change_takes_other_chunks_along(
     small, recover, finished, step
 ):

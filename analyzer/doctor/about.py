@@ -198,10 +198,11 @@ class About:
             return
         if not self._whole:
             return
-        channels = self._data.definitions.channels
-        actual = {channel.topic: self._data.counts[i] for i, channel in channels.items()}
+        actual: Counter[str] = Counter()
+        for number, channel in self._data.definitions.channels.items():
+            actual[channel.topic] += self._data.counts[number]
         counts |= dict.fromkeys(actual.keys() - counts.keys(), 0)
-        actual |= dict.fromkeys(counts.keys() - actual.keys(), 0)
+        actual.update(dict.fromkeys(counts.keys() - actual.keys(), 0))
         if counts != actual or total != sum(actual.values()):
             wrong = [topic for topic in actual if counts.get(topic) != actual[topic]]
             what = ", ".join(sorted(map(str, wrong))) or "in all"
