@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from tools.bench import features, timing
+from tools.bench import features, reading, timing, writing
 from tools.bench.labmic import make_microphone
 from tools.bench.table import Row, Table, Target
 from tools.bench.workload import Workload
@@ -106,3 +106,17 @@ def test_a_folder_without_sound_is_one_clear_line(tmp_path):
         "holds no second of sound in files *.flac or *.wav"
     )
     assert "Traceback" not in done.stderr
+
+
+def test_the_readers_agree_and_each_gets_a_time_and_a_ratio(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    monkeypatch.setattr(reading, "_DAY", 60)
+    rows = reading.measure(Workload(tmp_path, minutes=1.0)).rows
+    assert all(math.isfinite(row.value) and row.value >= 0 for row in rows)
+    assert sum(row.ratio is not None for row in rows) == 3
+
+
+def test_columns_and_messages_are_written_at_a_speed(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    columns, single = writing.measure(Workload(tmp_path, minutes=0.2)).rows
+    assert single.ratio == pytest.approx(columns.value / single.value)

@@ -24,6 +24,7 @@ from tools.bench.timing import BenchError, best_of, hearthlog
 from tools.bench.workload import Workload
 
 _DAY = 86_400
+_MIDNIGHT = "2026-03-01T00:00"  # so that it becomes one file
 _TOPIC = "/mic/statistics"
 _TWICE = Target(2, at_most=True)
 _PEAK_MEGABYTES = Target(100, at_most=True)
@@ -73,7 +74,20 @@ def measure(work: Workload) -> Table:
 def _day(work: Workload) -> Path:
     folder = work.folder / "logs-day"
     sound = [work.wav] * max(round(_DAY / work.seconds), 1)
-    hearthlog(["record", *sound, "--model", work.model_file, "-o", folder, "-d", str(2 * _DAY)])
+    hearthlog(
+        [
+            "record",
+            *sound,
+            "--model",
+            work.model_file,
+            "-o",
+            folder,
+            "-d",
+            str(_DAY),
+            "--start",
+            _MIDNIGHT,
+        ]
+    )
     return find_logs(folder)[0]
 
 
