@@ -14,7 +14,6 @@ from schemas.layout import message_type
 from schemas.rows import Fields, Int64, decode_rows, ragged
 from schemas.series import iterate_messages
 
-_BLOCK = 8 << 20  # bytes
 _HEADS = ("log_times", "publish_times", "sequences")
 
 
@@ -190,46 +189,32 @@ class _Pile:
 
 
 class _Growing:
-    """An array that grows by large blocks.
+    """An array that grows in its place.
 
-    Fresh memory is what takes the time: large blocks come in large pages, and are given back one
-    by one while the whole array is filled from them.
+    Fresh memory is what takes the time: a large array that is resized keeps its pages.
     """
 
     def __init__(self) -> None:
-        self._blocks: list[NDArray[Any]] = []
-        self._free = 0  # rows at the end of the last block
+        self._values: NDArray[Any] | None = None
+        self._count = 0
 
     def append(self, values: NDArray[Any]) -> None:
         """Append rows; where their dtype or shape is another, rows become objects."""
-        if self._blocks:
-            kept = self._blocks[-1]
-            if (kept.dtype, kept.shape[1:]) != (values.dtype, values.shape[1:]):
-                self._blocks = [ragged(block) for block in self._blocks]
-                values = ragged(values)
-        while len(values):
-            if not self._free:
-                row = values[:1].nbytes
-                self._free = max(_BLOCK // max(row, 1), 1)
-                self._blocks.append(np.empty((self._free, *values.shape[1:]), values.dtype))
-            block = self._blocks[-1][len(self._blocks[-1]) - self._free :]
-            part = values[: len(block)]
-            block[: len(part)] = part
-            self._free -= len(part)
-            values = values[len(part) :]
+        kept = values[:0].copy() if self._values is None else self._values
+        if (kept.dtype, kept.shape[1:]) != (values.dtype, values.shape[1:]):
+            kept, values = ragged(kept[: self._count]), ragged(values)
+        end = self._count + len(values)
+        if end > len(kept):
+            kept.resize((end + end // 4, *kept.shape[1:]), refcheck=False)
+        kept[self._count : end] = values
+        self._values, self._count = kept, end
 
     def joined(self) -> NDArray[Any]:
-        """Return all rows as one array, and forget them."""
-        blocks = self._blocks
-        if self._free:
-            blocks[-1] = blocks[-1][: -self._free]
-        whole = np.empty((sum(map(len, blocks)), *blocks[0].shape[1:]), blocks[0].dtype)
-        start = 0
-        while blocks:
-            block = blocks.pop(0)
-            whole[start : start + len(block)] = block
-            start += len(block)
-        return whole
+        """Return all rows, and forget them."""
+        values, self._values = self._values, None
+        assert values is not None
+        values.resize((self._count, *values.shape[1:]), refcheck=False)
+        return values
 
 
 def _in_order(columns: Columns) -> Columns:
