@@ -1,10 +1,11 @@
 """The messages of many chunks at once, still encoded, found through the index behind each chunk."""
 
 import struct
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +15,11 @@ from numpy.typing import NDArray
 
 from schemas.errors import LogError
 from schemas.logfile import LogFile
-from schemas.records import HEAD, McapError, chunk_head, decompress, parse
+from schemas.records import HEAD, ChunkHead, McapError, chunk_head, decompress_into, parse
 from schemas.rows import Bytes, Int64, gather
 
 _INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
-_INDEX_HEAD = struct.Struct("<BQHI")
+_INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")])
 _ENTRY = struct.Struct("<QQ")
 MESSAGE_HEAD = np.dtype(
     [
@@ -31,7 +32,10 @@ MESSAGE_HEAD = np.dtype(
     ]
 )
 _WRONG_INDEX = "the index of a chunk does not belong to it"
+_CHANNELS_LIMIT = 1 << 16
 _FIXED = MESSAGE_HEAD.itemsize - HEAD.size  # bytes of a message's content before its payload
+
+Entries = tuple[int, bytes | memoryview]  # of the index of a chunk, and which chunk that is
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,17 @@ class RawMessages:
 
     def between(self, start: int | None, end: int | None) -> "RawMessages":
         """Return those with start <= log time < end."""
-        times = self.log_times
-        first = 0 if start is None else int(np.searchsorted(times, start))
-        last = len(times) if end is None else int(np.searchsorted(times, end))
-        if last - first == len(times):
+        rows = slice(*bounds(self.log_times, start, end))
+        if rows == slice(0, len(self)):
             return self
-        return replace(self, offsets=self.offsets[first:last], heads=self.heads[first:last])
+        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+
+
+def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
+    """Tell where in ascending times those with start <= time < end begin and stop."""
+    first = 0 if start is None else int(np.searchsorted(times, start))
+    last = len(times) if end is None else int(np.searchsorted(times, end))
+    return first, max(first, last)
 
 
 def read_chunks(
@@ -102,20 +111,11 @@ def read_chunks(
     LogError
         If a chunk is damaged, or its index does not belong to it.
     """
-    contents: list[bytes] = []
-    indices: dict[int, list[tuple[int, bytes | memoryview]]] = {}
-    for number, chunk in enumerate(chunks):
-        try:
-            content, found = _read(file, chunk, check=check)
-        except (McapError, UnicodeDecodeError) as error:
-            raise file.damaged(int(chunk["offset"]), error) from error
-        contents.append(content)
-        for identity, entries in found.items():
-            indices.setdefault(identity, []).append((number, entries))
-    sizes = np.array([len(content) for content in contents], np.int64)
-    buffer = np.frombuffer(b"".join(contents), np.uint8)
+    if not len(chunks):
+        return []
+    batch = _read(file, chunks, check=check)
+    indices = batch.indices()
     _define(file, indices.keys())
-    batch = _Batch(file, chunks, sizes, buffer)
     read = [
         batch.messages(identity, parts)
         for identity, parts in indices.items()
@@ -126,40 +126,56 @@ def read_chunks(
     return [messages for messages in read if len(messages)]
 
 
-def _read(
-    file: LogFile, chunk: np.void, *, check: bool
-) -> tuple[bytes, Mapping[int, bytes | memoryview]]:
-    """Read the records in one chunk, and by channel the entries of its index."""
-    offset, length, index_length = chunk.item()[:3]
-    raw = memoryview(file.read(offset, length + max(index_length, 0)))
-    if index_length < 0:
-        return bytes(raw), _walk(file, raw)
-    if len(raw) < HEAD.size or HEAD.unpack_from(raw) != (Opcode.CHUNK, length - HEAD.size):
+def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
+    """Read and decompress chunks."""
+    raw, starts = _read_stored(file, chunks)
+    lengths, indexed = chunks["length"], chunks["index_length"] >= 0
+    records: list[tuple[ChunkHead | None, memoryview]] = []
+    for number, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
+        record = raw[start : start + length].data
+        try:
+            records.append(_chunk(record) if indexed[number] else (None, record))
+        except McapError as error:
+            raise file.damaged(int(chunks["offset"][number]), error) from error
+    sizes = np.array([len(record) if head is None else head.size for head, record in records], int)
+    buffer = np.empty(sizes.sum(), np.uint8)
+    end = 0
+    for number, (head, record) in enumerate(records):
+        first, end = end, end + int(sizes[number])
+        if head is None:
+            buffer[first:end] = record
+            continue
+        try:
+            decompress_into(buffer[first:end].data, head, record, check=check)
+        except McapError as error:
+            raise file.damaged(int(chunks["offset"][number]), error) from error
+    return _Batch(file, chunks, sizes, buffer, raw, starts)
+
+
+def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]:
+    """Read chunks and the indexes behind them, neighbours at once; return where each begins."""
+    offsets = chunks["offset"]
+    lengths = chunks["length"] + np.maximum(chunks["index_length"], 0)
+    cut = offsets + lengths > file.size
+    if cut.any():
+        raise file.damaged(int(offsets[cut.argmax()]), "a chunk is shorter than it claims")
+    ends = np.cumsum(lengths)
+    raw = np.empty(lengths.sum(), np.uint8)
+    apart = np.flatnonzero(offsets[1:] != (offsets + lengths)[:-1]) + 1
+    for first, last in pairwise([0, *apart.tolist(), len(chunks)]):
+        start = int(ends[first] - lengths[first])
+        file.read_into(raw[start : ends[last - 1]].data, int(offsets[first]))
+    return raw, ends - lengths
+
+
+def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
+    if len(record) < HEAD.size or HEAD.unpack_from(record) != (
+        Opcode.CHUNK,
+        len(record) - HEAD.size,
+    ):
         raise McapError("here should be a chunk")
-    record = raw[HEAD.size : length]
-    content = decompress(chunk_head(record), record, check=check)
-    found: Mapping[int, bytes | memoryview] = _indices(raw[length:])
-    if not found or not found.keys() <= file.channels.keys():
-        walked = _walk(file, memoryview(content))
-        found = found or walked
-    return content, found
-
-
-def _indices(raw: memoryview) -> dict[int, memoryview]:
-    """Split the message indexes behind a chunk into their entries, by channel."""
-    found: dict[int, memoryview] = {}
-    start = 0
-    while start < len(raw):
-        first = start + _INDEX_HEAD.size
-        if first > len(raw):
-            raise McapError("a message index is cut")
-        opcode, length, identity, size = _INDEX_HEAD.unpack_from(raw, start)
-        start += HEAD.size + length
-        if opcode != Opcode.MESSAGE_INDEX or start > len(raw) or size > start - first or size % 16:
-            raise McapError("here should be a message index")
-        if size:
-            found[identity] = raw[first : first + size]
-    return found
+    content = record[HEAD.size :]
+    return chunk_head(content), content
 
 
 def _walk(file: LogFile, content: memoryview) -> dict[int, bytes]:
@@ -191,23 +207,80 @@ def _define(file: LogFile, identities: AbstractSet[int]) -> None:
         return
     for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
         with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
-            content, _ = _read(file, chunk, check=False)
-            _walk(file, memoryview(content))
+            _read(file, np.array([chunk]), check=False).walk()
         if identities <= file.channels.keys():
             return
 
 
 class _Batch(NamedTuple):
-    """The records of some chunks of a log, in one buffer."""
+    """The records of some chunks of a log, in one buffer, and the chunks as they are stored."""
 
     file: LogFile
     chunks: NDArray[np.void]
     sizes: Int64
     buffer: Bytes
+    raw: Bytes
+    starts: Int64
 
-    def messages(
-        self, identity: int, parts: Sequence[tuple[int, bytes | memoryview]]
-    ) -> RawMessages:
+    def indices(self) -> dict[int, list[Entries]]:
+        """Return the index entries of each channel, by chunk; chunks without index get one."""
+        ends = self.starts + self.chunks["length"]
+        parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
+        found: dict[int, list[Entries]] = {}
+        for number, identity, first, size in parts.tolist():
+            found.setdefault(identity, []).append((number, self.raw[first : first + size].data))
+        unknown = not found.keys() <= self.file.channels.keys()
+        without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
+        for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
+            walked = self.walk(number)
+            for identity, entries in walked.items() if without[number] else ():
+                found.setdefault(identity, []).append((number, entries))
+        return found
+
+    def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
+        """Go through the message indexes behind all chunks, one of each chunk at a time.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, 4)]
+            Number of the chunk, of the channel, and place and size of its entries.
+        """
+        parts = [np.empty((0, 4), np.int64)]
+        numbers = np.flatnonzero(starts < ends)
+        starts, ends = starts[numbers], ends[numbers]
+        for _ in range(_CHANNELS_LIMIT):
+            if not len(numbers):
+                break
+            first = starts + _INDEX_HEAD.itemsize
+            if (first > ends).any():
+                raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
+            heads = gather(self.raw, starts, _INDEX_HEAD.itemsize).view(_INDEX_HEAD)
+            length, size = heads["length"], heads["size"].astype(np.int64)
+            sound = (
+                (heads["opcode"] == Opcode.MESSAGE_INDEX)
+                & (length >= size + _INDEX_HEAD.itemsize - HEAD.size)
+                & (length <= ends - starts - HEAD.size)
+                & (size % _INDEX.itemsize == 0)
+            )
+            if not sound.all():
+                raise self._damaged(numbers[sound.argmin()], "here should be a message index")
+            part = np.stack([numbers, heads["channel"], first, size], axis=1)
+            parts.append(part[size > 0])
+            starts = starts + HEAD.size + length
+            going = starts < ends
+            numbers, starts, ends = numbers[going], starts[going], ends[going]
+        return np.concatenate(parts)
+
+    def walk(self, number: int = 0) -> dict[int, bytes]:
+        """Go through the records of a chunk: note its channels, make the index it should have."""
+        end = int(self.sizes[: number + 1].sum())
+        content = self.buffer[end - int(self.sizes[number]) : end].data
+        try:
+            return _walk(self.file, content)
+        except (McapError, UnicodeDecodeError) as error:
+            raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
+
+    def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
         """Follow the index entries of a channel to its messages, and check every one of them."""
         entries = np.frombuffer(b"".join(part for _, part in parts), _INDEX)
         counts = [len(part) // _INDEX.itemsize for _, part in parts]
@@ -232,6 +305,8 @@ class _Batch(NamedTuple):
         )
         if not sound.all():
             raise self._damaged(number[sound.argmin()], _WRONG_INDEX)
+        if (heads["length"] + HEAD.size).sum() > len(self.buffer):
+            raise self._damaged(number[0], _WRONG_INDEX)  # it leads to some of them twice
         offsets = starts + MESSAGE_HEAD.itemsize
         if (np.diff(heads["log_time"]) < 0).any():
             order = np.argsort(heads["log_time"], kind="stable")

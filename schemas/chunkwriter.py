@@ -4,6 +4,7 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 """
 
 import struct
+import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,12 +18,14 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from schemas.ahead import map_ahead
 from schemas.chunks import MESSAGE_HEAD, RawMessages
 from schemas.records import HEAD, MAGIC
 from schemas.rows import Int64, gather
 
 CHUNK_SIZE = 1 << 20
 _COMPRESSION = b"zstd"
+_COMPRESSORS = 2  # threads
 _LAST = 1 << 63
 _MESSAGE = struct.Struct("<BQHIQQ")
 _CHUNK = struct.Struct("<BQQQQII")
@@ -30,6 +33,42 @@ _INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _ENTRY = struct.Struct("<QQ")
 _INDEX_HEAD = struct.Struct("<BQHI")
 _FOOTER_START = struct.Struct("<BQQQ")
+
+
+class _Chunk:
+    """A chunk in progress: its records, its index by channel, and the span of its log times."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self.entries: dict[int, bytearray] = {}
+        self.start, self.end = _LAST, 0
+
+    def add(self, data: NDArray[np.uint8], channels: Int64, entries: NDArray[np.void]) -> None:
+        """Append encoded messages."""
+        self.content += data.data
+        found, places = np.unique(channels, return_index=True)
+        for channel in found[np.argsort(places)].tolist():
+            same = entries[channels == channel].tobytes()
+            self.entries.setdefault(channel, bytearray()).extend(same)
+        times = entries["time"]
+        self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
+
+    def stored(self) -> "StoredChunk":
+        """Compress it."""
+        data = _LOCAL.zstd.compress(self.content)
+        crc = zlib.crc32(self.content)
+        size = len(self.content)
+        return StoredChunk(_COMPRESSION, data, size, crc, self.start, self.end, self.entries)
+
+
+class _Local(threading.local):
+    """Compressors are dear to make and must not be shared between threads."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdCompressor()
+
+
+_LOCAL = _Local()
 
 
 class Block(NamedTuple):
@@ -125,7 +164,6 @@ class ChunkWriter:
     def __init__(self, stream: BinaryIO, chunk_size: int = CHUNK_SIZE) -> None:
         self._stream = stream
         self._chunk_size = chunk_size
-        self._compressor = zstandard.ZstdCompressor()
         self._schemas: list[records.Schema] = []
         self._channels: list[records.Channel] = []
         self._chunk_indexes = bytearray()  # as it will be written: there may be very many
@@ -134,9 +172,7 @@ class ChunkWriter:
         self._attachments: list[records.AttachmentIndex] = []
         self._metadata: list[records.MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
-        self._content = bytearray()  # of the chunk in progress
-        self._entries: dict[int, bytearray] = {}  # its index, by channel
-        self._span = (_LAST, 0)
+        self._chunk = _Chunk()  # in progress
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
@@ -168,7 +204,7 @@ class ChunkWriter:
         """Add a schema and return its number."""
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas.append(schema)
-        self._content += encoded(schema)
+        self._chunk.content += encoded(schema)
         return schema.id
 
     def register_channel(
@@ -179,7 +215,7 @@ class ChunkWriter:
             len(self._channels) + 1, topic, message_encoding, metadata, schema_id
         )
         self._channels.append(channel)
-        self._content += encoded(channel)
+        self._chunk.content += encoded(channel)
         return channel.id
 
     def define(
@@ -201,15 +237,16 @@ class ChunkWriter:
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         """Append a message."""
-        entry = _ENTRY.pack(log_time, len(self._content))
-        self._entries.setdefault(channel_id, bytearray()).extend(entry)
+        chunk = self._chunk
+        entry = _ENTRY.pack(log_time, len(chunk.content))
+        chunk.entries.setdefault(channel_id, bytearray()).extend(entry)
         length = _MESSAGE.size - HEAD.size + len(data)
-        self._content += _MESSAGE.pack(
+        chunk.content += _MESSAGE.pack(
             Opcode.MESSAGE, length, channel_id, sequence, log_time, publish_time
         )
-        self._content += data
-        self._span = min(self._span[0], log_time), max(self._span[1], log_time)
-        if len(self._content) > self._chunk_size:
+        chunk.content += data
+        chunk.start, chunk.end = min(chunk.start, log_time), max(chunk.end, log_time)
+        if len(chunk.content) > self._chunk_size:
             self.flush()
 
     def write(self, blocks: Sequence[Block]) -> None:
@@ -235,15 +272,9 @@ class ChunkWriter:
 
     def flush(self) -> None:
         """End the chunk in progress."""
-        if not self._entries:
-            return
-        data = self._compressor.compress(self._content)
-        crc = zlib.crc32(self._content)
-        size = len(self._content)
-        self._put(StoredChunk(_COMPRESSION, data, size, crc, *self._span, self._entries))
-        self._content.clear()
-        self._entries.clear()
-        self._span = (_LAST, 0)
+        if self._chunk.entries:
+            self._put(self._chunk.stored())
+            self._chunk = _Chunk()
 
     def copy_chunk(self, chunk: StoredChunk) -> None:
         """Write a chunk of another file as it is, and its message index behind it."""
@@ -329,28 +360,24 @@ class ChunkWriter:
         self, data: NDArray[np.uint8], ends: Int64, sizes: Int64, channels: Int64, times: Int64
     ) -> None:
         """Cut encoded messages, one after the other, into chunks."""
+        full: list[_Chunk] = []
         first = offset = 0
         while first < len(ends):
-            room = self._chunk_size - len(self._content)
-            full = int(np.searchsorted(ends, offset + room, side="right"))
-            last = min(full + 1, len(ends))
+            chunk = self._chunk
+            room = self._chunk_size - len(chunk.content)
+            beyond = int(np.searchsorted(ends, offset + room, side="right"))
+            last = min(beyond + 1, len(ends))
             part = slice(first, last)
             entries = np.empty(last - first, _INDEX)
             entries["time"] = times[part]
-            entries["offset"] = ends[part] - sizes[part] - offset + len(self._content)
-            self._content += data[offset : ends[last - 1]].data
-            self._add_entries(channels[part], entries)
+            entries["offset"] = ends[part] - sizes[part] - offset + len(chunk.content)
+            chunk.add(data[offset : ends[last - 1]], channels[part], entries)
             first, offset = last, int(ends[last - 1])
-            if full < len(ends):
-                self.flush()
-
-    def _add_entries(self, channels: Int64, entries: NDArray[np.void]) -> None:
-        found, places = np.unique(channels, return_index=True)
-        for channel in found[np.argsort(places)].tolist():
-            same = entries[channels == channel].tobytes()
-            self._entries.setdefault(channel, bytearray()).extend(same)
-        times = entries["time"]
-        self._span = min(self._span[0], int(times.min())), max(self._span[1], int(times.max()))
+            if beyond < len(ends):
+                full.append(chunk)
+                self._chunk = _Chunk()
+        for stored in map_ahead(_Chunk.stored, full, _COMPRESSORS):
+            self._put(stored)
 
     def _write(self, record: records.McapRecord) -> tuple[int, int]:
         """Write a record; return its offset and its length."""

@@ -3,18 +3,19 @@
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.chunks import RawMessages
+from schemas.chunks import RawMessages, bounds
 from schemas.errors import LogError
 from schemas.layout import message_type
-from schemas.logfile import LogFile
+from schemas.logfile import topic_counts
 from schemas.rows import Fields, Int64, decode_rows, ragged
-from schemas.series import iterate_messages
+from schemas.series import iterate_pieces
 
 _HEADS = ("log_times", "publish_times", "sequences")
 
@@ -53,6 +54,23 @@ class Columns:
     def __getitem__(self, path: str) -> NDArray[Any]:
         return self.fields[path]
 
+    def between(self, start: int | None, end: int | None) -> "Columns":
+        """Return the messages with start <= log time < end."""
+        rows = slice(*bounds(self.log_times, start, end))
+        if rows == slice(0, len(self)):
+            return self
+        return self.taken(rows)
+
+    def taken(self, rows: slice | NDArray[np.intp]) -> "Columns":
+        """Return some of the messages."""
+        return replace(
+            self,
+            log_times=self.log_times[rows],
+            publish_times=self.publish_times[rows],
+            sequences=self.sequences[rows],
+            fields={path: values[rows] for path, values in self.fields.items()},
+        )
+
 
 def read_columns(
     logs: Iterable[Path],
@@ -86,7 +104,8 @@ def read_columns(
         have different types on one topic.
     """
     logs = list(logs)
-    expected = _expected_rows(logs) if start is None and end is None else Counter()
+    whole = start is None and end is None
+    expected = sum(map(topic_counts, logs), Counter()) if whole else Counter()
     found: dict[str, _Pile] = {}
     for batch in iterate_columns(logs, topics, start, end, fields):
         for columns in batch:
@@ -109,8 +128,8 @@ def iterate_columns(
         The next span of time: one for each topic that speaks in it, or more where its channels
         differ in type or metadata. Nothing is older than what was yielded before.
     """
-    for messages in iterate_messages(logs, topics, start, end):
-        yield decode(messages, fields)
+    pieces = iterate_pieces(logs, topics, start, end, partial(decode, fields=fields))
+    return map(_joined, pieces)
 
 
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
@@ -121,9 +140,13 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
     LogError
         If they are not of the type that their channel says, or not encoded as CDR.
     """
+    return _joined([_decode(raw, fields) for raw in messages])
+
+
+def _joined(pieces: Iterable[Columns]) -> list[Columns]:
+    """Join pieces of one topic, type and metadata, in the order of time."""
     parts: dict[Any, list[Columns]] = {}
-    for raw in messages:
-        columns = _decode(raw, fields)
+    for columns in pieces:
         key = columns.topic, columns.type, tuple(sorted(columns.metadata.items()))
         parts.setdefault(key, []).append(columns)
     return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
@@ -229,23 +252,5 @@ class _Growing:
         return self._values[: self._count]
 
 
-def _expected_rows(logs: Iterable[Path]) -> Counter[str]:
-    """Count the messages of each topic as finished logs say, so far as that can be true."""
-    found: Counter[str] = Counter()
-    for path in logs:
-        with LogFile(path) as file:
-            counts = {} if file.statistics is None else file.statistics.channel_message_counts
-            for number, channel in file.channels.items():
-                found[channel.topic] += min(counts.get(number, 0), file.size)
-    return found
-
-
 def _in_order(columns: Columns) -> Columns:
-    order = np.argsort(columns.log_times, kind="stable")
-    return replace(
-        columns,
-        log_times=columns.log_times[order],
-        publish_times=columns.publish_times[order],
-        sequences=columns.sequences[order],
-        fields={path: values[order] for path, values in columns.fields.items()},
-    )
+    return columns.taken(np.argsort(columns.log_times, kind="stable"))

@@ -4,7 +4,9 @@ import os
 import struct
 import zlib
 from array import array
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Self
 
@@ -130,6 +132,10 @@ class LogFile:
     def read(self, offset: int, length: int) -> bytes:
         """Read some bytes; fewer at the end of the file."""
         return os.pread(self._descriptor, length, offset)
+
+    def read_into(self, out: memoryview, offset: int) -> None:
+        """Read as many bytes as there is room for, or fewer at the end of the file."""
+        os.preadv(self._descriptor, [out], offset)
 
     def record(self, place: Place) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages."""
@@ -348,21 +354,52 @@ def time_span(path: Path) -> tuple[int, int] | None:
         return int(file.chunks["start"].min()), int(file.chunks["end"].max())
 
 
+def topic_counts(path: Path) -> Counter[str]:
+    """Count the messages of each topic as a finished log says, so far as that can be true."""
+    found: Counter[str] = Counter()
+    with suppress(OSError, McapError, UnicodeDecodeError, struct.error), path.open("rb") as stream:
+        about = _statistics(stream)
+        counts = {} if about is None else about.channel_message_counts
+        for channel in _summary_group(stream, Opcode.CHANNEL):
+            if isinstance(channel, records.Channel):
+                most = os.fstat(stream.fileno()).st_size  # a message takes more than a byte
+                found[channel.topic] += min(counts.get(channel.id, 0), most)
+    return found
+
+
 def _statistics(stream: BinaryIO) -> records.Statistics | None:
     """Read the statistics of a finished log, which are found without reading its index."""
+    for found in _summary_group(stream, Opcode.STATISTICS):
+        if isinstance(found, records.Statistics):
+            return found
+    return None
+
+
+def _summary_group(stream: BinaryIO, opcode: int) -> list[McapRecord | None]:
+    """Read the records of one kind in the summary of a finished log."""
     stream.seek(-FOOTER_SIZE, os.SEEK_END)
     tail = stream.read()
     if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
-        return None
+        return []
     footer = parse(Opcode.FOOTER, tail[HEAD.size :])
     assert isinstance(footer, records.Footer)
-    size = stream.tell() - FOOTER_SIZE - footer.summary_offset_start
+    end = stream.tell() - FOOTER_SIZE
+    size = end - footer.summary_offset_start
     if not footer.summary_offset_start or not 0 <= size <= _RUN_LIMIT:
-        return None
+        return []
     stream.seek(footer.summary_offset_start)
     for group, start, length in _SUMMARY_OFFSET.iter_unpack(stream.read(size)):
-        if group == Opcode.STATISTICS and length <= _RUN_LIMIT:
+        if group == opcode and length <= _RUN_LIMIT and start < end:
             stream.seek(start)
-            found = parse(Opcode.STATISTICS, stream.read(length)[HEAD.size :])
-            return found if isinstance(found, records.Statistics) else None
-    return None
+            return _split(stream.read(length))
+    return []
+
+
+def _split(raw: bytes) -> list[McapRecord | None]:
+    found = []
+    start = 0
+    while start < len(raw):
+        opcode, length = HEAD.unpack_from(raw, start)
+        start += HEAD.size + length
+        found.append(parse(opcode, raw[start - length : start]))
+    return found

@@ -19,7 +19,17 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-__all__ = ["HEAD", "LIMIT", "MAGIC", "ChunkHead", "McapError", "chunk_head", "decompress", "parse"]
+__all__ = [
+    "HEAD",
+    "LIMIT",
+    "MAGIC",
+    "ChunkHead",
+    "McapError",
+    "chunk_head",
+    "decompress",
+    "decompress_into",
+    "parse",
+]
 
 LIMIT = 100 << 20  # bytes; ours are below 2 MiB
 HEAD = struct.Struct("<BQ")  # opcode and length
@@ -115,29 +125,45 @@ def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = Fa
     McapError
         If the data are damaged.
     """
-    data = content[head.data]
+    out = bytearray(head.size)
+    decompress_into(memoryview(out), head, content, check=check)
+    return bytes(out)
+
+
+def decompress_into(
+    out: memoryview, head: ChunkHead, content: bytes | memoryview, *, check: bool = False
+) -> None:
+    """Decompress the records of a chunk to where there is room for `head.size` bytes.
+
+    Parameters and errors are those of `decompress`.
+    """
     try:
-        raw = _DECOMPRESS[head.compression](data, head.size)
+        size = _DECOMPRESS[head.compression](content[head.data], out)
     except KeyError as error:
         raise McapError(f"a chunk has unknown compression {head.compression!r}") from error
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:  # the last two are lz4's
         raise McapError(f"a chunk cannot be decompressed ({error})") from error
-    if len(raw) != head.size:
+    if size != head.size:
         raise McapError("a chunk has another size than it claims")
-    if check and head.crc and zlib.crc32(raw) != head.crc:
+    if check and head.crc and zlib.crc32(out) != head.crc:
         raise McapError("a chunk has another checksum than it claims")
-    return raw
 
 
-def _zstd(data: bytes | memoryview, size: int) -> bytes:
-    if zstandard.frame_content_size(data) not in {size, -1}:  # it would be allocated unseen
-        raise McapError("a chunk has another size than it claims")
-    return _LOCAL.zstd.decompress(data, max_output_size=size) if size else b""
+def _zstd(data: bytes | memoryview, out: memoryview) -> int:
+    reader = _LOCAL.zstd.stream_reader(data)
+    size = reader.readinto(out) if out else 0
+    return size + len(reader.read(1))
 
 
-def _lz4(data: bytes | memoryview, size: int) -> bytes:
-    stream = lz4.frame.LZ4FrameDecompressor()
-    return bytes(stream.decompress(data, max_length=size + 1))
+def _lz4(data: bytes | memoryview, out: memoryview) -> int:
+    raw = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=len(out) + 1)
+    return _stored(raw, out)
+
+
+def _stored(data: bytes | memoryview, out: memoryview) -> int:
+    if len(data) == len(out):
+        out[:] = data
+    return len(data)
 
 
 class _Local(threading.local):
@@ -148,10 +174,6 @@ class _Local(threading.local):
 
 
 _LOCAL = _Local()
-
-
-def _stored(data: bytes | memoryview, _size: int) -> bytes:
-    return bytes(data)
 
 
 _DECOMPRESS = {b"zstd": _zstd, b"lz4": _lz4, b"": _stored}

@@ -1,18 +1,33 @@
 """The messages of several logs as one series, in the order of time and within bounded memory."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.ahead import map_ahead
 from schemas.chunks import RawMessages, read_chunks
 from schemas.logfile import LogFile, time_span
+from schemas.records import LIMIT
 
-_BATCH = 2 << 20  # bytes, uncompressed, that are read at once
+_BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
+_READERS = 2  # threads: more than these wait for each other's Python
 _FIRST, _LAST = 0, (1 << 63) - 1  # log times
+
+
+class Messages(Protocol):
+    """Messages of one channel or topic, in the order of their log times, encoded or decoded."""
+
+    def __len__(self) -> int: ...
+
+    def between(self, start: int | None, end: int | None) -> Self:
+        """Return those with start <= log time < end."""
+
+
+Piece = TypeVar("Piece", bound=Messages)
 
 
 class _Log:
@@ -21,7 +36,8 @@ class _Log:
     def __init__(self, path: Path, query: "_Query") -> None:
         self.file = LogFile(path)
         self.chunks = query.wanted(self.file)
-        self._ends = np.cumsum(self.chunks["size"])
+        sizes = self.chunks["size"] + self.chunks["length"]
+        self._ends = np.cumsum(np.clip(sizes, 0, LIMIT))
         self._position = 0
 
     @property
@@ -59,6 +75,31 @@ class _Query(NamedTuple):
         wanted = [not ids or not ids <= others for ids in file.channel_sets]
         return chunks[np.array(wanted, bool)[chunks["channels"]]]
 
+    def read(self, batch: "_Batch") -> list[RawMessages]:
+        """Read the wanted messages of a batch."""
+        found: list[RawMessages] = []
+        for file, chunks in batch.parts:
+            found += _between(read_chunks(file, chunks, self.topics), self.start, self.end)
+        return found
+
+
+class _Batch(NamedTuple):
+    """What is read at once.
+
+    Attributes
+    ----------
+    parts : list of (LogFile, np.ndarray)
+        Chunks by log.
+    until : int
+        No later batch has an earlier message.
+    finished : list of LogFile
+        Logs of which nothing more is to be read.
+    """
+
+    parts: list[tuple[LogFile, NDArray[np.void]]]
+    until: int
+    finished: list[LogFile]
+
 
 def iterate_messages(
     logs: Iterable[Path],
@@ -87,20 +128,46 @@ def iterate_messages(
     LogError
         If a log is damaged.
     """
+    return iterate_pieces(logs, topics, start, end, list)
+
+
+def iterate_pieces(
+    logs: Iterable[Path],
+    topics: Collection[str] | None,
+    start: int | None,
+    end: int | None,
+    function: Callable[[list[RawMessages]], list[Piece]],
+) -> Iterator[list[Piece]]:
+    """Make something of the messages of some logs as they are read, in the threads that read.
+
+    Parameters and errors are those of `iterate_messages`.
+
+    Yields
+    ------
+    list of Piece
+        What the function made of messages: of those of the next span of time.
+    """
     query = _Query(topics, _FIRST if start is None else start, _LAST if end is None else end)
-    pending: list[RawMessages] = []
-    with closing(_Queue(logs, query)) as queue:
-        while (until := queue.start) < _LAST or pending:
-            ready = _between(pending, _FIRST, until)
+
+    def read(batch: _Batch) -> tuple[_Batch, list[Piece]]:
+        return batch, function(query.read(batch))
+
+    pending: list[Piece] = []
+    with (
+        _Queue(logs, query) as queue,
+        closing(map_ahead(read, queue.batches(), _READERS)) as batches,
+    ):
+        for batch, pieces in batches:
+            pending += pieces
+            ready = _between(pending, _FIRST, batch.until)
             if ready:
                 yield ready
-            pending = _between(pending, until, _LAST)
-            for file, chunks in queue.next_chunks():
-                pending += _between(read_chunks(file, chunks, topics), query.start, query.end)
+            pending = _between(pending, batch.until, _LAST)
+            queue.close(batch.finished)
 
 
-def _between(messages: list[RawMessages], start: int, end: int) -> list[RawMessages]:
-    return [part for part in (m.between(start, end) for m in messages) if len(part)]
+def _between(pieces: list[Piece], start: int, end: int) -> list[Piece]:
+    return [part for part in (piece.between(start, end) for piece in pieces) if len(part)]
 
 
 class _Queue:
@@ -115,46 +182,55 @@ class _Queue:
             if last >= query.start and first < query.end
         ]
         self._open: list[_Log] = []
-        self._read: list[_Log] = []
+        self._finished: list[LogFile] = []
+        self._files: set[LogFile] = set()
         self._open_next()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close(self._files)
 
     @property
     def start(self) -> int:
         """No chunk that is still to come starts earlier."""
         return min((_start(log) for log in self._open), default=_LAST)
 
-    def next_chunks(self) -> list[tuple[LogFile, NDArray[np.void]]]:
-        """Hand out the next chunks, together of a few megabytes, by log."""
-        self._close_read()
-        picked: dict[LogFile, list[NDArray[np.void]]] = {}
-        size = 0
-        while self._open and size < _BATCH:
-            log = min(self._open, key=_start)
-            others = [_start(other) for other in self._open if other is not log]
-            until = min([*others, *(first for first, _ in self._closed[-1:])], default=_LAST)
-            chunks = log.next_chunks(until, _BATCH - size)
-            picked.setdefault(log.file, []).append(chunks)
-            size += int(chunks["size"].sum())
-            self._open_next()
-        return [(file, np.concatenate(parts)) for file, parts in picked.items()]
+    def batches(self) -> Iterator["_Batch"]:
+        """Hand out the chunks, a few megabytes at a time."""
+        while self._open:
+            picked: dict[LogFile, list[NDArray[np.void]]] = {}
+            size = 0
+            while self._open and size < _BATCH:
+                log = min(self._open, key=_start)
+                others = [_start(other) for other in self._open if other is not log]
+                until = min([*others, *(first for first, _ in self._closed[-1:])], default=_LAST)
+                chunks = log.next_chunks(until, _BATCH - size)
+                picked.setdefault(log.file, []).append(chunks)
+                size += int(chunks["size"].sum())
+                self._open_next()
+            parts = [(file, np.concatenate(parts)) for file, parts in picked.items()]
+            finished, self._finished = self._finished, []
+            yield _Batch(parts, self.start, finished)
 
-    def close(self) -> None:
-        """Close all logs."""
-        self._read += self._open
-        self._close_read()
+    def close(self, files: Iterable[LogFile]) -> None:
+        """Close logs whose chunks were all read."""
+        for file in list(files):
+            file.close()
+            self._files.remove(file)
 
     def _open_next(self) -> None:
         """Open the logs that may have the next chunk, and put aside those that have no more."""
-        self._read += [log for log in self._open if log.start is None]
+        self._finished += [log.file for log in self._open if log.start is None]
         self._open = [log for log in self._open if log.start is not None]
         while self._closed and (not self._open or self._closed[-1][0] <= self.start):
             log = _Log(self._closed.pop()[1], self._query)
-            (self._read if log.start is None else self._open).append(log)
-
-    def _close_read(self) -> None:
-        for log in self._read:
-            log.file.close()
-        self._read.clear()
+            self._files.add(log.file)
+            if log.start is None:
+                self._finished.append(log.file)
+            else:
+                self._open.append(log)
 
 
 def _start(log: _Log) -> int:

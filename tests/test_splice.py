@@ -308,5 +308,5 @@ def test_logs_of_any_size_are_merged_in_little_memory(tmp_path):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert (tmp_path / "all.mcap").stat().st_size > 40_000_000
-    assert peak < 40_000_000
+    assert peak < 75_000_000  # decompressed they are 90 MB
     assert len(LogReader(tmp_path / "all.mcap").channels) in (0, 1)
