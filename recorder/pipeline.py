@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.classifier import Classifier
+from models.modelfile import Model
 from models.segments import Segment, SegmentMerger
-from recorder import lines
+from recorder import features, lines
 from recorder.features import FeatureExtractor
 from recorder.statistics import WINDOW_FRAMES, RollingStatistics
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
@@ -21,6 +22,7 @@ from schemas.topics import DIAGNOSTICS, ROSOUT, topic
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
+_FRAME_SECONDS = features.FRAME_SAMPLES / features.SAMPLE_RATE
 _ROW_TYPES = {
     "features": messages.FEATURES,
     "statistics": messages.STATISTICS,
@@ -34,6 +36,23 @@ class Record(NamedTuple):
     log_time: int
     topic: str
     data: bytes
+
+
+def stream_info(microphone: str, device: str, model: Model | None) -> Any:
+    """Make the `AudioStreamInfo` of a microphone; its stamp is still zero."""
+    return message(
+        messages.STREAM_INFO,
+        header=header(0, microphone),
+        device=device,
+        sample_rate=features.SAMPLE_RATE,
+        frame_seconds=_FRAME_SECONDS,
+        window_seconds=_FRAME_SECONDS * WINDOW_FRAMES,
+        feature_set=features.NAME,
+        feature_names=list(features.FEATURE_NAMES),
+        model="" if model is None else model.name,
+        model_sha256="" if model is None else model.sha256,
+        labels=[] if model is None else list(model.classes),
+    )
 
 
 def opening(info: Any) -> list[Record]:

@@ -14,18 +14,13 @@ from models.modelfile import Model, load_model
 from recorder import features
 from recorder.config import Settings
 from recorder.log import LogDescription, RollingLog
-from recorder.pipeline import Pipeline
+from recorder.pipeline import Pipeline, stream_info
 from recorder.recovery import Recovered, recover_active
 from recorder.sources.microphone import MicrophoneSource
 from recorder.sources.replayed import FileSource
-from recorder.statistics import WINDOW_FRAMES
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
-from schemas import messages
-from schemas.messages import header, message
 from schemas.topics import topics_of
 from schemas.writer import Attachment
-
-FRAME_SECONDS = features.FRAME_SAMPLES / features.SAMPLE_RATE
 
 
 class Source(Protocol):
@@ -134,28 +129,15 @@ def _describe(settings: Settings, source: Source, model: Model | None) -> LogDes
     attachments = [Attachment("configuration.json", "application/json", configuration)]
     if model is not None:
         attachments.append(Attachment("model_card.md", "text/markdown", model.card().encode()))
-    name, digest = ("", "") if model is None else (model.name, model.sha256)
     classes = None if model is None else list(model.classes)
-    info = message(
-        messages.STREAM_INFO,
-        header=header(0, microphone),
-        device=source.device,
-        sample_rate=features.SAMPLE_RATE,
-        frame_seconds=FRAME_SECONDS,
-        window_seconds=FRAME_SECONDS * WINDOW_FRAMES,
-        feature_set=features.NAME,
-        feature_names=list(features.FEATURE_NAMES),
-        model=name,
-        model_sha256=digest,
-        labels=classes or [],
-    )
+    info = stream_info(microphone, source.device, model)
     metadata = {
         "version": version("hearthlog"),
         "node": settings.node,
         "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
         "feature_set": features.NAME,
-        "model": name,
-        "model_sha256": digest,
+        "model": info.model,
+        "model_sha256": info.model_sha256,
     }
     return LogDescription(
         root=settings.output,

@@ -114,16 +114,19 @@ def read_chunks(
     if not len(chunks):
         return []
     batch = _read(file, chunks, check=check)
-    indices = batch.indices()
+    indices = batch.indices(_unwanted(file, topics))
     _define(file, indices.keys())
-    read = [
-        batch.messages(identity, parts)
-        for identity, parts in indices.items()
-        if topics is None
-        or identity not in file.channels
-        or file.channels[identity].topic in topics
-    ]
+    for identity in _unwanted(file, topics):
+        indices.pop(identity, None)
+    read = [batch.messages(identity, parts) for identity, parts in indices.items()]
     return [messages for messages in read if len(messages)]
+
+
+def _unwanted(file: LogFile, topics: Collection[str] | None) -> list[int]:
+    """Return the channels, of those that are known, of other topics."""
+    if topics is None:
+        return []
+    return [number for number, channel in file.channels.items() if channel.topic not in topics]
 
 
 def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
@@ -222,15 +225,15 @@ class _Batch(NamedTuple):
     raw: Bytes
     starts: Int64
 
-    def indices(self) -> dict[int, list[Entries]]:
-        """Return the index entries of each channel, by chunk; chunks without index get one."""
+    def indices(self, unwanted: Sequence[int]) -> dict[int, list[Entries]]:
+        """Return the index entries of the other channels; chunks without index get one."""
         ends = self.starts + self.chunks["length"]
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
+        without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
         found: dict[int, list[Entries]] = {}
-        for number, identity, first, size in parts.tolist():
+        for number, identity, first, size in parts[~np.isin(parts[:, 1], unwanted)].tolist():
             found.setdefault(identity, []).append((number, self.raw[first : first + size].data))
         unknown = not found.keys() <= self.file.channels.keys()
-        without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
         for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
             walked = self.walk(number)
             for identity, entries in walked.items() if without[number] else ():
@@ -248,9 +251,9 @@ class _Batch(NamedTuple):
         parts = [np.empty((0, 4), np.int64)]
         numbers = np.flatnonzero(starts < ends)
         starts, ends = starts[numbers], ends[numbers]
-        for _ in range(_CHANNELS_LIMIT):
-            if not len(numbers):
-                break
+        while len(numbers):
+            if len(parts) > _CHANNELS_LIMIT:
+                raise self._damaged(numbers[0], "a chunk has more indexes than there are channels")
             first = starts + _INDEX_HEAD.itemsize
             if (first > ends).any():
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")

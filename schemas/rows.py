@@ -175,10 +175,15 @@ def decode_rows(
         If a payload is not of this type.
     """
     parts: list[tuple[Indices, Fields]] = []
-    for size in np.unique(sizes).tolist():
-        rows = np.flatnonzero(sizes == size)
+    for size, rows in _by_size(sizes):
         parts += _decode_same_size(kind, rows, gather(buffer, offsets[rows], size), fields)
     return _scattered(parts, len(sizes))
+
+
+def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
+    if len(sizes) and (sizes == sizes[0]).all():  # most often, and quicker
+        return [(int(sizes[0]), np.arange(len(sizes)))]
+    return [(size, np.flatnonzero(sizes == size)) for size in np.unique(sizes).tolist()]
 
 
 def _decode_same_size(

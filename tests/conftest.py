@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
+from spliced import record_logs
 
 from analyzer.dataset import build_dataset
 from analyzer.manifest import read_manifest
@@ -76,3 +77,17 @@ def day(tmp_path_factory) -> Path:
     write_day(path, minutes=3, seed=12)
     os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
     return path
+
+
+@pytest.fixture(scope="session", params=["simulated home", "real household"])
+def sounds(request) -> list[Path]:
+    """Sounds of a home to record, simulated and real."""
+    if request.param == "simulated home":
+        return [request.getfixturevalue("day")]
+    return sorted(request.getfixturevalue("household").glob("*/*.flac"))[::20]
+
+
+@pytest.fixture(scope="session")
+def recorded(sounds, tmp_path_factory, model_file) -> Path:
+    """A folder of logs with gaps, of a minute each; the last one, unfinished, is beside it."""
+    return record_logs(sounds, tmp_path_factory.mktemp("logs"), model_file)

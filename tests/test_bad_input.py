@@ -3,13 +3,13 @@
 import os
 import shutil
 import subprocess
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import soundfile
 from logs import features
+from spliced import small_disk
 
 from models.modelfile import load_model, save_model
 from schemas.reader import LogReader
@@ -36,18 +36,6 @@ def sound(tmp_path):
     soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 48_000), 16_000)
     os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
     return path
-
-
-@contextmanager
-def small_disk(folder, size="1m"):
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
-    if subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("only root can mount a small disk")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +117,7 @@ def test_an_output_folder_that_is_a_file(refused, sound, tmp_path):
 
 
 def test_an_output_folder_that_is_read_only(refused, sound, tmp_path):
-    with small_disk(tmp_path / "disk") as disk:
+    with small_disk(tmp_path / "disk", "1m") as disk:
         subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
         expected = f"{disk}: cannot be written (Read-only file system)"
         assert refused("record", sound, "-o", disk) == expected
@@ -140,7 +128,7 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
 ):
     long = tmp_path / "long.wav"
     soundfile.write(long, np.random.default_rng(0).normal(0, 0.1, 16_000 * 300), 16_000)
-    with small_disk(tmp_path / "disk") as disk:
+    with small_disk(tmp_path / "disk", "1m") as disk:
         message = refused("record", long, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert message == (
             f"{disk}: cannot be written (No space left on device); what was recorded is kept and "

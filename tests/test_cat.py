@@ -15,7 +15,7 @@ import typer
 from conftest import HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
-from spliced import record_logs, run, write_log
+from spliced import run, write_log
 
 from analyzer.lines import in_order, json_lines, printable, text_lines
 from analyzer.pieces import pieces
@@ -42,15 +42,6 @@ from tools.cli.times import parse_time
 def hearthlog(capfd):
     """Run the command and return what came of it."""
     return partial(run, capfd)
-
-
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def recorded(request, tmp_path_factory, model_file):
-    if request.param == "simulated home":
-        paths = [request.getfixturevalue("day")]
-    else:
-        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::30]
-    return record_logs(paths, tmp_path_factory.mktemp("logs"), model_file)
 
 
 @pytest.fixture(scope="module")

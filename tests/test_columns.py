@@ -1,8 +1,10 @@
 """Topics read as columns are what is read message by message, whatever the file looks like."""
 
 import json
+import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -31,18 +33,14 @@ from schemas.writer import LogWriter, Rows
 SECOND = NANOSECONDS
 
 
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def logs(request, tmp_path_factory, model_file):
+@pytest.fixture(scope="module")
+def logs(sounds, tmp_path_factory, model_file):
     """Several files of one recording."""
-    if request.param == "simulated home":
-        paths = [request.getfixturevalue("day")]
-    else:
-        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::20]
     folder = tmp_path_factory.mktemp("logs")
     settings = load_settings(
         None, {"output": folder, "model": model_file, "max_bag_duration": 60}, {}
     )
-    found = record_files(settings, FileSource(paths, 1_772_348_370_123_456_789), Event()).logs
+    found = record_files(settings, FileSource(sounds, 1_772_348_370_123_456_789), Event()).logs
     assert len(found) > 2
     return found
 
@@ -407,3 +405,13 @@ def test_definitions_of_the_file_come_before_those_that_are_known(tmp_path):
         writer.finish()
     columns = read_columns([path])["/mic/features"]
     assert (columns["frame"].tolist(), columns["extra"].tolist()) == ([7], ["hi"])
+
+
+def test_reading_that_is_given_up_leaves_no_file_open_and_no_thread(log):
+    def held():
+        return set(os.listdir("/proc/self/fd")), threading.active_count()
+
+    before = held()
+    for _ in iterate_columns([log]):
+        break
+    assert held() == before

@@ -14,7 +14,7 @@ import pytest
 import soundfile
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
-from spliced import raw_messages, record_logs, run, small_disk, write_log
+from spliced import raw_messages, run, small_disk, write_log
 
 from recorder.sources.files import read_audio
 from schemas import messages
@@ -26,15 +26,6 @@ from schemas.reader import LogReader
 
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000
-
-
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def recorded(request, tmp_path_factory, model_file):
-    if request.param == "simulated home":
-        paths = [request.getfixturevalue("day")]
-    else:
-        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::30]
-    return record_logs(paths, tmp_path_factory.mktemp("logs"), model_file)
 
 
 @pytest.fixture(scope="module", params=["simulated home", "real household"])

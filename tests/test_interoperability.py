@@ -4,11 +4,9 @@ import json
 import shutil
 import struct
 from io import BytesIO
-from threading import Event as Flag
 
 import numpy as np
 import pytest
-from lossy import LossySource
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
@@ -23,9 +21,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from models.modelfile import load_model
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
+from schemas.files import find_logs
 from schemas.messages import NANOSECONDS
 from schemas.reader import LogReader
 
@@ -46,25 +42,10 @@ TOPICS = {
 } | {"/diagnostics": "diagnostic_msgs/msg/DiagnosticArray", "/rosout": "rcl_interfaces/msg/Log"}
 
 
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def recorded(request, tmp_path_factory, model_file):
+@pytest.fixture(scope="module")
+def recorded(recorded):
     """Two logs of one recording with gaps, and the last of them when it was unfinished."""
-    if request.param == "simulated home":
-        paths = [request.getfixturevalue("day")]
-    else:
-        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::20]
-    folder = tmp_path_factory.mktemp("logs")
-    unfinished = folder / "unfinished.mcap.active"
-
-    def copy_active():
-        (active,) = (folder / "logs").rglob("*.active")
-        shutil.copy(active, unfinished)
-
-    settings = Settings(output=folder / "logs", model=model_file, max_bag_duration=60)
-    source = LossySource(FileSource(paths, START), LOST, copy_active)
-    logs = record(settings, source, Flag()).logs
-    assert len(logs) > 1
-    return logs, unfinished
+    return find_logs(recorded), recorded.parent / "unfinished.mcap.active"
 
 
 @pytest.fixture

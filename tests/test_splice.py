@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from spliced import LOST, raw_messages, record_logs, run, small_disk, write_log
+from spliced import LOST, raw_messages, run, small_disk, write_log
 
 from analyzer.selection import select
 from analyzer.splice import splice
@@ -28,15 +28,6 @@ FEATURES = Topic("/mic/features", messages.FEATURES, array_names={"values": ["a"
 def hearthlog(capfd):
     """Run the command and return what came of it."""
     return partial(run, capfd)
-
-
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def recorded(request, tmp_path_factory, model_file):
-    if request.param == "simulated home":
-        paths = [request.getfixturevalue("day")]
-    else:
-        paths = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::20]
-    return record_logs(paths, tmp_path_factory.mktemp("logs"), model_file)
 
 
 @pytest.fixture

@@ -9,15 +9,11 @@ from analyzer.replay.origin import Origin
 from models.modelfile import Model
 from recorder import features
 from recorder.log import LogDescription
-from recorder.statistics import WINDOW_FRAMES
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.messages import NANOSECONDS, header, message
+from recorder.pipeline import stream_info
 from schemas.topics import topics_of
 from schemas.writer import Attachment
 
 MODEL_CARD = "model_card.md"
-_FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
 
 
 def describe(
@@ -38,21 +34,8 @@ def describe(
     """
     if model is not None and model.sha256 == origin.model_sha256:
         model = replace(model, name=origin.model)  # whatever its file is called here
-    name, digest = ("", "") if model is None else (model.name, model.sha256)
     classes = None if model is None else list(model.classes)
-    info = message(
-        messages.STREAM_INFO,
-        header=header(0, origin.microphone),
-        device=origin.device,
-        sample_rate=features.SAMPLE_RATE,
-        frame_seconds=_FRAME_SECONDS,
-        window_seconds=_FRAME_SECONDS * WINDOW_FRAMES,
-        feature_set=features.NAME,
-        feature_names=list(features.FEATURE_NAMES),
-        model=name,
-        model_sha256=digest,
-        labels=classes or [],
-    )
+    info = stream_info(origin.microphone, origin.device, model)
     attachments = [item for item in origin.attachments if item.name != MODEL_CARD]
     if model is not None:
         attachments.append(Attachment(MODEL_CARD, "text/markdown", model.card().encode()))
@@ -67,8 +50,8 @@ def describe(
             "version": version("hearthlog"),
             "node": origin.node,
             "feature_set": features.NAME,
-            "model": name,
-            "model_sha256": digest,
+            "model": info.model,
+            "model_sha256": info.model_sha256,
             **replayed,
         },
         attachments=attachments,
