@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from analyzer.errors import DataError
 from analyzer.manifest import Clip
 from analyzer.scenario import Scenario
+from models.inputs import WINDOW_FRAMES
 from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
 from recorder.sources.files import read_audio
-from recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from recorder.statistics import RollingStatistics
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24

@@ -18,6 +18,7 @@ from sklearn.svm import SVC
 from analyzer.dataset import Dataset
 from analyzer.errors import DataError
 from analyzer.scenario import Scenario
+from models.inputs import WINDOW_FRAMES
 from models.modelfile import (
     Amount,
     ClassMetrics,
@@ -29,7 +30,6 @@ from models.modelfile import (
     TrainingData,
 )
 from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, NAME, SAMPLE_RATE
-from recorder.statistics import WINDOW_FRAMES
 
 # Cost and gamma times the number of statistics; of equals the first wins.
 GRID = [(c, g) for c in (4.0, 1.0, 16.0) for g in (0.5, 0.25, 1.0)]

@@ -22,10 +22,13 @@ class Classifier:
     ----------
     classes : tuple of str
         Names behind the columns of the probabilities.
+    inputs : str
+        What `probabilities` takes, as `models.inputs` makes them.
     """
 
     def __init__(self, model: Model) -> None:
         self.classes = model.classes
+        self.inputs = model.description.inputs
         self._mean = model.scaler_mean
         self._scale = model.scaler_scale
         self._intercepts = model.intercepts
@@ -37,35 +40,35 @@ class Classifier:
         self._sides = one_hot[self._first] - one_hot[self._second]
         self._times_second = np.bincount(self._second, minlength=count)
 
-    def probabilities(self, statistics: Float32) -> Float32:
+    def probabilities(self, inputs: Float32) -> Float32:
         """Compute the probability of each class.
 
         Parameters
         ----------
-        statistics : np.ndarray [shape=(n, 42)], float32
-            Means, then standard deviations of the features; finite.
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
 
         Returns
         -------
         np.ndarray [shape=(n, C)], float32
             In the order of the model's classes; every row sums to 1.
         """
-        result = np.empty((len(statistics), len(self.classes)), np.float32)
-        for start in range(0, len(statistics), _ROWS_AT_ONCE):
+        result = np.empty((len(inputs), len(self.classes)), np.float32)
+        for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
-            votes = self._votes(self._pairs(statistics[rows])) * self._inverse_temperature
+            votes = self._votes(self._pairs(inputs[rows])) * self._inverse_temperature
             votes -= votes.max(axis=1, keepdims=True)
             np.exp(votes, out=votes)
             result[rows] = votes / votes.sum(axis=1, keepdims=True)
         return result
 
-    def _pairs(self, statistics: Float32) -> Float64:
+    def _pairs(self, inputs: Float32) -> Float64:
         """Decision of every pair of classes, shape (n, C (C - 1) / 2)."""
-        scaled = (statistics - self._mean) / self._scale
+        scaled = (inputs - self._mean) / self._scale
         square = np.vecdot(scaled, scaled)[:, np.newaxis]
         extended = np.concatenate([scaled, square, np.ones_like(square)], axis=1)
         classes = len(self.classes)
-        against = np.zeros((classes, len(statistics), classes - 1))
+        against = np.zeros((classes, len(inputs), classes - 1))
         for index, weights, coefficients in self._blocks:
             kernel = rowwise_matmul(extended, weights)
             np.minimum(kernel, 0.0, out=kernel)  # a distance rounded to less than none

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from safetensors.numpy import load, save
 
 from models.errors import ModelError
+from models.inputs import WINDOW_FRAMES, Kind, input_width
 from schemas.errors import LogError
 from schemas.files import check_new, new_file
 
@@ -27,6 +28,7 @@ _HEADER_LIMIT = 4 << 20  # parsed, it takes many times its size
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 _LARGEST = 1e9  # with _SMALLEST_SCALE: no product of finite statistics overflows
 _SMALLEST_SCALE = 1e-30
+_ROUNDING = 1e-9
 _DTYPES: dict[str, np.dtype[Any]] = {
     "scaler_mean": np.dtype(np.float64),
     "scaler_scale": np.dtype(np.float64),
@@ -34,6 +36,12 @@ _DTYPES: dict[str, np.dtype[Any]] = {
     "support_counts": np.dtype(np.int64),
     "dual_coefficients": np.dtype(np.float64),
     "intercepts": np.dtype(np.float64),
+}
+_OPTIONAL: dict[str, np.dtype[Any]] = {
+    "transitions": np.dtype(np.float64),
+    "training_windows": np.dtype(np.float32),
+    "training_target": np.dtype(np.int64),
+    "training_group": np.dtype(np.int64),
 }
 
 Float64 = NDArray[np.float64]
@@ -97,9 +105,18 @@ class Metrics(_Record):
 
 
 class Smoothing(_Record):
-    """How labels become segments."""
+    """How labels become segments.
 
-    method: Literal["merge"]
+    Attributes
+    ----------
+    method : str
+        `merge`: successive equal labels become one. `hmm`: the labels are those of the likeliest
+        path through a hidden Markov model, decided `lag_seconds` after the sound.
+    lag_seconds : float
+    """
+
+    method: Literal["merge", "hmm"]
+    lag_seconds: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
 
 
 class Description(_Record):
@@ -113,6 +130,7 @@ class Description(_Record):
     classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
     feature_set: _Text
     feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
+    inputs: Kind = "statistics"
     window_seconds: _Positive
     scenario_name: _Text
     scenario: dict[_ClassName, list[_Text]]
@@ -133,16 +151,22 @@ class Model:
     Attributes
     ----------
     description : Description
-    scaler_mean, scaler_scale : np.ndarray [shape=(2d,)], float64
-        Of the statistics: d means, then d standard deviations, in the order of the feature names.
-    support_vectors : np.ndarray [shape=(n, 2d)], float32
-        Statistics, not scaled, class after class.
+    scaler_mean, scaler_scale : np.ndarray [shape=(width,)], float64
+        Of the inputs that `models.inputs` makes.
+    support_vectors : np.ndarray [shape=(n, width)], float32
+        Inputs, not scaled, class after class.
     support_counts : np.ndarray [shape=(C,)], int64
         Support vectors of each class.
     dual_coefficients : np.ndarray [shape=(C - 1, n)], float64
         As in libsvm: row j of a vector of class i is against class j if j < i, else j + 1.
     intercepts : np.ndarray [shape=(C (C - 1) / 2,)], float64
         Of the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
+    transitions : np.ndarray [shape=(C, C)], float64
+        Of the hidden Markov model, from row to column, a frame; empty where segments are merged.
+    training_windows : np.ndarray [shape=(m, 20, d)], float32
+        Features that it was learned from, to learn from them again; empty if they are not kept.
+    training_target, training_group : np.ndarray [shape=(m,)], int64
+        Their classes, and the numbers of their sources.
     name : str
         Stem of the file it was loaded from.
     sha256 : str
@@ -156,6 +180,12 @@ class Model:
     support_counts: NDArray[np.int64]
     dual_coefficients: Float64
     intercepts: Float64
+    transitions: Float64 = field(default_factory=lambda: np.empty((0, 0)))
+    training_windows: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty((0, 0, 0), np.float32)
+    )
+    training_target: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    training_group: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     name: str = ""
     sha256: str = ""
 
@@ -224,7 +254,8 @@ def save_model(model: Model, path: Path) -> None:
         If the file exists, the folder does not or cannot be written, or the model is inconsistent.
     """
     check_output(path)
-    arrays = {name: np.ascontiguousarray(getattr(model, name)) for name in _DTYPES}
+    every = {name: np.ascontiguousarray(getattr(model, name)) for name in _DTYPES | _OPTIONAL}
+    arrays = {name: array for name, array in every.items() if name in _DTYPES or array.size}
     _check(path, model.description, arrays)
     text = json.dumps(model.description.model_dump(), ensure_ascii=False)
     data = save(arrays, {_KEY: text})
@@ -251,7 +282,7 @@ def load_model(path: Path) -> Model:
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
         raise ModelError(f"{path}: is no model file ({_one_line(error)})") from error
     description = _description(path, data)
-    if arrays.keys() != _DTYPES.keys():
+    if not _DTYPES.keys() <= arrays.keys() <= (_DTYPES | _OPTIONAL).keys():
         raise ModelError(f"{path}: has other arrays than a model of hearthlog")
     _check(path, description, arrays)
     for array in arrays.values():
@@ -315,8 +346,45 @@ def _check(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> N
     problem = _problem(about)
     if problem:
         raise ModelError(f"{path}: {problem}")
-    classes, width = len(about.classes), 2 * len(about.feature_names)
-    total = len(arrays["support_vectors"]) if arrays["support_vectors"].ndim else 0
+    shapes = _shapes(about, arrays)
+    if shapes.keys() != arrays.keys():
+        name = min(shapes.keys() ^ arrays.keys())
+        raise ModelError(f"{path}: {name} {'is missing' if name in shapes else 'is out of place'}")
+    for name, shape in shapes.items():
+        _check_array(path, name, arrays[name], shape)
+    if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
+        raise ModelError(f"{path}: scaler_scale has values that are not positive")
+    counts = arrays["support_counts"]
+    total = len(arrays["support_vectors"])
+    if (counts < 0).any() or counts.sum() != total:
+        raise ModelError(f"{path}: support_counts do not add up to the {total} support vectors")
+    target = arrays.get("training_target", counts[:0])
+    if ((target < 0) | (target >= len(about.classes))).any():
+        raise ModelError(f"{path}: training_target has classes that the model has not")
+    transitions = arrays.get("transitions", np.ones((1, 1)))
+    if (transitions < 0).any() or (np.abs(transitions.sum(axis=1) - 1.0) > _ROUNDING).any():
+        raise ModelError(f"{path}: the rows of transitions are no probabilities")
+
+
+def _check_array(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    dtype = (_DTYPES | _OPTIONAL)[name]
+    if array.dtype != dtype:
+        raise ModelError(f"{path}: {name} is of type {array.dtype}, not {dtype}")
+    if array.shape != shape:
+        raise ModelError(f"{path}: {name} has shape {array.shape}, not {shape}")
+    if not np.isfinite(array).all():
+        raise ModelError(f"{path}: {name} has values that are not finite")
+    if array.dtype == np.float64 and not (np.abs(array) <= _LARGEST).all():
+        raise ModelError(f"{path}: {name} has values that make no sense")
+
+
+def _shapes(about: Description, arrays: dict[str, NDArray[Any]]) -> dict[str, tuple[int, ...]]:
+    """Return the shape that each array must have."""
+    classes, width = len(about.classes), input_width(about.inputs)
+    total, kept = (
+        len(arrays[name]) if name in arrays and arrays[name].ndim else 0
+        for name in ("support_vectors", "training_windows")
+    )
     shapes: dict[str, tuple[int, ...]] = {
         "scaler_mean": (width,),
         "scaler_scale": (width,),
@@ -325,21 +393,12 @@ def _check(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> N
         "dual_coefficients": (classes - 1, total),
         "intercepts": (classes * (classes - 1) // 2,),
     }
-    for name, shape in shapes.items():
-        array = arrays[name]
-        if array.dtype != _DTYPES[name]:
-            raise ModelError(f"{path}: {name} is of type {array.dtype}, not {_DTYPES[name]}")
-        if array.shape != shape:
-            raise ModelError(f"{path}: {name} has shape {array.shape}, not {shape}")
-        if not np.isfinite(array).all():
-            raise ModelError(f"{path}: {name} has values that are not finite")
-        if name != "support_vectors" and not (np.abs(array.astype(np.float64)) <= _LARGEST).all():
-            raise ModelError(f"{path}: {name} has values that make no sense")
-    if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
-        raise ModelError(f"{path}: scaler_scale has values that are not positive")
-    counts = arrays["support_counts"]
-    if (counts < 0).any() or counts.sum() != total:
-        raise ModelError(f"{path}: support_counts do not add up to the {total} support vectors")
+    if about.smoothing.method == "hmm":
+        shapes["transitions"] = (classes, classes)
+    if kept:
+        shapes["training_windows"] = (kept, WINDOW_FRAMES, len(about.feature_names))
+        shapes["training_target"] = shapes["training_group"] = (kept,)
+    return shapes
 
 
 def _one_line(text: object) -> str:

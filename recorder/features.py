@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from models.inputs import dct_weights
 from models.rowwise import rowwise_matmul
 
 NAME = "auros21"
@@ -111,7 +112,7 @@ class FeatureExtractor:
         power = np.square(magnitude[1:], out=magnitude[1:])
         out[:, 7] = _rolloff(power, band_power[1:])
         mel_db = 10.0 * np.log10(rowwise_matmul(power, _mel_weights()) + _POWER_FLOOR)
-        out[:, 8:] = rowwise_matmul(mel_db, _dct_weights())
+        out[:, 8:] = rowwise_matmul(mel_db, dct_weights())
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
@@ -163,16 +164,6 @@ def _moment_weights() -> Float64:
 def _mel_weights() -> Float64:
     """Mel bank for squared DFT magnitudes: a full-scale sine has power 1 (0 dB)."""
     return mel_bank() / _BINS**2
-
-
-@cache
-def _dct_weights() -> Float64:
-    """Orthonormal DCT-II, its first 13 coefficients (the first is the level)."""
-    band = np.arange(_MEL_BANDS)[:, np.newaxis]
-    order = np.arange(MFCC_COUNT)
-    weights = np.sqrt(2.0 / _MEL_BANDS) * np.cos(np.pi / _MEL_BANDS * (band + 0.5) * order)
-    weights[:, 0] /= np.sqrt(2.0)
-    return weights
 
 
 def _energy_of_parts(rows: Float64, parts: int) -> Float64:

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.classifier import Classifier
+from models.inputs import WINDOW_FRAMES, InputStream
 from models.modelfile import Model
 from models.segments import Segment, SegmentMerger
 from recorder import features, lines
 from recorder.features import FeatureExtractor
-from recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from recorder.statistics import RollingStatistics
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
 from schemas import messages
 from schemas.messages import duration_message, encode, header, message, nanoseconds
@@ -82,6 +83,7 @@ class Pipeline:
     ) -> None:
         self.microphone = microphone
         self._classifier = classifier
+        self._inputs = None if classifier is None else InputStream(classifier.inputs)
         self._statistics_every = statistics_every
         self._features = FeatureExtractor()
         self._statistics = RollingStatistics()
@@ -108,7 +110,6 @@ class Pipeline:
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         """
-        whole_window = max(WINDOW_FRAMES - 1 - self._statistics.remembered, 0)
         mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))
         shown = np.flatnonzero(frames % self._statistics_every == 0)
@@ -118,11 +119,10 @@ class Pipeline:
                 "statistics", frames[shown], stamps[shown], {"mean": mean[shown], "std": std[shown]}
             ),
         ]
-        if self._classifier is not None and whole_window < len(features):
-            window = np.concatenate([mean, std], axis=1)[whole_window:]
-            records += self._labels(
-                self._classifier, window, frames[whole_window:], stamps[whole_window:]
-            )
+        if self._classifier is not None and self._inputs is not None:
+            inputs = self._inputs(features)  # at the last frames: labels are of a whole second
+            heard = slice(len(frames) - len(inputs), None)
+            records += self._labels(self._classifier, inputs, frames[heard], stamps[heard])
         records.sort(key=itemgetter(0))
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
         return records
@@ -134,6 +134,8 @@ class Pipeline:
     def _push_gap(self, gap: Gap) -> list[Record]:
         self._features.restart()
         self._statistics.restart()
+        if self._inputs is not None:
+            self._inputs.restart()
         closed = self._segment_records(self._segments.close(self._end))
         data = encode(
             message(
@@ -151,9 +153,11 @@ class Pipeline:
         ]
 
     def _labels(
-        self, classifier: Classifier, window: Float32, frames: Int64, stamps: Int64
+        self, classifier: Classifier, inputs: Float32, frames: Int64, stamps: Int64
     ) -> list[Record]:
-        probabilities = classifier.probabilities(window)
+        if not len(inputs):
+            return []
+        probabilities = classifier.probabilities(inputs)
         best = probabilities.argmax(axis=1)
         confidence = probabilities[np.arange(len(best)), best]
         closed = self._segments.push(best, confidence, stamps)

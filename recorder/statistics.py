@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-WINDOW_FRAMES = 20
+from models.inputs import WINDOW_FRAMES, mean_and_std
+
 _FRAMES_AT_ONCE = 256
 
 Float32 = NDArray[np.float32]
@@ -17,11 +18,6 @@ class RollingStatistics:
 
     def __init__(self) -> None:
         self._recent: Float32 | None = None
-
-    @property
-    def remembered(self) -> int:
-        """Frames that the window of the next frame begins with, at most 19."""
-        return 0 if self._recent is None else len(self._recent)
 
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""
@@ -52,18 +48,8 @@ class RollingStatistics:
         heard = np.concatenate([recent, features])
         filling = min(max(WINDOW_FRAMES - 1 - len(recent), 0), len(features))
         for i in range(filling):
-            _mean_and_std(heard[np.newaxis, : len(recent) + i + 1], mean[i : i + 1], std[i : i + 1])
+            mean[i : i + 1], std[i : i + 1] = mean_and_std(heard[np.newaxis, : len(recent) + i + 1])
         if filling < len(features):
             windows = np.lib.stride_tricks.sliding_window_view(heard, WINDOW_FRAMES, axis=0)
-            _mean_and_std(windows.transpose(0, 2, 1), mean[filling:], std[filling:])
+            mean[filling:], std[filling:] = mean_and_std(windows.transpose(0, 2, 1))
         self._recent = heard[max(len(heard) - WINDOW_FRAMES + 1, 0) :].copy()
-
-
-def _mean_and_std(windows: Float32, mean: Float32, std: Float32) -> None:
-    """Reduce windows of shape (n, frames, d) along their frames, in float64."""
-    frames = windows.shape[1]
-    center = windows.sum(axis=1, dtype=np.float64) / frames
-    mean[...] = center
-    deviation = windows - center[:, np.newaxis]
-    np.square(deviation, out=deviation)
-    std[...] = np.sqrt(deviation.sum(axis=1) / frames)

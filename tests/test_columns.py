@@ -1,7 +1,6 @@
 """Topics read as columns are what is read message by message, whatever the file looks like."""
 
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -409,7 +408,7 @@ def test_definitions_of_the_file_come_before_those_that_are_known(tmp_path):
 
 def test_reading_that_is_given_up_leaves_no_file_open_and_no_thread(log):
     def held():
-        return set(os.listdir("/proc/self/fd")), threading.active_count()
+        return set(Path("/proc/self/fd").iterdir()), threading.active_count()
 
     before = held()
     for _ in iterate_columns([log]):

@@ -12,8 +12,8 @@ from mcap.records import Channel
 from analyzer.doctor.contract import NAME, Contract, place_of, type_of
 from analyzer.doctor.data import ATTACHMENTS, Data
 from analyzer.doctor.findings import DISTRUST, Findings
+from models.inputs import WINDOW_FRAMES
 from recorder import features
-from recorder.statistics import WINDOW_FRAMES
 from schemas.messages import NANOSECONDS, definition, type_hash
 from schemas.rosbag2 import METADATA as ROSBAG2
 from schemas.topics import Topic, topics_of

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analyzer.doctor.findings import DISTRUST, Findings
-from recorder.statistics import WINDOW_FRAMES
+from models.inputs import WINDOW_FRAMES
 from recorder.stream import FRAME_NANOSECONDS
 from schemas.rows import Int64
 

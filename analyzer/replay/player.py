@@ -12,11 +12,11 @@ from analyzer.replay.description import describe
 from analyzer.replay.origin import Origin
 from analyzer.replay.recorded import Features, Piece
 from models.classifier import Classifier
+from models.inputs import WINDOW_FRAMES
 from models.modelfile import Model
 from recorder import features
 from recorder.log import RollingLog
 from recorder.pipeline import Pipeline, Record
-from recorder.statistics import WINDOW_FRAMES
 from recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
 from schemas.errors import LogError
 from schemas.messages import NANOSECONDS

@@ -11,8 +11,9 @@ from sklearn.svm import SVC
 
 from analyzer.train import group_folds
 from models.classifier import Classifier
+from models.inputs import WINDOW_FRAMES
 from recorder.features import FeatureExtractor
-from recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from recorder.statistics import RollingStatistics
 from tools.bench.table import Row, Table, Target
 from tools.bench.timing import best_of
 from tools.bench.workload import Workload

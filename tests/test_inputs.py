@@ -1,0 +1,53 @@
+"""Inputs of a classifier: the same bits in any blocks, the paper's where it is asked for."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.inputs import InputStream, bands_of, dct_weights, input_width, window_inputs
+from recorder.statistics import RollingStatistics
+
+KINDS = ["statistics", "bands"]
+
+
+def features(count, seed=0):
+    values = np.abs(np.random.default_rng(seed).standard_normal((count, 21)))
+    return values.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(st.lists(st.integers(0, 70), max_size=30), st.integers(1, 700), st.integers(0, 2**32))
+def test_blocks_of_any_size_agree_bit_for_bit(kind, sizes, count, seed):
+    values = features(count, seed)
+    whole, stream = InputStream(kind)(values), InputStream(kind)
+    borders = [0, *np.cumsum(sizes).clip(0, count).tolist(), count]
+    parts = [stream(values[a:b]) for a, b in zip(borders, borders[1:], strict=False)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    assert whole.shape == (max(count - 19, 0), input_width(kind))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_windows_on_their_own_give_what_the_stream_gives(kind):
+    values = features(400)
+    windows = np.lib.stride_tricks.sliding_window_view(values, 20, axis=0).transpose(0, 2, 1)
+    np.testing.assert_array_equal(window_inputs(kind, windows), InputStream(kind)(values))
+
+
+def test_statistics_are_those_of_the_log():
+    values = features(300)
+    logged = np.concatenate(RollingStatistics()(values), axis=1)
+    np.testing.assert_array_equal(InputStream("statistics")(values), logged[19:])
+
+
+def test_after_a_restart_the_window_fills_again():
+    values, stream = features(100), InputStream("bands")
+    stream(values[:50])
+    stream.restart()
+    np.testing.assert_array_equal(stream(values[50:]), InputStream("bands")(values[50:]))
+
+
+def test_bands_of_a_smooth_spectrum_come_back_from_its_cepstra():
+    smooth = 10.0 * np.cos(np.pi * (np.arange(32) + 0.5) / 32 * 3) - 40.0
+    cepstra = (smooth @ dct_weights())[np.newaxis].astype(np.float32)
+    np.testing.assert_allclose(bands_of(cepstra)[0], smooth, atol=1e-4)
