@@ -1,9 +1,11 @@
-"""From labelled clips to what a classifier learns from: statistics of one-second segments."""
+"""From labelled sound to what a classifier learns from: windows of one second."""
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +16,48 @@ from analyzer.scenario import Scenario
 from models.inputs import WINDOW_FRAMES
 from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
 from recorder.sources.files import read_audio
-from recorder.statistics import RollingStatistics
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
+_FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 _ENERGY = FEATURE_NAMES.index("energy")
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 _UNGATED = "silence"
 
 Float32 = NDArray[np.float32]
+Indices = NDArray[np.intp]
+Progress = Callable[[int, int], None]
+
+
+class Recording(NamedTuple):
+    """A stretch of sound of one label.
+
+    Attributes
+    ----------
+    label, group, collection, licence : str
+        As in a manifest: of one group, nothing is both learned from and tested on.
+    features : np.ndarray [shape=(n, 21)], float32
+        Of successive frames.
+    weight : float
+        How much a segment of it counts.
+    """
+
+    label: str
+    group: str
+    collection: str
+    licence: str
+    features: Float32
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of a class there is."""
+
+    sources: int
+    segments: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -32,46 +66,67 @@ class Dataset:
 
     Attributes
     ----------
-    statistics : np.ndarray [shape=(n, 42)], float32
-        Mean, then standard deviation of the 21 features over each segment.
+    windows : np.ndarray [shape=(n, 20, 21)], float32
+        Features of a second each.
     target : np.ndarray [shape=(n,)], intp
         Index into `classes`.
-    group : np.ndarray [shape=(n,)], intp
-        Number of the source group.
+    group, collection : np.ndarray [shape=(n,)], intp
+        Numbers of the source group and of the collection.
+    weight : np.ndarray [shape=(n,)], float64
+        How much a segment counts.
     classes : tuple of str
-    clips : tuple of Clip
-        Those that gave segments.
-    clip_seconds : tuple of float
-        How long they are.
+    seconds : dict of str to float
+        Sound of each class that was used, before it was thinned out.
+    collection_names : tuple of str
+        The names behind `collection`.
+    collections : dict of (name, licence) to int
+        How many recordings were used.
     skipped : dict of str to int
-        Why clips gave no segment, and how many.
+        Why recordings gave no segment, and how many.
     """
 
-    statistics: Float32
-    target: NDArray[np.intp]
-    group: NDArray[np.intp]
+    windows: Float32
+    target: Indices
+    group: Indices
+    collection: Indices
+    weight: NDArray[np.float64]
     classes: tuple[str, ...]
-    clips: tuple[Clip, ...]
-    clip_seconds: tuple[float, ...]
-    skipped: dict[str, int]
+    seconds: Mapping[str, float]
+    collection_names: tuple[str, ...]
+    collections: Mapping[tuple[str, str], int]
+    skipped: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.target)
 
     @property
     def digest(self) -> str:
         """SHA-256 of the segments, their classes and their groups."""
         digest = hashlib.sha256("\n".join(self.classes).encode())
-        for array in (self.statistics, self.target.astype("<i8"), self.group.astype("<i8")):
+        for array in (self.windows, self.target.astype("<i8"), self.group.astype("<i8")):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
+    @property
+    def amounts(self) -> dict[str, Amount]:
+        """How much there is of each class."""
+        return {
+            name: Amount(
+                sources=len(np.unique(self.group[self.target == i])),
+                segments=int((self.target == i).sum()),
+                seconds=round(self.seconds.get(name, 0.0), 3),
+            )
+            for i, name in enumerate(self.classes)
+        }
+
 
 def build_dataset(
-    clips: Sequence[Clip], scenario: Scenario, progress: Callable[[int, int], None]
+    clips: Sequence[Clip],
+    scenario: Scenario,
+    progress: Progress,
+    home: Iterable[Recording] = (),
 ) -> Dataset:
-    """Cut the clips of a scenario's labels into one-second segments, half a second apart.
-
-    A segment is kept if it is no more than 12 dB below its clip's mean level and above -60 dBFS;
-    of silence all are. A clip shorter than a second gives none. At most 24 segments, evenly
-    spaced, are kept for each class and source group.
+    """Cut the clips of a scenario's labels into segments, as `cut_recordings` does.
 
     Parameters
     ----------
@@ -79,6 +134,8 @@ def build_dataset(
     scenario : Scenario
     progress : callable
         Told how many clips of how many are done.
+    home : iterable of Recording
+        More to learn from.
 
     Raises
     ------
@@ -87,55 +144,77 @@ def build_dataset(
     SourceError
         If a clip cannot be read.
     """
-    class_of = scenario.class_of
-    classes = tuple(scenario.classes)
-    groups: dict[str, int] = {}
-    skipped: Counter[str] = Counter()
-    used: list[Clip] = []
-    seconds: list[float] = []
-    statistics: list[Float32] = []
-    target: list[int] = []
-    group: list[int] = []
-    for number, clip in enumerate(clips):
-        progress(number, len(clips))
-        name = class_of.get(clip.label)
-        if name is None:
-            skipped[f"label {clip.label} is not in the scenario"] += 1
-            continue
-        features = _features(clip)
-        if len(features) < WINDOW_FRAMES:  # the recorder labels whole windows only
-            skipped["shorter than a second"] += 1
-            continue
-        segments = _segments(features, gated=clip.label != _UNGATED)
-        if not len(segments):
-            skipped["nowhere above -60 dBFS"] += 1
-            continue
-        used.append(clip)
-        seconds.append(len(features) * FRAME_SAMPLES / SAMPLE_RATE)
-        statistics.append(segments)
-        target.append(classes.index(name))
-        group.append(groups.setdefault(clip.source_group, len(groups)))
-    progress(len(clips), len(clips))
-    for index, name in enumerate(classes):
-        if index not in target:
+    data = cut_recordings(chain(_heard(clips, scenario, progress), home), scenario)
+    for name, amount in data.amounts.items():
+        if not amount.segments:
             labels = ", ".join(scenario.classes[name])
             raise DataError(f"class {name} has no segments: no usable clip is labelled {labels}")
-    counts = [len(segments) for segments in statistics]
-    clip_of = np.repeat(np.arange(len(used)), counts)
-    target_of, group_of = np.array(target)[clip_of], np.array(group)[clip_of]
-    kept = _thinned(target_of * len(groups) + group_of)
+    return data
+
+
+def _heard(clips: Sequence[Clip], scenario: Scenario, progress: Progress) -> Iterable[Recording]:
+    known = scenario.class_of
+    for number, clip in enumerate(clips):
+        progress(number, len(clips))
+        features = clip_features(clip) if clip.label in known else np.empty((0, 0), np.float32)
+        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
+    progress(len(clips), len(clips))
+
+
+def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Dataset:
+    """Cut recordings into segments of a second, half a second apart.
+
+    A segment is kept if it is no more than 12 dB below its recording's mean level and above
+    -60 dBFS; of silence all are. At most 24 segments, evenly spaced, are kept for each class and
+    source group.
+    """
+    classes = tuple(scenario.classes)
+    class_of = {name: name for name in classes} | scenario.class_of
+    groups: dict[str, int] = {}
+    collections: dict[str, int] = {}
+    used: Counter[tuple[str, str]] = Counter()
+    skipped: Counter[str] = Counter()
+    seconds: dict[str, float] = {}
+    windows = [np.empty((0, WINDOW_FRAMES, len(FEATURE_NAMES)), np.float32)]
+    weights = [np.empty(0)]
+    rows = [np.empty((0, 3), np.intp)]
+    for item in recordings:
+        reason, found = _segments(item, class_of)
+        if reason:
+            skipped[reason] += 1
+            continue
+        name = class_of[item.label]
+        used[item.collection, item.licence] += 1
+        seconds[name] = seconds.get(name, 0.0) + len(item.features) * _FRAME_SECONDS
+        windows.append(found)
+        weights.append(np.full(len(found), item.weight))
+        group = groups.setdefault(item.group, len(groups))
+        collection = collections.setdefault(item.collection, len(collections))
+        rows.append(np.tile([classes.index(name), group, collection], (len(found), 1)))
+    target, group_of, collection_of = np.concatenate(rows).T
+    kept = _thinned(target * len(groups) + group_of)
     return Dataset(
-        np.concatenate(statistics)[kept],
-        target_of[kept],
+        np.concatenate(windows)[kept],
+        target[kept],
         group_of[kept],
+        collection_of[kept],
+        np.concatenate(weights)[kept],
         classes,
-        tuple(used),
-        tuple(seconds),
+        seconds,
+        tuple(collections),
+        dict(used),
         dict(sorted(skipped.items())),
     )
 
 
-def _features(clip: Clip) -> Float32:
+def clip_features(clip: Clip) -> Float32:
+    """Compute the features of a clip, shape (n, 21).
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read.
+    """
     extract = FeatureExtractor()
     features = [np.empty((0, len(FEATURE_NAMES)), np.float32)]
     rest = np.empty(0, np.float32)
@@ -147,21 +226,27 @@ def _features(clip: Clip) -> Float32:
     return np.concatenate(features)
 
 
-def _segments(features: Float32, *, gated: bool) -> Float32:
-    """Statistics of the segments of one clip that are loud enough, shape (n, 42)."""
-    mean, std = RollingStatistics()(features)
-    ends = slice(WINDOW_FRAMES - 1, None, HOP_FRAMES)
-    segments = np.concatenate([mean[ends], std[ends]], axis=1)
-    if not gated:
-        return segments
-    energy = segments[:, _ENERGY]
-    clip_energy = features[:, _ENERGY].mean(dtype=np.float64)
-    return segments[energy > max(_FLOOR, clip_energy * _BELOW_CLIP)]
+def _segments(recording: Recording, class_of: Mapping[str, str]) -> tuple[str, Float32]:
+    """Return why there are no segments, or those that are loud enough, shape (n, 20, 21)."""
+    features = recording.features
+    nothing = np.empty((0, WINDOW_FRAMES, len(FEATURE_NAMES)), np.float32)
+    if recording.label not in class_of:
+        return f"label {recording.label} is not in the scenario", nothing
+    if len(features) < WINDOW_FRAMES:  # the recorder labels whole windows only
+        return "shorter than a second", nothing
+    every = np.lib.stride_tricks.sliding_window_view(features, WINDOW_FRAMES, axis=0)
+    windows = every[::HOP_FRAMES].transpose(0, 2, 1)
+    if recording.label == _UNGATED:
+        return "", windows
+    energy = windows[:, :, _ENERGY].mean(axis=1, dtype=np.float64)
+    level = features[:, _ENERGY].mean(dtype=np.float64)
+    found = windows[energy > max(_FLOOR, level * _BELOW_CLIP)]
+    return ("" if len(found) else "nowhere above -60 dBFS"), found
 
 
-def _thinned(key: NDArray[np.intp]) -> NDArray[np.intp]:
+def _thinned(key: Indices) -> Indices:
     """Choose at most 24 evenly spaced rows of each key; return their indices in order."""
-    kept = []
+    kept = [np.empty(0, np.intp)]
     for value in np.unique(key):
         rows = np.flatnonzero(key == value)
         count = min(len(rows), SEGMENTS_PER_GROUP)

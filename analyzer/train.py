@@ -1,22 +1,29 @@
-"""Learn a model from segments: an RBF support vector machine, chosen and measured by sources."""
+"""Learn a model from segments, and measure it on sources that it has not heard."""
 
-import os
-from collections import Counter
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.calibration import CalibratedClassifierCV
-from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
-from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import StandardScaler
-from sklearn.svm import SVC
+from sklearn.pipeline import Pipeline
 
-from analyzer.dataset import Dataset
+from analyzer.dataset import Dataset, Progress
 from analyzer.errors import DataError
+from analyzer.evaluation.scores import calibration_error
+from analyzer.hmm import LAG_SECONDS, default_transitions
+from analyzer.recipe import (
+    HOME_VOTE,
+    RECIPES,
+    Fold,
+    Recipe,
+    cross_validate,
+    fit,
+    inverse_temperature,
+    prepare,
+    softmax,
+)
 from analyzer.scenario import Scenario
 from models.inputs import WINDOW_FRAMES
 from models.modelfile import (
@@ -31,23 +38,22 @@ from models.modelfile import (
 )
 from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, NAME, SAMPLE_RATE
 
-# Cost and gamma times the number of statistics; of equals the first wins.
-GRID = [(c, g) for c in (4.0, 1.0, 16.0) for g in (0.5, 0.25, 1.0)]
 MOST_FOLDS = 5
+SMOOTHINGS = ("hmm", "merge")
 _SHUFFLES = 20
-_CALIBRATION_BINS = 15
-_WORKERS = 4
 
 Float64 = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Folds = list[tuple[Indices, Indices]]
 
 
-def train_model(data: Dataset, scenario: Scenario, progress: Callable[[int, int], None]) -> Model:
-    """Choose cost and gamma by cross-validated macro F1, calibrate, and learn from everything.
-
-    Folds never split a source group. The metrics are those of the chosen parameters on segments
-    a fold has not seen; the calibration, one temperature, is fitted to the same decisions.
+def train_model(
+    data: Dataset,
+    scenario: Scenario,
+    progress: Progress,
+    recipe: Recipe = RECIPES["bands"],
+    smoothing: str = "hmm",
+) -> Model:
+    """Learn from segments; calibrate and measure on folds that never split a source group.
 
     Parameters
     ----------
@@ -56,70 +62,119 @@ def train_model(data: Dataset, scenario: Scenario, progress: Callable[[int, int]
         The one the data was built for.
     progress : callable
         Told how many fits of how many are done.
+    recipe : Recipe
+    smoothing : str
+        How labels become segments: see `models.modelfile.Smoothing`.
 
     Raises
     ------
     DataError
-        If a class has too few source groups to be cross-validated.
+        If a class has too few source groups to be cross-validated, or all segments are alike.
     """
-    statistics = data.statistics.astype(np.float64)
+    check_varied(data)
     folds = group_folds(data)
-    candidates = [(cost, factor / statistics.shape[1]) for cost, factor in GRID]
-    jobs = [(candidate, fold) for candidate in candidates for fold in folds]
-    decisions = [np.empty((len(statistics), len(data.classes))) for _ in candidates]
+    examples = prepare(recipe, data)
 
-    def decide(job: tuple[tuple[float, float], tuple[Indices, Indices]]) -> Float64:
-        (cost, gamma), (seen, unseen) = job
-        fitted = _classifier(cost, gamma).fit(statistics[seen], data.target[seen])
-        return _per_class(fitted.decision_function(statistics[unseen]))
+    def report(done: int, _total: int) -> None:
+        progress(done, len(folds) + 1)
 
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _WORKERS)) as pool:  # libsvm frees the lock
-        for number, decided in enumerate(pool.map(decide, jobs)):
-            progress(number, len(jobs) + 1)
-            candidate, fold = divmod(number, len(folds))
-            decisions[candidate][folds[fold][1]] = decided
-    scores = [f1_score(data.target, d.argmax(axis=1), average="macro") for d in decisions]
-    best = int(np.argmax(scores))
-    cost, gamma = candidates[best]
-
-    calibrated = CalibratedClassifierCV(
-        _classifier(cost, gamma), method="temperature", ensemble=False, cv=folds
-    ).fit(statistics, data.target)
-    progress(len(jobs) + 1, len(jobs) + 1)
-    fitted = calibrated.calibrated_classifiers_[0]
-    scaler, machine = fitted.estimator
-    inverse_temperature = float(fitted.calibrators[0].beta_)
-    # scikit-learn turns the sign of two classes round; in the file all pairs are alike.
-    sign = -1.0 if len(data.classes) == 2 else 1.0
-    return Model(
-        Description(
-            format=1,
-            kind="svm-rbf",
-            classes=list(data.classes),
-            feature_set=NAME,
-            feature_names=list(FEATURE_NAMES),
-            window_seconds=WINDOW_FRAMES * FRAME_SAMPLES / SAMPLE_RATE,
-            scenario_name=scenario.name,
-            scenario={name: list(labels) for name, labels in scenario.classes.items()},
-            cost=cost,
-            gamma=gamma,
-            calibration="temperature",
-            inverse_temperature=inverse_temperature,
-            smoothing=Smoothing(method="merge"),
-            training_data=_training_data(data, scenario),
-            metrics=_metrics(data, decisions[best], inverse_temperature, len(folds)),
-            versions={name: version(name) for name in ("hearthlog", "numpy", "scikit-learn")},
+    decisions = cross_validate(recipe, examples, len(data.classes), folds, report)
+    inverse = inverse_temperature(decisions, data.target)
+    machine = fit(recipe, examples)
+    progress(len(folds) + 1, len(folds) + 1)
+    hidden = smoothing == "hmm"
+    smooth = (
+        Smoothing(method="hmm", lag_seconds=LAG_SECONDS) if hidden else Smoothing(method="merge")
+    )
+    about = Description(
+        format=2,
+        kind="svm-rbf",
+        classes=list(data.classes),
+        feature_set=NAME,
+        feature_names=list(FEATURE_NAMES),
+        inputs=recipe.inputs,
+        window_seconds=WINDOW_FRAMES * FRAME_SAMPLES / SAMPLE_RATE,
+        scenario_name=scenario.name,
+        scenario={name: list(labels) for name, labels in scenario.classes.items()},
+        cost=recipe.cost,
+        gamma=recipe.gamma / examples.inputs.shape[2],
+        copies=recipe.copies,
+        calibration="temperature",
+        inverse_temperature=inverse,
+        smoothing=Smoothing(
+            method="hmm" if hidden else "merge", lag_seconds=LAG_SECONDS if hidden else 0.0
         ),
-        scaler_mean=scaler.mean_,
-        scaler_scale=scaler.scale_,
-        support_vectors=data.statistics[machine.support_],
-        support_counts=machine.n_support_.astype(np.int64),
-        dual_coefficients=sign * machine.dual_coef_,
-        intercepts=sign * machine.intercept_,
+        training_data=_training_data(data),
+        metrics=_metrics(data, decisions, inverse, len(folds)),
+        versions={name: version(name) for name in ("hearthlog", "numpy", "scikit-learn")},
+    )
+    return replace(
+        _model(about, machine),
+        transitions=default_transitions(data.classes) if hidden else np.empty((0, 0)),
+        training_windows=data.windows,
+        training_target=data.target.astype(np.int64),
+        training_group=data.group.astype(np.int64),
     )
 
 
-def group_folds(data: Dataset) -> Folds:
+def adapt_model(base: Model, home: Dataset) -> Model:
+    """Learn once more what a model has learned, and a home's own segments with it.
+
+    Parameters
+    ----------
+    base : Model
+        With its training windows.
+    home : Dataset
+        Of the same classes; it need not have segments of all of them.
+
+    Returns
+    -------
+    Model
+        With the parameters, calibration and metrics of `base`, which are those of other homes; it
+        keeps the windows of `base` alone, so that it can be adapted again to more of the home.
+
+    Raises
+    ------
+    DataError
+        If the base model has not kept what it was learned from, or the home has no segments.
+    """
+    about = base.description
+    if not len(base.training_windows):
+        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
+    if not len(home):
+        raise DataError("the home has no segments of a class of the model to learn from")
+    joined = replace(
+        home,
+        windows=np.concatenate([base.training_windows, home.windows]),
+        target=np.concatenate([base.training_target, home.target]),
+        group=np.concatenate([base.training_group, home.group]),
+        weight=np.concatenate([np.ones(len(base.training_windows)), home.weight]),
+    )
+    recipe = Recipe(about.inputs, about.cost, about.gamma * base.scaler_mean.size, about.copies)
+    examples = prepare(recipe, joined)
+    machine = fit(recipe, examples)
+    found = {name: Amount(**asdict(amount)) for name, amount in home.amounts.items()}
+    training = about.training_data.model_copy(update={"home": found, "base_sha256": base.sha256})
+    return replace(
+        _model(
+            about.model_copy(update={"training_data": training, "home_vote": HOME_VOTE}), machine
+        ),
+        home_vectors=examples.inputs[0, len(base.training_windows) :],
+        home_target=home.target.astype(np.int64),
+        transitions=base.transitions,
+        training_windows=base.training_windows,
+        training_target=base.training_target,
+        training_group=base.training_group,
+    )
+
+
+def check_varied(data: Dataset) -> None:
+    """Raise DataError if there is nothing to tell the segments apart by."""
+    if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
+        raise DataError("all segments are alike: their features never change; is this sound?")
+
+
+def group_folds(data: Dataset) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
     Returns
@@ -133,7 +188,7 @@ def group_folds(data: Dataset) -> Folds:
         If a class comes from fewer than two groups, or no division leaves every class something
         to learn from.
     """
-    sources = [len(np.unique(data.group[data.target == i])) for i in range(len(data.classes))]
+    sources = [amount.sources for amount in data.amounts.values()]
     fewest = int(np.argmin(sources))
     if sources[fewest] < 2:
         raise DataError(
@@ -144,7 +199,7 @@ def group_folds(data: Dataset) -> Folds:
     everything = np.arange(len(data.classes))
     for seed in range(_SHUFFLES):
         divider = StratifiedGroupKFold(count, shuffle=True, random_state=seed)
-        folds = list(divider.split(data.statistics, data.target, data.group))
+        folds = list(divider.split(data.target, data.target, data.group))
         if all(np.array_equal(np.unique(data.target[seen]), everything) for seen, _ in folds):
             return folds
     raise DataError(
@@ -153,35 +208,25 @@ def group_folds(data: Dataset) -> Folds:
     )
 
 
-def calibration_error(probabilities: Float64, target: Indices) -> float:
-    """Compute the expected calibration error of the winning class, over 15 bins of equal width.
-
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)]
-    target : np.ndarray [shape=(n,)]
-
-    References
-    ----------
-    Guo et al., "On Calibration of Modern Neural Networks", 2017.
-    """
-    confidence = probabilities.max(axis=1)
-    right = probabilities.argmax(axis=1) == target
-    place = np.minimum((confidence * _CALIBRATION_BINS).astype(int), _CALIBRATION_BINS - 1)
-    return float(np.abs(np.bincount(place, right - confidence)).sum() / len(target))
-
-
-def _classifier(cost: float, gamma: float) -> Pipeline:
-    return make_pipeline(StandardScaler(), SVC(C=cost, gamma=gamma, class_weight="balanced"))
+def _model(about: Description, machine: Pipeline) -> Model:
+    """Put a fitted machine into a model."""
+    scaler, svc = machine
+    # scikit-learn turns the sign of two classes round; in the file all pairs are alike.
+    sign = -1.0 if len(about.classes) == 2 else 1.0
+    # The file keeps support vectors as they were before scaling, in float32.
+    support = svc.support_vectors_ * scaler.scale_ + scaler.mean_
+    return Model(
+        about,
+        scaler_mean=scaler.mean_,
+        scaler_scale=scaler.scale_,
+        support_vectors=support.astype(np.float32),
+        support_counts=svc.n_support_.astype(np.int64),
+        dual_coefficients=sign * svc.dual_coef_,
+        intercepts=sign * svc.intercept_,
+    )
 
 
-def _per_class(decision: Float64) -> Float64:
-    return np.stack([-decision, decision], axis=1) if decision.ndim == 1 else decision
-
-
-def _metrics(data: Dataset, decision: Float64, inverse_temperature: float, folds: int) -> Metrics:
-    probabilities = np.exp(inverse_temperature * (decision - decision.max(axis=1, keepdims=True)))
-    probabilities /= probabilities.sum(axis=1, keepdims=True)
+def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Metrics:
     predicted = decision.argmax(axis=1)
     precision, recall, f1, _ = precision_recall_fscore_support(
         data.target, predicted, labels=range(len(data.classes)), zero_division=0.0
@@ -190,7 +235,7 @@ def _metrics(data: Dataset, decision: Float64, inverse_temperature: float, folds
     return Metrics(
         folds=folds,
         macro_f1=float(f1.mean()),
-        expected_calibration_error=calibration_error(probabilities, data.target),
+        expected_calibration_error=calibration_error(softmax(inverse * decision), data.target),
         classes={
             name: ClassMetrics(
                 precision=float(precision[i]), recall=float(recall[i]), f1=float(f1[i])
@@ -201,24 +246,12 @@ def _metrics(data: Dataset, decision: Float64, inverse_temperature: float, folds
     )
 
 
-def _training_data(data: Dataset, scenario: Scenario) -> TrainingData:
-    class_of = scenario.class_of
-    seconds = dict.fromkeys(data.classes, 0.0)
-    for clip, duration in zip(data.clips, data.clip_seconds, strict=True):
-        seconds[class_of[clip.label]] += duration
-    collections = Counter((clip.source, clip.licence) for clip in data.clips)
+def _training_data(data: Dataset) -> TrainingData:
     return TrainingData(
         sha256=data.digest,
-        classes={
-            name: Amount(
-                sources=len(np.unique(data.group[data.target == i])),
-                segments=int((data.target == i).sum()),
-                seconds=round(seconds[name], 3),
-            )
-            for i, name in enumerate(data.classes)
-        },
+        classes={name: Amount(**asdict(amount)) for name, amount in data.amounts.items()},
         collections=[
             Collection(name=name, licence=licence, clips=clips)
-            for (name, licence), clips in sorted(collections.items())
+            for (name, licence), clips in sorted(data.collections.items())
         ],
     )

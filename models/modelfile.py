@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,8 @@ _DTYPES: dict[str, np.dtype[Any]] = {
 }
 _OPTIONAL: dict[str, np.dtype[Any]] = {
     "transitions": np.dtype(np.float64),
+    "home_vectors": np.dtype(np.float32),
+    "home_target": np.dtype(np.int64),
     "training_windows": np.dtype(np.float32),
     "training_target": np.dtype(np.int64),
     "training_group": np.dtype(np.int64),
@@ -76,11 +79,21 @@ class Collection(_Record):
 
 
 class TrainingData(_Record):
-    """What the model learned from; the digest is of its segments, not of files."""
+    """What the model learned from; the digest is of its segments, not of files.
+
+    Attributes
+    ----------
+    home : dict of str to Amount
+        What a home of its own added, by class, if it was adapted.
+    base_sha256 : str
+        Of the model file that was adapted, or empty.
+    """
 
     sha256: _Digest
     classes: dict[_ClassName, Amount]
     collections: list[Collection]
+    home: dict[_ClassName, Amount] = {}
+    base_sha256: _Text = ""
 
 
 class ClassMetrics(_Record):
@@ -123,9 +136,11 @@ class Description(_Record):
     """Everything about a model that is no array.
 
     `inverse_temperature` calibrates: it multiplies the decision values before the softmax.
+    `home_vote` is what the nearness of the home's own vectors adds to the decision for a class.
+    `copies` says how often each segment was learned from as another microphone would hear it.
     """
 
-    format: Literal[1]
+    format: Literal[2]
     kind: Literal["svm-rbf"]
     classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
     feature_set: _Text
@@ -136,6 +151,8 @@ class Description(_Record):
     scenario: dict[_ClassName, list[_Text]]
     cost: _Positive
     gamma: _Positive
+    copies: _Count = 0
+    home_vote: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
     calibration: Literal["temperature"]
     inverse_temperature: _Positive
     smoothing: Smoothing
@@ -163,6 +180,10 @@ class Model:
         Of the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
     transitions : np.ndarray [shape=(C, C)], float64
         Of the hidden Markov model, from row to column, a frame; empty where segments are merged.
+    home_vectors : np.ndarray [shape=(h, width)], float32
+        Inputs that a home has corrected, which draw what is like them to their class.
+    home_target : np.ndarray [shape=(h,)], int64
+        Their classes.
     training_windows : np.ndarray [shape=(m, 20, d)], float32
         Features that it was learned from, to learn from them again; empty if they are not kept.
     training_target, training_group : np.ndarray [shape=(m,)], int64
@@ -181,6 +202,8 @@ class Model:
     dual_coefficients: Float64
     intercepts: Float64
     transitions: Float64 = field(default_factory=lambda: np.empty((0, 0)))
+    home_vectors: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    home_target: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     training_windows: NDArray[np.float32] = field(
         default_factory=lambda: np.empty((0, 0, 0), np.float32)
     )
@@ -225,6 +248,15 @@ class Model:
                 f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
                 f"{result.f1:.3f} |"
             )
+        if about.training_data.home:
+            lines += [
+                "",
+                "Adapted to a home (the figures above are those before); learned besides:",
+            ]
+            lines += [""] + [
+                f"- {name}: {amount.segments} segments from {amount.sources} sources"
+                for name, amount in about.training_data.home.items()
+            ]
         lines += ["", "Learned from recordings of:", ""]
         lines += [
             f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
@@ -275,6 +307,7 @@ def load_model(path: Path) -> Model:
     ModelError
         If it is missing, too large, damaged, inconsistent, or made for another feature set.
     """
+    path = _pointed_to(path)
     data = _read(path)
     _check_header(path, data)
     try:
@@ -289,6 +322,14 @@ def load_model(path: Path) -> Model:
         array.flags.writeable = False
     name, digest = path.stem, hashlib.sha256(data).hexdigest()
     return Model(description, **arrays, name=name, sha256=digest)
+
+
+def _pointed_to(path: Path) -> Path:
+    """Follow a link such as `champion`: its name does not say which model it is."""
+    try:
+        return Path(os.path.realpath(path)) if path.is_symlink() else path
+    except OSError:
+        return path  # why, reading it will say
 
 
 def _read(path: Path) -> bytes:
@@ -358,9 +399,10 @@ def _check(path: Path, about: Description, arrays: dict[str, NDArray[Any]]) -> N
     total = len(arrays["support_vectors"])
     if (counts < 0).any() or counts.sum() != total:
         raise ModelError(f"{path}: support_counts do not add up to the {total} support vectors")
-    target = arrays.get("training_target", counts[:0])
-    if ((target < 0) | (target >= len(about.classes))).any():
-        raise ModelError(f"{path}: training_target has classes that the model has not")
+    for name in ("training_target", "home_target"):
+        target = arrays.get(name, counts[:0])
+        if ((target < 0) | (target >= len(about.classes))).any():
+            raise ModelError(f"{path}: {name} has classes that the model has not")
     transitions = arrays.get("transitions", np.ones((1, 1)))
     if (transitions < 0).any() or (np.abs(transitions.sum(axis=1) - 1.0) > _ROUNDING).any():
         raise ModelError(f"{path}: the rows of transitions are no probabilities")
@@ -381,9 +423,9 @@ def _check_array(path: Path, name: str, array: NDArray[Any], shape: tuple[int, .
 def _shapes(about: Description, arrays: dict[str, NDArray[Any]]) -> dict[str, tuple[int, ...]]:
     """Return the shape that each array must have."""
     classes, width = len(about.classes), input_width(about.inputs)
-    total, kept = (
+    total, home, kept = (
         len(arrays[name]) if name in arrays and arrays[name].ndim else 0
-        for name in ("support_vectors", "training_windows")
+        for name in ("support_vectors", "home_vectors", "training_windows")
     )
     shapes: dict[str, tuple[int, ...]] = {
         "scaler_mean": (width,),
@@ -395,6 +437,8 @@ def _shapes(about: Description, arrays: dict[str, NDArray[Any]]) -> dict[str, tu
     }
     if about.smoothing.method == "hmm":
         shapes["transitions"] = (classes, classes)
+    if home:
+        shapes["home_vectors"], shapes["home_target"] = (home, width), (home,)
     if kept:
         shapes["training_windows"] = (kept, WINDOW_FRAMES, len(about.feature_names))
         shapes["training_target"] = shapes["training_group"] = (kept,)

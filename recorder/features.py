@@ -131,12 +131,21 @@ def mel_bank() -> Float64:
         Weight of each spectral bin in each band; as `librosa.filters.mel(norm=None)`.
     """
     frequency = np.arange(_BINS) * (SAMPLE_RATE / FRAME_SAMPLES)
-    corners = _mel_to_hertz(np.linspace(0.0, _hertz_to_mel(SAMPLE_RATE / 2), _MEL_BANDS + 2))
+    corners = _mel_corners()
     width = np.diff(corners)
     distance = frequency[:, np.newaxis] - corners[np.newaxis, :]
     rising = distance[:, :-2] / width[:-1]
     falling = -distance[:, 2:] / width[1:]
     return np.maximum(0.0, np.minimum(rising, falling))
+
+
+def mel_centres() -> Float64:
+    """Frequencies, in hertz, at which the filters of `mel_bank` peak; shape (32,)."""
+    return _mel_corners()[1:-1]
+
+
+def _mel_corners() -> Float64:
+    return _mel_to_hertz(np.linspace(0.0, _hertz_to_mel(SAMPLE_RATE / 2), _MEL_BANDS + 2))
 
 
 # The scale of Slaney's Auditory Toolbox: linear below 1 kHz, logarithmic above.

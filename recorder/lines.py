@@ -21,10 +21,10 @@ def of_info(info: Any) -> bytes:
 
 
 def of_segment(microphone: str, segment: Segment, label: str) -> bytes:
-    """Say what was heard, at its end."""
+    """Say what was heard, once that is known."""
     duration = _seconds(segment.end - segment.start)
     text = f"{label} for {duration} ({100 * segment.confidence:.0f} %)"
-    return _line(segment.end, microphone, _INFO, text)
+    return _line(segment.known, microphone, _INFO, text)
 
 
 def of_gap(microphone: str, gap: Gap) -> bytes:
@@ -36,6 +36,11 @@ def of_gap(microphone: str, gap: Gap) -> bytes:
 def of_health(microphone: str, health: Health) -> bytes:
     """Say how the source is."""
     return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
+
+
+def of_model(microphone: str, stamp: int, level: int, text: str) -> bytes:
+    """Say which model speaks, or which was refused; the level is one of `diagnostic_msgs`."""
+    return _line(stamp, microphone, _LEVELS[level], text)
 
 
 def _line(stamp: int, microphone: str, level: int, text: str) -> bytes:

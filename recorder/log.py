@@ -9,7 +9,7 @@ from typing import Any
 
 from recorder.pipeline import Record, opening
 from schemas.errors import LogError
-from schemas.files import log_path
+from schemas.files import active_path, log_path
 from schemas.messages import NANOSECONDS, header
 from schemas.topics import Topic
 from schemas.writer import Attachment, LogWriter
@@ -114,6 +114,17 @@ class RollingLog:
                 for record in records:
                     self._append(record)
             self._finish_file()
+
+    def may_begin(self, stamp: int) -> bool:
+        """Tell whether there is a name left for a file that begins at a time: one a second."""
+        path = log_path(self._description.root, self._description.node, stamp)
+        return not (path.exists() or active_path(path).exists())
+
+    def begin_anew(self, description: LogDescription, records: Sequence[Record]) -> None:
+        """Complete the file as `finish` does; the next record begins one of other content."""
+        self.finish(records)
+        self._description = description
+        self._until = 0
 
     @contextmanager
     def _keeping_what_was_written(self) -> Iterator[None]:

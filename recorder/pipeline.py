@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from models.classifier import Classifier
 from models.inputs import WINDOW_FRAMES, InputStream
 from models.modelfile import Model
-from models.segments import Segment, SegmentMerger
+from models.segments import Segment, Segmenter
 from recorder import features, lines
 from recorder.features import FeatureExtractor
 from recorder.statistics import RollingStatistics
@@ -76,18 +76,22 @@ class Pipeline:
         Without one there are no labels.
     statistics_every : int
         Frames from one statistics message to the next.
+
+    Attributes
+    ----------
+    settled : bool
+        Whether sound before the first frame would have left no trace in the segments to come.
     """
 
     def __init__(
         self, microphone: str, classifier: Classifier | None = None, statistics_every: int = 1
     ) -> None:
         self.microphone = microphone
-        self._classifier = classifier
-        self._inputs = None if classifier is None else InputStream(classifier.inputs)
+        self.settled = False
+        self._use(classifier)
         self._statistics_every = statistics_every
         self._features = FeatureExtractor()
         self._statistics = RollingStatistics()
-        self._segments = SegmentMerger()
         self._end = 0
         self._level = 0
 
@@ -119,24 +123,61 @@ class Pipeline:
                 "statistics", frames[shown], stamps[shown], {"mean": mean[shown], "std": std[shown]}
             ),
         ]
-        if self._classifier is not None and self._inputs is not None:
+        if self._inputs is not None:
             inputs = self._inputs(features)  # at the last frames: labels are of a whole second
             heard = slice(len(frames) - len(inputs), None)
-            records += self._labels(self._classifier, inputs, frames[heard], stamps[heard])
+            records += self._labels(inputs, frames[heard], stamps[heard])
         records.sort(key=itemgetter(0))
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
         return records
 
     def finish(self) -> list[Record]:
         """Close what is open at the end of the sound."""
-        return self._segment_records(self._segments.close(self._end))
+        return self._close(self._end)
+
+    def change_model(
+        self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
+    ) -> tuple[list[Record], list[Record]]:
+        """Let another model speak from a frame on; features and statistics go on.
+
+        Parameters
+        ----------
+        model : Model or None
+        classifier : Classifier or None
+            Of that model.
+        frame, stamp : int
+            Number and time of the frame that follows.
+
+        Returns
+        -------
+        closing, opening : list of Record
+            What ends the log of the last model, and what begins that of this one.
+        """
+        closing = self._close(stamp)
+        self._use(classifier)
+        if self._inputs is not None and self._statistics.recent is not None:
+            self._inputs(self._statistics.recent)
+        who = "no model" if model is None else f"model {model.name} ({model.sha256[:12]})"
+        return closing, self.report_model(stamp, 0, f"{who} from frame {frame} on")
+
+    def report_model(self, stamp: int, level: int, text: str) -> list[Record]:
+        """Say something about the model; the level is one of `diagnostic_msgs`."""
+        return [
+            self._diagnostics(stamp, level, f"hearthlog: {self.microphone} model", text, {}),
+            Record(stamp, ROSOUT, lines.of_model(self.microphone, stamp, level, text)),
+        ]
+
+    def _use(self, classifier: Classifier | None) -> None:
+        self._classifier = classifier
+        self._inputs = None if classifier is None else InputStream(classifier.inputs)
+        self._segmenter = None if classifier is None else _segmenter(classifier)
 
     def _push_gap(self, gap: Gap) -> list[Record]:
         self._features.restart()
         self._statistics.restart()
         if self._inputs is not None:
             self._inputs.restart()
-        closed = self._segment_records(self._segments.close(self._end))
+        closed = self._close(self._end)
         data = encode(
             message(
                 messages.GAP,
@@ -152,15 +193,15 @@ class Pipeline:
             Record(gap.end, ROSOUT, lines.of_gap(self.microphone, gap)),
         ]
 
-    def _labels(
-        self, classifier: Classifier, inputs: Float32, frames: Int64, stamps: Int64
-    ) -> list[Record]:
-        if not len(inputs):
+    def _labels(self, inputs: Float32, frames: Int64, stamps: Int64) -> list[Record]:
+        classifier, segmenter = self._classifier, self._segmenter
+        if classifier is None or segmenter is None or not len(inputs):
             return []
         probabilities = classifier.probabilities(inputs)
         best = probabilities.argmax(axis=1)
         confidence = probabilities[np.arange(len(best)), best]
-        closed = self._segments.push(best, confidence, stamps)
+        closed = segmenter.push(probabilities, stamps)
+        self.settled |= segmenter.settled
         columns = {
             "label": [classifier.classes[i] for i in best],
             "confidence": confidence,
@@ -181,6 +222,14 @@ class Pipeline:
         rows = encode_rows(_ROW_TYPES[kind], common | dict(columns), len(frames))
         return [Record(time, name, row) for time, row in zip(stamps.tolist(), rows, strict=True)]
 
+    def _close(self, end: int) -> list[Record]:
+        """End the segments at `end`; what comes next begins anew."""
+        if self._segmenter is None:
+            return []
+        closed = self._segmenter.close(end)
+        self.settled |= bool(closed)
+        return self._segment_records(closed)
+
     def _segment_records(self, segments: list[Segment]) -> list[Record]:
         return [record for segment in segments for record in self._of_segment(segment)]
 
@@ -197,34 +246,40 @@ class Pipeline:
             )
         )
         return [
-            Record(segment.end, topic(self.microphone, "segment"), data),
-            Record(segment.end, ROSOUT, lines.of_segment(self.microphone, segment, label)),
+            Record(segment.known, topic(self.microphone, "segment"), data),
+            Record(segment.known, ROSOUT, lines.of_segment(self.microphone, segment, label)),
         ]
 
     def _push_health(self, health: Health) -> list[Record]:
-        records = [self._health_record(health)]
+        name = f"hearthlog: {self.microphone}"
+        records = [
+            self._diagnostics(health.stamp, health.level, name, health.summary, health.values)
+        ]
         if health.level != self._level:
             self._level = health.level
             line = lines.of_health(self.microphone, health)
             records.append(Record(health.stamp, ROSOUT, line))
         return records
 
-    def _health_record(self, health: Health) -> Record:
-        values = [
-            message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
-            for key, value in health.values.items()
-        ]
+    def _diagnostics(
+        self, stamp: int, level: int, name: str, text: str, values: Mapping[str, str]
+    ) -> Record:
         status = message(
             "diagnostic_msgs/msg/DiagnosticStatus",
-            level=health.level,
-            name=f"hearthlog: {self.microphone}",
-            message=health.summary,
+            level=level,
+            name=name,
+            message=text,
             hardware_id=self.microphone,
-            values=values,
+            values=[
+                message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+                for key, value in values.items()
+            ],
         )
         data = encode(
-            message(
-                messages.DIAGNOSTICS, header=header(health.stamp, self.microphone), status=[status]
-            )
+            message(messages.DIAGNOSTICS, header=header(stamp, self.microphone), status=[status])
         )
-        return Record(health.stamp, DIAGNOSTICS, data)
+        return Record(stamp, DIAGNOSTICS, data)
+
+
+def _segmenter(classifier: Classifier) -> Segmenter:
+    return Segmenter(classifier.smoothing, classifier.transitions, _FRAME_SECONDS)

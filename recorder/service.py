@@ -1,19 +1,20 @@
 """The recorder: a source of sound, the pipeline, and the log it ends in."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Protocol
 
-from models.classifier import Classifier
-from models.modelfile import Model, load_model
+from models.modelfile import Model
 from recorder import features
 from recorder.config import Settings
 from recorder.log import LogDescription, RollingLog
+from recorder.modelwatch import ModelWatch
 from recorder.pipeline import Pipeline, stream_info
 from recorder.recovery import Recovered, recover_active
 from recorder.sources.microphone import MicrophoneSource
@@ -43,10 +44,22 @@ class Recording:
     recovered: Sequence[Recovered]
     frames_lost: int = 0
     gaps: int = 0
+    models_refused: int = 0
 
 
-def record_files(settings: Settings, source: FileSource, stop: Flag) -> Recording:
+def record_files(
+    settings: Settings, source: FileSource, stop: Flag, asked: SimpleQueue[None] | None = None
+) -> Recording:
     """Record audio files as if a microphone had heard them.
+
+    Parameters
+    ----------
+    settings : Settings
+    source : FileSource
+    stop : threading.Event
+        Once set, the log is completed.
+    asked : SimpleQueue or None
+        What is put into it makes the recorder look at once whether the model's file is another.
 
     Raises
     ------
@@ -58,11 +71,15 @@ def record_files(settings: Settings, source: FileSource, stop: Flag) -> Recordin
         If the log cannot be written; what was written stays, for the next start to complete.
     """
     recovered = recover_active(settings.output, settings.node)
-    return record(settings, source, stop, recovered)
+    return record(settings, source, stop, recovered, asked)
 
 
-def record_microphone(settings: Settings, stop: Flag) -> Recording:
+def record_microphone(
+    settings: Settings, stop: Flag, asked: SimpleQueue[None] | None = None
+) -> Recording:
     """Record the microphone until `stop` is set, whatever happens to it.
+
+    Parameters are those of `record_files`.
 
     Raises
     ------
@@ -75,7 +92,8 @@ def record_microphone(settings: Settings, stop: Flag) -> Recording:
     with closing(source):  # it hears, and its pipe holds, while older logs are completed
         recovered = recover_active(settings.output, settings.node)
         end = max((log.end for log in recovered), default=0)
-        return record(settings, _AfterKill(source, end) if end else source, stop, recovered)
+        heard = _AfterKill(source, end) if end else source
+        return record(settings, heard, stop, recovered, asked)
 
 
 class _AfterKill:
@@ -97,30 +115,70 @@ class _AfterKill:
 
 
 def record(
-    settings: Settings, source: Source, stop: Flag, recovered: Sequence[Recovered] = ()
+    settings: Settings,
+    source: Source,
+    stop: Flag,
+    recovered: Sequence[Recovered] = (),
+    asked: SimpleQueue[None] | None = None,
 ) -> Recording:
     """Record a source until it ends or `stop` is set; raises as `record_files`."""
-    model = None if settings.model is None else load_model(settings.model)
-    microphone = settings.microphone[0].name
-    pipeline = Pipeline(
-        microphone, None if model is None else Classifier(model), settings.statistics_every
-    )
-    log = RollingLog(
-        _describe(settings, source, model),
-        settings.max_bag_duration,
-        settings.flush_seconds,
-        settings.sync_seconds,
-    )
-    recording = Recording(log.finished, recovered)
-    try:
-        for event in source.events(stop):
-            if isinstance(event, Gap):
-                recording.gaps += 1
-                recording.frames_lost += event.frames_lost
-            log.write(pipeline.push(event))
-    finally:
-        log.finish(pipeline.finish())
+
+    def describe(model: Model | None) -> LogDescription:
+        return _describe(settings, source, model)
+
+    with ExitStack() as stack:
+        watch = None
+        if settings.model is not None:
+            watch = stack.enter_context(closing(ModelWatch(settings.model, asked or SimpleQueue())))
+        first = None if watch is None else watch.first
+        pipeline = Pipeline(
+            settings.microphone[0].name,
+            None if first is None else first.classifier,
+            settings.statistics_every,
+        )
+        log = RollingLog(
+            describe(None if first is None else first.model),
+            settings.max_bag_duration,
+            settings.flush_seconds,
+            settings.sync_seconds,
+        )
+        recording = Recording(log.finished, recovered)
+        try:
+            for event in source.events(stop):
+                if isinstance(event, Gap):
+                    recording.gaps += 1
+                    recording.frames_lost += event.frames_lost
+                if isinstance(event, Frames) and watch is not None:
+                    recording.models_refused += _attend(watch, event, pipeline, log, describe)
+                log.write(pipeline.push(event))
+        finally:
+            log.finish(pipeline.finish())
     return recording
+
+
+def _attend(
+    watch: ModelWatch,
+    coming: Frames,
+    pipeline: Pipeline,
+    log: RollingLog,
+    describe: Callable[[Model | None], LogDescription],
+) -> int:
+    """Let a model that is ready speak from the coming frames on; return how many were refused.
+
+    Its labels begin a log of their own: the names behind the probabilities are of the channel, and
+    the card is of the file.
+    """
+    stamp = int(coming.stamps[0])
+    refused = list(watch.refusals())
+    for text in refused:
+        log.write(pipeline.report_model(stamp, 1, text))
+    if watch.ready is not None and log.may_begin(stamp):
+        model, classifier = watch.ready
+        watch.ready = None
+        last, first = pipeline.change_model(model, classifier, coming.first, stamp)
+        log.begin_anew(describe(model), last)
+        log.write(first)
+    return len(refused)
 
 
 def _describe(settings: Settings, source: Source, model: Model | None) -> LogDescription:

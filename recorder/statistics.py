@@ -19,6 +19,11 @@ class RollingStatistics:
     def __init__(self) -> None:
         self._recent: Float32 | None = None
 
+    @property
+    def recent(self) -> Float32 | None:
+        """The features of the last frames, of which one more makes a window; None after a gap."""
+        return self._recent
+
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""
         self._recent = None

@@ -1,11 +1,8 @@
-"""Segments of made-up statistics, to train on in no time."""
-
-from pathlib import Path
+"""Segments of made-up features, to train on in no time."""
 
 import numpy as np
 
 from analyzer.dataset import Dataset
-from analyzer.manifest import Clip
 from analyzer.scenario import Scenario
 
 SOURCES = 6
@@ -16,13 +13,23 @@ def blobs(classes: int, count: int, *, spread: float = 1.5) -> tuple[Dataset, Sc
     rng = np.random.default_rng(classes)
     names = tuple(f"class_{i}" for i in range(classes))
     target = np.repeat(np.arange(classes), count)
-    centre = rng.standard_normal((classes, 42))
-    statistics = centre[target] + spread * rng.standard_normal((len(target), 42))
-    statistics = (statistics * np.geomspace(1e-4, 1e3, 42)).astype(np.float32)
+    centre = rng.standard_normal((classes, 21))
+    around = centre[target] + spread * rng.standard_normal((len(target), 21))
+    windows = around[:, np.newaxis] + 0.1 * rng.standard_normal((len(target), 20, 21))
+    windows *= np.geomspace(1e-2, 10, 21)
+    windows[:, :, [0, 6]] = np.exp(windows[:, :, [0, 6]])  # energy and flux are never negative
     group = target * SOURCES + np.arange(len(target)) % SOURCES
-    clips = [Clip(Path(name), name, name, "made up", "CC0") for name in names]
     data = Dataset(
-        statistics, target, group, names, tuple(clips), (float(count),) * classes, skipped={}
+        windows=windows.astype(np.float32),
+        target=target,
+        group=group,
+        collection=np.zeros_like(group),
+        weight=np.ones(len(target)),
+        classes=names,
+        seconds=dict.fromkeys(names, float(count)),
+        collection_names=("made up",),
+        collections={("made up", "CC0"): classes},
+        skipped={},
     )
     return data, Scenario("blobs", {name: (name,) for name in names})
 

@@ -6,27 +6,32 @@ import pytest
 from blobs import blobs, ignore_progress
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.calibration import CalibratedClassifierCV
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from analyzer.train import group_folds, train_model
+from analyzer.recipe import RECIPES, decide, softmax
+from analyzer.train import train_model
 from models.classifier import Classifier
+from models.inputs import window_inputs
 
 ROWS = 600
 
 
 @cache
 def trained(classes, count=60, spread=1.5):
-    return train_model(*blobs(classes, count, spread=spread), ignore_progress)
+    return train_model(*blobs(classes, count, spread=spread), ignore_progress, RECIPES["paper"])
+
+
+def statistics(data):
+    return window_inputs("statistics", data.windows)
 
 
 @cache
 def unseen(classes):
     rng = np.random.default_rng(7)
-    rows = blobs(classes, 60)[0].statistics
+    rows = statistics(blobs(classes, 60)[0])
     chosen = rows[rng.integers(0, len(rows), ROWS)]
     return (chosen * rng.uniform(0.8, 1.2, chosen.shape)).astype(np.float32)
 
@@ -37,14 +42,17 @@ def unseen(classes):
 def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     data, _ = blobs(classes, count, spread=spread)
     model = trained(classes, count, spread)
-    machine = SVC(C=model.description.cost, gamma=model.description.gamma, class_weight="balanced")
-    theirs = CalibratedClassifierCV(
-        make_pipeline(StandardScaler(), machine),
-        method="temperature",
-        ensemble=False,
-        cv=group_folds(data),
-    ).fit(data.statistics.astype(np.float64), data.target)
-    expected = theirs.predict_proba(unseen(classes).astype(np.float64))
+    machine = SVC(
+        C=model.description.cost,
+        gamma=model.description.gamma,
+        class_weight="balanced",
+        decision_function_shape="ovo",
+    )
+    fitted = make_pipeline(StandardScaler(), machine).fit(
+        statistics(data).astype(np.float64), data.target
+    )
+    decision = decide(fitted, unseen(classes), classes)
+    expected = softmax(model.description.inverse_temperature * decision)
 
     ours = Classifier(model).probabilities(unseen(classes))
 
@@ -56,7 +64,9 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
 
 def judged(classifier, rows):
     """Probabilities, and before their rounding to float32 the decisions behind them."""
-    return np.concatenate([classifier.probabilities(rows), classifier._pairs(rows)], axis=1)
+    return np.concatenate(
+        [classifier.probabilities(rows), classifier._pairs(classifier._extended(rows))], axis=1
+    )
 
 
 @settings(deadline=None)

@@ -1,5 +1,7 @@
 """Inputs of a classifier: the same bits in any blocks, the paper's where it is asked for."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,7 +24,7 @@ def test_blocks_of_any_size_agree_bit_for_bit(kind, sizes, count, seed):
     values = features(count, seed)
     whole, stream = InputStream(kind)(values), InputStream(kind)
     borders = [0, *np.cumsum(sizes).clip(0, count).tolist(), count]
-    parts = [stream(values[a:b]) for a, b in zip(borders, borders[1:], strict=False)]
+    parts = [stream(values[a:b]) for a, b in pairwise(borders)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert whole.shape == (max(count - 19, 0), input_width(kind))
 

@@ -47,8 +47,8 @@ class _Steps(NamedTuple):
 class Frames:
     """Follows one microphone through a file.
 
-    Messages are added as rows of three numbers: log time, frame and stamp; of segments and gaps
-    log time (their end), start, and the frames that a gap lost.
+    Messages are added as rows of three numbers: log time, frame and stamp; of segments log time,
+    start and end; of gaps log time (their end), start, and the frames that they lost.
 
     Parameters
     ----------
@@ -301,14 +301,14 @@ class Frames:
         """Segments follow each other, with nothing but gaps between them."""
         if not len(rows):
             return
-        ends, starts = rows[:, 0], rows[:, 1]
+        times, starts, ends = rows.T
         first = int(starts[0]) if self._segment_end is None else self._segment_end
         before = np.concatenate([[first], ends[:-1]])
         late = starts - before
         self._report(
             "segment-overlap",
             late < 0,
-            ends,
+            times,
             lambda i: f"a segment begins {-late[i] / 1e9:.3f} s before the last one has ended",
         )
         gaps = np.searchsorted(self._gap_ends, starts, "right")
@@ -316,7 +316,7 @@ class Frames:
         self._report(
             "segment-hole",
             (late > 0) & (gaps <= 0),
-            ends,
+            times,
             lambda i: f"nothing is said of the {late[i] / 1e9:.3f} s before a segment",
         )
         self._segment_end = int(ends[-1])

@@ -48,6 +48,7 @@ class LabelTrack:
         lines = [
             f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(label.split())}\n"
             for start, end, label in rows
+            if end > 0  # or it was over before, and known only then
         ]
         self._stream.write("".join(lines).encode())
 

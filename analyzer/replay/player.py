@@ -15,7 +15,7 @@ from models.classifier import Classifier
 from models.inputs import WINDOW_FRAMES
 from models.modelfile import Model
 from recorder import features
-from recorder.log import RollingLog
+from recorder.log import LogDescription, RollingLog
 from recorder.pipeline import Pipeline, Record
 from recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
 from schemas.errors import LogError
@@ -149,7 +149,9 @@ class Player:
         if origin.path == self._opened:
             return
         self._opened = origin.path
-        if self._origin is None or _is_new(origin, self._origin, self._next):
+        if self._origin is not None and self._goes_on(origin):
+            self._change_model(origin)
+        elif self._origin is None or _is_new(origin, self._origin, self._next):
             self._close()
             self._begin(origin)
 
@@ -200,14 +202,43 @@ class Player:
         classifier = None if model is None else Classifier(model)
         self._pipeline = Pipeline(origin.microphone, classifier, asked.statistics_every)
         if self._wanted.output is not None:
-            kind = "clips" if self._wanted.kind == "audio" else self._wanted.kind
-            replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
-            about = describe(origin, model, self._wanted.output, replayed)
+            about = self._describe(origin, model)
             seconds = asked.flush_seconds, asked.sync_seconds
             self._log = RollingLog(about, asked.max_bag_duration, *seconds)
-        self._has_labels = model is not None
+        self._sha256 = None if model is None else model.sha256
         self._origin = origin
         self._next, self._end, self._after_gap = 0, None, False
+
+    def _goes_on(self, origin: Origin) -> bool:
+        """Tell whether a log is of the same start of a recorder, but of another model."""
+        assert self._origin is not None
+        if origin.first_frame is None or origin.model_sha256 == self._origin.model_sha256:
+            return False
+        first = origin.first_frame[0]
+        follows = first == self._next or (self._after_gap and first > self._next)
+        return self._next > 0 and follows and _without_model(origin) == _without_model(self._origin)
+
+    def _change_model(self, origin: Origin) -> None:
+        """Let the model speak that the recorder went on with, if it is another one here too."""
+        self._origin = origin
+        model = self._wanted.model(origin)
+        sha256 = None if model is None else model.sha256
+        if sha256 == self._sha256:
+            return
+        assert origin.first_frame is not None
+        classifier = None if model is None else Classifier(model)
+        closing, opening = self._pipeline.change_model(model, classifier, *origin.first_frame)
+        self._emit(closing)
+        if self._log is not None:
+            self._log.begin_anew(self._describe(origin, model), [])
+        self._sha256 = sha256
+        self._emit(opening)
+
+    def _describe(self, origin: Origin, model: Model | None) -> LogDescription:
+        assert self._wanted.output is not None
+        kind = "clips" if self._wanted.kind == "audio" else self._wanted.kind
+        replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
+        return describe(origin, model, self._wanted.output, replayed)
 
     def _follow(self, event: Features) -> None:
         """See whether frames follow the last ones, and if not, do what the recorder did."""
@@ -249,7 +280,7 @@ class Player:
             self._emit(records)
             if end > self._start:
                 self._progress(end)
-        if not self._has_labels:
+        if self._sha256 is None:
             self.settled |= len(event.stamps) >= WINDOW_FRAMES
         return True
 
@@ -263,8 +294,8 @@ class Player:
         microphone = self._pipeline.microphone
         label, segment, gap = (topic(microphone, kind) for kind in ("label", "segment", "gap"))
         counts = Counter(record.topic for record in records)
-        if counts[segment] and self._wanted.kind == "features":
-            self.settled = True
+        if self._wanted.kind == "features":
+            self.settled |= self._pipeline.settled
         if records and records[0].log_time < self._start:
             records = [record for record in records if record.log_time >= self._start]
             counts = Counter(record.topic for record in records)
@@ -311,6 +342,10 @@ def _is_new(origin: Origin, last: Origin, following: int) -> bool:
     if origin.first_frame is not None and origin.first_frame[0] < following:
         return True
     return origin.metadata != last.metadata or origin.model_sha256 != last.model_sha256
+
+
+def _without_model(origin: Origin) -> dict[str, str]:
+    return {key: value for key, value in origin.metadata.items() if not key.startswith("model")}
 
 
 def _name(paths: Sequence[Path]) -> str:

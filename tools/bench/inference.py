@@ -5,15 +5,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.calibration import CalibratedClassifierCV
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
-from sklearn.svm import SVC
+from sklearn.frozen import FrozenEstimator
+from sklearn.pipeline import Pipeline
 
-from analyzer.train import group_folds
+from analyzer.recipe import RECIPES, decide, fit, prepare, softmax
 from models.classifier import Classifier
-from models.inputs import WINDOW_FRAMES
+from models.inputs import InputStream
 from recorder.features import FeatureExtractor
-from recorder.statistics import RollingStatistics
 from tools.bench.table import Row, Table, Target
 from tools.bench.timing import best_of
 from tools.bench.workload import Workload
@@ -26,10 +24,13 @@ _THE_SAME = Target(1e-5, at_most=True)
 def measure(work: Workload) -> Table:
     """Measure both on statistics of the sound."""
     ours = Classifier(work.model).probabilities
-    theirs = _scikit_learn(work).predict_proba
-    rows = _statistics(work)
+    machine, calibrated = _scikit_learn(work)
+    theirs = calibrated.predict_proba
+    rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
-    difference = np.abs(ours(rows) - theirs(rows_as_theirs)).max()
+    decision = decide(machine, rows, len(work.model.classes))
+    expected = softmax(work.model.description.inverse_temperature * decision)
+    difference = np.abs(ours(rows) - expected).max()
     found = []
     for count in (len(rows), _BLOCK):
         best = best_of(
@@ -46,19 +47,17 @@ def measure(work: Workload) -> Table:
     return Table(f"inference: {support} support vectors, {classes} classes, CPU time", found)
 
 
-def _scikit_learn(work: Workload) -> CalibratedClassifierCV:
-    """Fit what `analyzer.train` chose, the way it does."""
+def _scikit_learn(work: Workload) -> tuple[Pipeline, CalibratedClassifierCV]:
+    """Fit what `analyzer.train` did, and calibrate it as scikit-learn does."""
     data, _ = work.training
-    about = work.model.description
-    machine = SVC(C=about.cost, gamma=about.gamma, class_weight="balanced")
-    return CalibratedClassifierCV(
-        make_pipeline(StandardScaler(), machine),
-        method="temperature",
-        ensemble=False,
-        cv=group_folds(data),
-    ).fit(data.statistics.astype(np.float64), data.target)
+    recipe = RECIPES["bands"]
+    examples = prepare(recipe, data)
+    machine = fit(recipe, examples)
+    calibrated = CalibratedClassifierCV(
+        FrozenEstimator(machine), method="temperature", ensemble=False
+    )
+    return machine, calibrated.fit(examples.inputs[0].astype(np.float64), data.target)
 
 
-def _statistics(work: Workload) -> NDArray[np.float32]:
-    mean, std = RollingStatistics()(FeatureExtractor()(work.frames(_SECONDS)))
-    return np.concatenate([mean, std], axis=1)[WINDOW_FRAMES - 1 :]
+def _inputs(work: Workload) -> NDArray[np.float32]:
+    return InputStream("bands")(FeatureExtractor()(work.frames(_SECONDS)))

@@ -108,9 +108,9 @@ class Workload:
         scenario = Scenario("simulated", {label: (label,) for label in LABELS})
         clips = read_manifest(manifest, scenario.labels)
         data = build_dataset(clips, scenario, _ignore_progress)
-        noise = np.random.default_rng(_SEED).standard_normal(data.statistics.shape)
-        blurred = data.statistics + _OVERLAP * noise * data.statistics.std(axis=0)
-        return dataclasses.replace(data, statistics=blurred.astype(np.float32)), scenario
+        noise = np.random.default_rng(_SEED).standard_normal((len(data), 1, data.windows.shape[2]))
+        blurred = data.windows + _OVERLAP * noise * data.windows.std(axis=(0, 1))
+        return dataclasses.replace(data, windows=blurred.astype(np.float32)), scenario
 
     @cached_property
     def model(self) -> Model:

@@ -44,7 +44,7 @@ def demo(
     )
 
     _say(f"2. hearthlog train --data {manifest} --scenario {scenario} --output {model}")
-    train(data=manifest, scenario=str(scenario), output=model)
+    train(data=[manifest], scenario=str(scenario), output=model)
 
     _say(f"3. hearthlog record {day} --model {model} --output {logs} --start {_START}")
     settings = load_settings(None, {"output": logs, "model": model}, {})

@@ -10,14 +10,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from schemas.errors import HearthlogError
+from tools.cli.annotate import annotate
 from tools.cli.cat import cat
 from tools.cli.cut import cut
 from tools.cli.demo import demo
 from tools.cli.devices import devices
 from tools.cli.doctor import doctor
+from tools.cli.enrol import enrol
+from tools.cli.evaluate import evaluate
 from tools.cli.export import export
 from tools.cli.info import info
 from tools.cli.merge import merge
+from tools.cli.models import models
 from tools.cli.record import record
 from tools.cli.recover import recover
 from tools.cli.replay import replay
@@ -41,11 +45,15 @@ for verb in (
     doctor,
     recover,
     train,
+    enrol,
+    evaluate,
     review,
     replay,
     demo,
 ):
     app.command()(verb)
+app.add_typer(annotate, name="annotate")
+app.add_typer(models, name="models")
 
 
 @app.callback()

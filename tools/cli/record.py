@@ -3,6 +3,7 @@
 import signal
 import sys
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Annotated, Any
 
@@ -20,7 +21,11 @@ def record(
         Path | None, typer.Option("--output", "-o", help="Folder of logs.  [default: logs]")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option(help="Model file; without one there are no labels.")
+        Path | None,
+        typer.Option(
+            help="Model file, or a link to one; without it there are no labels. Another file that "
+            "takes its place speaks within about a second, or at SIGHUP."
+        ),
     ] = None,
     device: Annotated[
         str | None, typer.Option(help="Microphone, as `hearthlog devices` lists it.")
@@ -50,7 +55,7 @@ def record(
     """Record sound to a labelled log, from a microphone or from files.
 
     SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps, or a log
-    left by an earlier recorder was damaged.
+    left by an earlier recorder was damaged, or a new model was refused.
     """
     from recorder.config import load_settings
     from recorder.service import record_files, record_microphone
@@ -67,17 +72,18 @@ def record(
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    asked = _look_at_hangup(stop)
     if files:
         begin = start_time(start, files[0])
         with share_done("recording") as progress:
             source = FileSource(files, begin, realtime=realtime, progress=progress)
-            recording = record_files(settings, source, stop)
+            recording = record_files(settings, source, stop, asked)
     elif start is not None or realtime:
         raise typer.BadParameter("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
             typer.echo("hearthlog: listening; Ctrl-C completes the log", err=True)
-        recording = record_microphone(settings, stop)
+        recording = record_microphone(settings, stop, asked)
     for log in recording.logs:
         print(log)
     damaged = [old for old in recording.recovered if old.damage]
@@ -89,8 +95,23 @@ def record(
         typer.echo(
             f"hearthlog: {recording.gaps} gaps, {recording.frames_lost} frames not heard", err=True
         )
-    if damaged or recording.gaps:
+    if damaged or recording.gaps or recording.models_refused:
         raise typer.Exit(3)
+
+
+def _look_at_hangup(stop: Flag) -> SimpleQueue[None]:
+    """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
+    asked: SimpleQueue[None] = SimpleQueue()
+    at_terminal = sys.stderr.isatty()
+
+    def handle(*_: object) -> None:
+        if at_terminal and not sys.stderr.isatty():
+            stop.set()
+        asked.put(None)
+
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup wants it
+        signal.signal(signal.SIGHUP, handle)
+    return asked
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:

@@ -50,8 +50,8 @@ def replay(
         Path | None,
         typer.Option(
             help="Model file, the one that was recorded with or another. Without it the one that "
-            "was recorded with is looked for in the current folder and beside the logs; if it is "
-            "not there, there are statistics but no labels (exit status 3)."
+            "was recorded with is looked for in the current folder, in models, and beside the "
+            "logs; if it is not there, there are statistics but no labels (exit status 3)."
         ),
     ] = None,
     source: Annotated[
@@ -94,7 +94,7 @@ def replay(
     )
     _check_output(output, path)
     logs = LogSet(find_logs(path), wanted.kind)
-    models = _Models(model, (Path(), path if path.is_dir() else path.parent))
+    models = _Models(model, (Path(), Path("models"), path if path.is_dir() else path.parent))
     models.report(logs.chosen(wanted))
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,8 +1,8 @@
-"""`hearthlog train`: labelled clips to a model file."""
+"""`hearthlog train`: labelled sound to a model file."""
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,49 +10,127 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from analyzer.dataset import Dataset, Recording
+    from analyzer.scenario import Scenario
     from models.modelfile import Model
+
+_FEW_SOURCES = 5
+_FEW_SECONDS = 30.0
 
 
 def train(
-    data: Annotated[
-        Path,
-        typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv."),
-    ],
-    scenario: Annotated[
-        str, typer.Option(help="What to tell apart: bathroom, general, or a TOML file.")
-    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to make, *.safetensors.")
     ],
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv."),
+    ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="What to tell apart: bathroom, general, or a TOML file.")
+    ] = None,
+    home: Annotated[
+        list[Path] | None,
+        typer.Option(help="Logs with review layers, and enrolled sounds, to learn from as well."),
+    ] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
+    ] = None,
+    method: Annotated[
+        str, typer.Option(help="bands, or paper: the 42 statistics and SVM of the paper.")
+    ] = "bands",
+    smoothing: Annotated[
+        str, typer.Option(help="How labels become segments: hmm, or merge (the paper's).")
+    ] = "hmm",
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Learn a model from labelled clips, and measure it on sources it has not heard."""
-    from analyzer.dataset import build_dataset
-    from analyzer.manifest import read_manifest
-    from analyzer.scenario import load_scenario
-    from analyzer.train import train_model
+    """Learn a model from labelled sound, and measure it on sources it has not heard."""
     from models.modelfile import check_output, load_model, save_model
 
     check_output(output)
-    chosen = load_scenario(scenario)
-    clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
-    with _progress(f"listening to {len(clips)} clips") as report:
-        segments = build_dataset(clips, chosen, report)
-    with _progress(f"learning from {len(segments.target)} segments") as report:
-        model = train_model(segments, chosen, report)
+    if base is not None:
+        if data or scenario or not home:
+            raise typer.BadParameter("--base goes with --home, and without --data and --scenario")
+        model, segments = _adapted(base, home)
+    else:
+        if not data or not scenario:
+            raise typer.BadParameter("give --data and --scenario, or --base and --home")
+        model, segments = _learned(data, scenario, home or [], method, smoothing)
     save_model(model, output)
     saved = load_model(output)
     if as_json:
         about = saved.description.model_dump()
-        result = {"model": str(output), "sha256": saved.sha256, "skipped": segments.skipped}
+        result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
         print(json.dumps(result | about))
     else:
-        _print(saved, segments.skipped)
+        _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
 
 
+def _learned(
+    data: list[Path], scenario: str, home: list[Path], method: str, smoothing: str
+) -> tuple["Model", "Dataset"]:
+    from analyzer.dataset import build_dataset
+    from analyzer.manifest import read_manifest
+    from analyzer.recipe import RECIPES
+    from analyzer.scenario import load_scenario
+    from analyzer.train import SMOOTHINGS, train_model
+
+    if method not in RECIPES:
+        raise typer.BadParameter(f"--method {method}: choose one of {', '.join(RECIPES)}")
+    if smoothing not in SMOOTHINGS:
+        raise typer.BadParameter(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
+    chosen = load_scenario(scenario)
+    clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
+    with progress(f"listening to {len(clips)} clips") as report:
+        segments = build_dataset(clips, chosen, report, _heard_at(home))
+    _warn_of_few(segments)
+    with progress(f"learning from {len(segments)} segments") as report:
+        return train_model(segments, chosen, report, RECIPES[method], smoothing), segments
+
+
+def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
+    from analyzer.dataset import cut_recordings
+    from analyzer.train import adapt_model
+    from models.modelfile import load_model
+
+    model = load_model(base)
+    segments = cut_recordings(_heard_at(home), _scenario(model))
+    with progress(f"learning from {len(segments)} segments of the home besides"):
+        return adapt_model(model, segments), segments
+
+
+def _scenario(model: "Model") -> "Scenario":
+    from analyzer.scenario import Scenario
+
+    about = model.description
+    classes = {name: tuple(labels) for name, labels in about.scenario.items()}
+    return Scenario(about.scenario_name, classes)
+
+
+def _manifest(path: Path) -> Path:
+    return path / "manifest.csv" if path.is_dir() else path
+
+
+def _heard_at(folders: list[Path]) -> Iterator["Recording"]:
+    for folder in folders:
+        from analyzer.home import home_recordings
+
+        yield from home_recordings(folder)
+
+
+def _warn_of_few(segments: "Dataset") -> None:
+    for name, amount in segments.amounts.items():
+        if amount.sources < _FEW_SOURCES or amount.seconds < _FEW_SECONDS:
+            typer.echo(
+                f"hearthlog: class {name} has {amount.sources} sources, {amount.seconds:.0f} s: "
+                f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s",
+                err=True,
+            )
+
+
 @contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """Show a bar on stderr if that is a terminal, else one line."""
     from rich.console import Console
     from rich.progress import Progress
@@ -66,7 +144,7 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _print(model: "Model", skipped: dict[str, int]) -> None:
+def _print(model: "Model", segments: "Dataset") -> None:
     about, metrics = model.description, model.description.metrics
     width = max(len(name) for name in (*about.classes, "class"))
     print(f"{'class':{width}}  sources  seconds  segments  precision  recall     F1")
@@ -85,7 +163,16 @@ def _print(model: "Model", skipped: dict[str, int]) -> None:
     size = max(len(str(value)) for row in metrics.confusion for value in row) + 2
     for name, row in zip(about.classes, metrics.confusion, strict=True):
         print(f"{name:{width}}", *(f"{value:{size}}" for value in row), sep="")
+    if about.training_data.home:
+        print("\nlearned from the home besides (the figures above are those before)")
+    for name, amount in about.training_data.home.items():
+        if amount.segments:
+            print(f"{name:{width}}  {amount.sources:7}  {amount.seconds:7.1f}  {amount.segments:8}")
+    _print_skipped(segments.skipped)
+
+
+def _print_skipped(skipped: Mapping[str, int]) -> None:
     if skipped:
-        print("\nclips left out")
+        print("\nrecordings left out")
     for reason, count in skipped.items():
         print(f"{count:6}  {reason}")

@@ -1,0 +1,120 @@
+"""What some corrected seconds of a new home are worth.
+
+A collection that the machine has never heard stands for the home: it is adapted to segments from
+half of the collection's groups, and tried on those of the other half.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import f1_score
+
+from analyzer.dataset import Dataset, Progress
+from analyzer.errors import DataError
+from analyzer.home import HOME_WEIGHT
+from analyzer.recipe import Examples, Recipe, decide, fit, home_votes, prepare
+
+CORRECTED = (0, 10, 30, 60)  # segments
+_FEWEST_GROUPS = 8
+_FEWEST_CLASSES = 2
+_FEWEST_SEGMENTS = max(CORRECTED)  # to correct, and as many to be tried on
+_SHUFFLES = 3
+
+Indices = NDArray[np.intp]
+
+
+class Curve(NamedTuple):
+    """Macro F1 against the number of corrected segments.
+
+    Attributes
+    ----------
+    corrected : tuple of int
+    collections : dict of str to list of float
+        Of each collection that was left out, over the classes that it has.
+    mean : list of float
+    """
+
+    corrected: tuple[int, ...]
+    collections: dict[str, list[float]]
+    mean: list[float]
+
+
+def adaptation_curve(data: Dataset, recipe: Recipe, progress: Progress) -> Curve:
+    """Leave each collection out in turn and adapt to ever more of it.
+
+    Parameters
+    ----------
+    data : Dataset
+    recipe : Recipe
+    progress : callable
+        Told how many fits of how many are done.
+
+    Raises
+    ------
+    DataError
+        If no collection is large and varied enough to stand for a home.
+    """
+    names = data.collection_names
+    chosen = [number for number in range(len(names)) if _is_like_a_home(data, number)]
+    if not chosen:
+        raise DataError(
+            f"no collection has {_FEWEST_CLASSES} classes, {_FEWEST_GROUPS} source groups and "
+            f"{2 * _FEWEST_SEGMENTS} segments: none can stand for a new home"
+        )
+    examples = prepare(recipe, data)
+    jobs = [(number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
+    scores = np.empty((len(jobs), len(CORRECTED)))
+    for place, (number, shuffle) in enumerate(jobs):
+        scores[place] = list(_scores(recipe, examples, data, number, shuffle))
+        progress(place + 1, len(jobs))
+    each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
+    found = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
+    return Curve(CORRECTED, found, each.mean(axis=0).tolist())
+
+
+def _is_like_a_home(data: Dataset, number: int) -> bool:
+    inside = data.collection == number
+    return (
+        len(np.unique(data.target[inside])) >= _FEWEST_CLASSES
+        and len(np.unique(data.group[inside])) >= _FEWEST_GROUPS
+        and inside.sum() >= 2 * _FEWEST_SEGMENTS
+    )
+
+
+def _scores(
+    recipe: Recipe, examples: Examples, data: Dataset, number: int, shuffle: int
+) -> Iterator[float]:
+    rng = np.random.default_rng(shuffle)
+    inside = data.collection == number
+    groups = rng.permutation(np.unique(data.group[inside]))
+    mine = np.isin(data.group, groups[: len(groups) // 2])
+    pool = _turn_about(np.flatnonzero(inside & mine), data.target, rng)
+    test = np.flatnonzero(inside & ~mine)
+    others = np.flatnonzero(~inside & ~np.isin(data.group, groups))
+    for count in CORRECTED:
+        weight = examples.weight.copy()
+        weight[pool[:count]] = HOME_WEIGHT
+        seen = np.concatenate([others, pool[:count]])
+        machine = fit(recipe, examples._replace(weight=weight), seen)
+        inputs = examples.inputs[0]
+        decision = decide(machine, inputs[test], len(data.classes))
+        home = pool[:count]
+        votes = home_votes(machine, inputs[test], inputs[home], data.target[home])
+        decision[:, : votes.shape[1]] += votes
+        predicted = decision.argmax(axis=1)
+        labels = np.unique(data.target[test])
+        yield float(
+            f1_score(data.target[test], predicted, labels=labels, average="macro", zero_division=0)
+        )
+
+
+def _turn_about(rows: Indices, target: Indices, rng: np.random.Generator) -> Indices:
+    """Order segments at random, but so that the classes take turns, as a person would correct."""
+    rows = rng.permutation(rows)
+    turn = np.empty(len(rows), np.intp)
+    for value in np.unique(target[rows]):
+        same = target[rows] == value
+        turn[same] = np.arange(same.sum())
+    return rows[np.argsort(turn, kind="stable")]

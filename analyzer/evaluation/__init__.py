@@ -1,0 +1,1 @@
+"""How good a model, or a labelling, is: scores, events, references, pictures."""

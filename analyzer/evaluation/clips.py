@@ -1,0 +1,180 @@
+"""A model on labelled clips: by segments as in training, and by events as in a log."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analyzer.dataset import Progress, Recording, clip_features, cut_recordings
+from analyzer.errors import DataError
+from analyzer.evaluation.events import Detections, Events, detect
+from analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
+from analyzer.manifest import Clip
+from analyzer.scenario import Scenario
+from models.classifier import Classifier
+from models.inputs import InputStream, window_inputs
+from models.modelfile import Model
+from models.segments import Segmenter
+from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.messages import NANOSECONDS
+
+_FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good a model is on labelled clips.
+
+    Attributes
+    ----------
+    scores : Scores
+        Of segments of a second; the groups are the source groups.
+    expected_calibration_error : float
+    reliability : list of Bin
+    detections : Detections
+        Each clip is a recording with one event, its label from the first frame that the model
+        labels to the last.
+    evaluated_seconds : float
+        Of what the detections are about.
+    skipped : dict of str to int
+        Why clips gave no segment, and how many.
+    learned_from : bool
+        Whether the model learned from just these segments.
+    """
+
+    scores: Scores
+    expected_calibration_error: float
+    reliability: list[Bin]
+    detections: Detections
+    evaluated_seconds: float
+    skipped: Mapping[str, int]
+    learned_from: bool
+
+
+def scenario_of(model: Model) -> Scenario:
+    """Return the scenario that a model was trained for."""
+    about = model.description
+    classes = {name: tuple(labels) for name, labels in about.scenario.items()}
+    return Scenario(about.scenario_name, classes)
+
+
+def evaluate_model(
+    model: Model, clips: Sequence[Clip], scenario: Scenario, progress: Progress
+) -> Evaluation:
+    """Run a model on clips, and compare what it says with their labels.
+
+    Parameters
+    ----------
+    model : Model
+    clips : sequence of Clip
+    scenario : Scenario
+        With the classes of the model.
+    progress : callable
+        Told how many clips of how many are done.
+
+    Raises
+    ------
+    DataError
+        If the classes of the model are not those of the scenario, or no clip has a segment.
+    SourceError
+        If a clip cannot be read.
+    """
+    check_classes(model, scenario)
+    # In the order of the model's probabilities.
+    scenario = Scenario(
+        scenario.name, {name: scenario.classes[name] for name in model.classes}, scenario.ignored
+    )
+    listener = _Listener(model)
+    data = cut_recordings(_heard(clips, scenario, listener, progress), scenario)
+    if not len(data):
+        reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
+        raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
+    inputs = window_inputs(model.description.inputs, data.windows)
+    probabilities = Classifier(model).probabilities(inputs)
+    scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
+    return Evaluation(
+        scores=scores,
+        expected_calibration_error=calibration_error(probabilities, data.target),
+        reliability=reliability(probabilities, data.target),
+        detections=listener.detections(),
+        evaluated_seconds=listener.duration / NANOSECONDS,
+        skipped=data.skipped,
+        learned_from=data.digest == model.description.training_data.sha256,
+    )
+
+
+def check_classes(model: Model, scenario: Scenario) -> None:
+    """Raise DataError unless a model has the classes of a scenario, in any order."""
+    lacking = [name for name in scenario.classes if name not in model.classes]
+    other = [name for name in model.classes if name not in scenario.classes]
+    if lacking or other:
+        said = [
+            f"{what} {', '.join(names)}"
+            for what, names in (("the model lacks", lacking), ("the scenario lacks", other))
+            if names
+        ]
+        raise DataError(
+            f"model {model.name or model.description.scenario_name} does not fit scenario "
+            f"{scenario.name}: {'; '.join(said)}; use the scenario it was trained for"
+        )
+
+
+def _heard(
+    clips: Sequence[Clip], scenario: Scenario, listener: "_Listener", progress: Progress
+) -> Iterator[Recording]:
+    """Read the clips once, for segments and events alike."""
+    class_of = scenario.class_of
+    for number, clip in enumerate(clips):
+        progress(number, len(clips))
+        features = np.empty((0, len(FEATURE_NAMES)), np.float32)
+        if clip.label in class_of:
+            features = clip_features(clip)
+            listener.listen(features, class_of[clip.label])
+        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
+    progress(len(clips), len(clips))
+
+
+class _Listener:
+    """Collects the events of recordings that are laid out one after the other.
+
+    Attributes
+    ----------
+    duration : int
+        Labelled time, in nanoseconds.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.duration = 0
+        self._model = model
+        self._classifier = Classifier(model)
+        self._place = 0
+        self._reference: list[tuple[int, int, int]] = []
+        self._found: list[tuple[int, int, int]] = []
+
+    def listen(self, features: Float32, label: str) -> None:
+        """Add a recording of one label."""
+        inputs = InputStream(self._classifier.inputs)(features)
+        probabilities = self._classifier.probabilities(inputs)
+        if not len(probabilities):
+            return
+        length = len(probabilities) * FRAME_NANOSECONDS
+        stamps = self._place + np.arange(0, length, FRAME_NANOSECONDS)
+        about = self._model.description
+        segmenter = Segmenter(about.smoothing, self._model.transitions, _FRAME_SECONDS)
+        segments = segmenter.push(probabilities, stamps) + segmenter.close(self._place + length)
+        self._found += [(one.start, one.end, one.label) for one in segments]
+        true = self._model.classes.index(label)
+        self._reference.append((self._place, self._place + length, true))
+        self.duration += length
+        self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
+
+    def detections(self) -> Detections:
+        """Score all of them."""
+        reference, found = (
+            Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._found)
+        )
+        return detect(reference, found, self._model.classes, self.duration)

@@ -1,0 +1,144 @@
+"""Labellings of a log: its own segments, a layer's, a reviewer's, or those of a label file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from analyzer.errors import DataError
+from analyzer.evaluation.reference import Labelling
+from analyzer.exchange import read_lines
+from analyzer.export.names import names_of
+from analyzer.heard import find_heard
+from analyzer.known import is_of_type
+from analyzer.review import read_marks
+from analyzer.selection import Selection, select
+from schemas import messages
+from schemas.columns import read_columns
+from schemas.errors import LogError
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs
+
+REVIEW = "review"
+_FIELDS = {"header.stamp", "duration", "label"}
+_MOST_CLASSES = 100
+_LATEST = 1 << 62  # nanoseconds
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """What a log is labelled with.
+
+    Attributes
+    ----------
+    topic : str
+    classes : tuple of str
+        The labels there may be.
+    labelling : Labelling
+    unfinished : tuple of Path
+        Logs that were not completed.
+    """
+
+    topic: str
+    classes: tuple[str, ...]
+    labelling: Labelling
+    unfinished: tuple[Path, ...]
+
+    @property
+    def microphone(self) -> str:
+        """Name of the microphone."""
+        return self.topic.strip("/").split("/")[0]
+
+
+def read_labelled(path: Path, topic: str | None = None) -> Labelled:
+    """Read the segments of a log, or of a folder of logs, and of their layers.
+
+    Parameters
+    ----------
+    path : Path
+    topic : str, optional
+        By default that of the only microphone.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, or has no such segments.
+    """
+    selection = select(_with_layers(path))
+    topic = _segment_topic(selection, topic)
+    columns = read_columns(selection.logs, {topic}, fields=_FIELDS).get(topic)
+    if columns is None or not (columns["duration"] > 0).any():
+        raise LogError(f"{path}: there is no segment on {topic}")
+    columns = columns.taken(np.flatnonzero(columns["duration"] > 0))
+    columns = columns.taken(np.argsort(columns["header.stamp"], kind="stable"))
+    starts, labels = columns["header.stamp"], columns["label"]
+    ends = starts + columns["duration"]
+    if (starts[1:] < ends[:-1]).any():
+        raise LogError(f"{topic}: segments overlap; is a log there twice, or those of two homes?")
+    channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
+    named = [names_of(channel.metadata, "probabilities") for channel, _ in channels]
+    classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
+    if len(classes) > _MOST_CLASSES:
+        raise LogError(f"{topic}: has {len(classes)} different labels; no classifier has so many")
+    labelling = Labelling(starts, ends, labels)
+    return Labelled(topic, classes, labelling, tuple(selection.unfinished))
+
+
+def read_reference(source: str, path: Path, microphone: str) -> Labelling:
+    """Read what a log is to be compared with.
+
+    Parameters
+    ----------
+    source : str
+        A label file as `analyzer.exchange` reads it, or `review` for the review layers.
+    path : Path
+        The log, or folder of logs.
+    microphone : str
+
+    Raises
+    ------
+    DataError
+        If there is no such file, it is no label file, or nobody has reviewed the logs.
+    LogError
+        If a log or a layer is damaged.
+    """
+    if source == REVIEW:
+        marks = [mark for log in find_logs(path) for mark in read_marks(log)]
+        where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
+    else:
+        found = read_lines(Path(source), find_heard(path), microphone)
+        marks = [mark for _, mark in found]
+        where = f"{source}: has no label of {microphone}"
+    marks = [mark for mark in marks if mark.microphone == microphone]
+    if not marks:
+        raise DataError(where)
+    if max(abs(time) for mark in marks for time in (mark.start, mark.end)) > _LATEST:
+        raise DataError(f"{source}: has a time that no log has")
+    starts, ends, labels = zip(*((m.start, m.end, m.label) for m in marks), strict=True)
+    return Labelling(np.array(starts), np.array(ends), np.array(labels, object))
+
+
+def _with_layers(path: Path) -> list[Path]:
+    """List a log and the layers beside it."""
+    if not path.is_file():
+        return [path]
+    stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+    beside = (other for other in path.parent.iterdir() if other.name.endswith(SUFFIX))
+    return [path, *sorted(other for other in beside if other.name.startswith(f"{stem}."))]
+
+
+def _segment_topic(selection: Selection, wanted: str | None) -> str:
+    """Find the topic of a recorder's segments."""
+    known = sorted(
+        topic
+        for topic, channels in selection.channels.items()
+        if all(is_of_type(*described, messages.SEGMENT) for described in channels)
+    )
+    recorded = [topic for topic in known if topic.count("/") == 2]
+    if not known:
+        raise LogError("no segments: the log was recorded without a model; relabel it with one")
+    if wanted is None and len(recorded) != 1:
+        raise LogError(f"choose one with --topic: {', '.join(known)}")
+    topic = recorded[0] if wanted is None else wanted
+    if topic not in known:
+        raise LogError(f"{topic}: no such segments; there are {', '.join(known)}")
+    return topic

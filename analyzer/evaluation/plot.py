@@ -1,0 +1,91 @@
+"""Scores as a picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from analyzer.evaluation.scores import Bin, Scores
+from analyzer.evaluation.table import shown
+from schemas.files import new_file
+
+
+def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:
+    """Draw the confusion matrix, F1 by class and, if there are bins, the reliability diagram.
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
+    count = len(scores.classes)
+    names = [shown(name).replace("$", r"\$") for name in scores.classes]
+    figure = Figure(figsize=(9 + 0.45 * count, 3.5 + 0.45 * count), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, parse_math=False)
+    if bins:
+        axes = figure.subplot_mosaic([["matrix", "f1"], ["matrix", "sure"]], width_ratios=(3, 2))
+        _reliability(axes["sure"], bins)
+    else:
+        axes = figure.subplot_mosaic([["matrix", "f1"]], width_ratios=(3, 2))
+    _matrix(axes["matrix"], scores, names)
+    _f1(axes["f1"], scores, names)
+    with new_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def _matrix(axes: Any, scores: Scores, names: Sequence[str]) -> None:
+    counts = np.array(scores.confusion)
+    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    for row, column in np.argwhere(counts > 0).tolist():
+        axes.text(
+            column,
+            row,
+            f"{100 * share[row, column]:.0f}",
+            ha="center",
+            va="center",
+            color="white" if share[row, column] > 0.5 else "black",
+        )
+    axes.set_xticks(range(len(names)), names, rotation=45, ha="right", rotation_mode="anchor")
+    axes.set_yticks(
+        range(len(names)),
+        [f"{name} ({n})" for name, n in zip(names, counts.sum(axis=1), strict=True)],
+    )
+    axes.set(title="confusion, % of the true class", xlabel="predicted", ylabel="true (support)")
+
+
+def _f1(axes: Any, scores: Scores, names: Sequence[str]) -> None:
+    for place, one in enumerate(scores.per_class.values()):
+        if one.f1 is None:
+            continue
+        axes.barh(place, one.f1, color="tab:blue", alpha=0.6)
+        if one.f1_interval is not None:
+            axes.plot(one.f1_interval, (place, place), color="black", linewidth=1.5)
+    axes.axvline(scores.macro_f1, color="tab:red", linestyle="--", linewidth=1)
+    if scores.macro_f1_interval is not None:
+        axes.axvspan(*scores.macro_f1_interval, color="tab:red", alpha=0.1)
+    axes.set_yticks(range(len(names)), names)
+    axes.set(
+        title=f"F1, 95 % intervals; macro {scores.macro_f1:.3f} (red)",
+        xlim=(0, 1),
+        ylim=(len(names) - 0.5, -0.5),
+    )
+
+
+def _reliability(axes: Any, bins: Sequence[Bin]) -> None:
+    confidence, accuracy = ([getattr(b, name) for b in bins] for name in ("confidence", "accuracy"))
+    share = np.array([b.count for b in bins]) / sum(b.count for b in bins)
+    axes.plot((0, 1), (0, 1), color="grey", linestyle=":")
+    axes.plot(confidence, accuracy, color="tab:blue")
+    axes.scatter(confidence, accuracy, s=20 + 400 * share, color="tab:blue", alpha=0.6)
+    axes.set(
+        title="reliability (dots: share of segments)",
+        xlabel="probability of the winning class",
+        ylabel="how often it is right",
+        xlim=(0, 1.02),
+        ylim=(0, 1.05),
+    )

@@ -1,0 +1,293 @@
+"""Scores of classified segments, how sure they are, and how far two models differ."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analyzer.errors import DataError
+
+RESAMPLES = 1000
+_BINS = 15
+_SEED = 0
+_COUNTS_AT_ONCE = 4_000_000  # of the counts of resamples: bounds memory
+_INTERVAL = (2.5, 97.5)
+
+Interval = tuple[float, float]
+Float64 = NDArray[np.float64]
+Counts = NDArray[np.int64]
+Indices = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class ClassScores:
+    """Scores of one class; None where they have no meaning, as recall of what never occurs.
+
+    Attributes
+    ----------
+    precision, recall, f1 : float or None
+    f1_interval : tuple of float, or None
+        95 %, bootstrap over groups; None with a single group.
+    support : int
+        True segments of the class.
+    """
+
+    precision: float | None
+    recall: float | None
+    f1: float | None
+    f1_interval: Interval | None
+    support: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of classified segments.
+
+    Attributes
+    ----------
+    macro_f1, macro_precision, macro_recall : float
+        Means over the classes that occur.
+    macro_f1_interval : tuple of float, or None
+        95 %, bootstrap over groups; None with a single group.
+    per_class : dict of str to ClassScores
+    confusion : list of list of int
+        True classes in rows, predicted ones in columns.
+    segments, groups : int
+    classes : tuple of str
+    """
+
+    macro_f1: float
+    macro_f1_interval: Interval | None
+    macro_precision: float
+    macro_recall: float
+    per_class: dict[str, ClassScores]
+    confusion: list[list[int]]
+    segments: int
+    groups: int
+    classes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Segments whose winning class has a probability in one of 15 equal ranges.
+
+    Attributes
+    ----------
+    bin : int
+    confidence : float
+        Mean probability of the winning class.
+    accuracy : float
+        Share in which it is the true one.
+    count : int
+    """
+
+    bin: int
+    confidence: float
+    accuracy: float
+    count: int
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Macro F1 of a second model minus that of a first, on the same segments.
+
+    Attributes
+    ----------
+    macro_f1 : float
+        Positive where the second is better.
+    interval : tuple of float, or None
+        95 %, paired bootstrap over groups; None with a single group.
+    """
+
+    macro_f1: float
+    interval: Interval | None
+
+
+def score(
+    target: Indices,
+    predicted: Indices,
+    group: Indices,
+    classes: Sequence[str],
+    weight: Counts | None = None,
+) -> Scores:
+    """Score predicted classes.
+
+    Parameters
+    ----------
+    target, predicted : np.ndarray [shape=(n,)]
+        Indices of classes.
+    group : np.ndarray [shape=(n,)]
+        Numbers of the sources, which are resampled as a whole for the intervals.
+    classes : sequence of str
+    weight : np.ndarray [shape=(n,)], int64, optional
+        For how many segments a row stands; for one by default.
+
+    Raises
+    ------
+    DataError
+        If there is no segment.
+    """
+    confusions = _confusions(target, predicted, group, len(classes), weight)
+    confusion = confusions.sum(axis=0)
+    support = confusion.sum(axis=1)
+    precision, recall, f1 = _rates(confusion)
+    resampled = np.concatenate([_rates(counts)[2] for counts in _resamples(confusions)])
+    return Scores(
+        macro_f1=float(np.nanmean(f1)),
+        macro_f1_interval=_interval(_macro(resampled), confusions),
+        macro_precision=float(precision[support > 0].mean()),
+        macro_recall=float(np.nanmean(recall)),
+        per_class={
+            name: ClassScores(
+                precision=_known(precision[i]),
+                recall=_known(recall[i]),
+                f1=_known(f1[i]),
+                f1_interval=_interval(resampled[:, i], confusions) if support[i] else None,
+                support=int(support[i]),
+            )
+            for i, name in enumerate(classes)
+        },
+        confusion=confusion.astype(np.int64).tolist(),
+        segments=int(confusion.sum()),
+        groups=len(confusions),
+        classes=tuple(classes),
+    )
+
+
+def difference(
+    target: Indices,
+    probabilities_a: NDArray[np.floating],
+    probabilities_b: NDArray[np.floating],
+    group: Indices,
+    classes: Sequence[str],
+) -> Difference:
+    """Compare two models on the same segments: macro F1 of b minus that of a.
+
+    Parameters
+    ----------
+    target : np.ndarray [shape=(n,)]
+        Indices of classes.
+    probabilities_a, probabilities_b : np.ndarray [shape=(n, C)]
+    group : np.ndarray [shape=(n,)]
+        Numbers of the sources.
+    classes : sequence of str
+
+    Raises
+    ------
+    DataError
+        If there is no segment.
+    """
+    first, second = (
+        _confusions(target, probabilities.argmax(axis=1), group, len(classes))
+        for probabilities in (probabilities_a, probabilities_b)
+    )
+    resampled = np.concatenate(
+        [
+            _macro(_rates(b)[2]) - _macro(_rates(a)[2])
+            for a, b in zip(_resamples(first), _resamples(second), strict=True)  # the same draws
+        ]
+    )
+    macro = [float(np.nanmean(_rates(c.sum(axis=0))[2])) for c in (first, second)]
+    return Difference(macro[1] - macro[0], _interval(resampled, first))
+
+
+def calibration_error(probabilities: NDArray[np.floating], target: Indices) -> float:
+    """Compute the expected calibration error of the winning class, over 15 bins of equal width.
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)]
+    target : np.ndarray [shape=(n,)]
+
+    References
+    ----------
+    Guo et al., "On Calibration of Modern Neural Networks", 2017.
+    """
+    place, confidence, right = _binned(probabilities, target)
+    return float(np.abs(np.bincount(place, right - confidence)).sum() / len(target))
+
+
+def reliability(probabilities: NDArray[np.floating], target: Indices) -> list[Bin]:
+    """Compare how sure a model is with how often it is right; empty bins are left out.
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)]
+    target : np.ndarray [shape=(n,)]
+    """
+    place, confidence, right = _binned(probabilities, target)
+    count = np.bincount(place, minlength=_BINS)
+    sure = np.bincount(place, confidence, minlength=_BINS)
+    correct = np.bincount(place, right, minlength=_BINS)
+    return [
+        Bin(i, float(sure[i] / count[i]), float(correct[i] / count[i]), int(count[i]))
+        for i in np.flatnonzero(count).tolist()
+    ]
+
+
+def _binned(
+    probabilities: NDArray[np.floating], target: Indices
+) -> tuple[NDArray[np.intp], Float64, Float64]:
+    confidence = probabilities.max(axis=1).astype(np.float64)
+    right = (probabilities.argmax(axis=1) == target).astype(np.float64)
+    return np.minimum((confidence * _BINS).astype(np.intp), _BINS - 1), confidence, right
+
+
+def _confusions(
+    target: Indices,
+    predicted: Indices,
+    group: Indices,
+    classes: int,
+    weight: Counts | None = None,
+) -> Float64:
+    """Confusion matrix of each group, shape (G, C, C)."""
+    if not len(target):
+        raise DataError("there is nothing to score")
+    names, number = np.unique(group, return_inverse=True)
+    place = (number * classes + target) * classes + predicted
+    counts = np.bincount(place, weight, minlength=len(names) * classes**2)
+    return counts.astype(np.float64).reshape(len(names), classes, classes)
+
+
+def _resamples(confusions: Float64) -> Iterator[Float64]:
+    """Yield the confusion matrices of all resamples of the groups, some at a time."""
+    groups, classes, _ = confusions.shape
+    flat = confusions.reshape(groups, -1)
+    share = np.full(groups, 1.0 / groups)
+    rng = np.random.default_rng(_SEED)
+    at_once = max(_COUNTS_AT_ONCE // max(groups, classes**2), 1)
+    for start in range(0, RESAMPLES, at_once):
+        drawn = rng.multinomial(groups, share, min(at_once, RESAMPLES - start))
+        yield (drawn.astype(np.float64) @ flat).reshape(-1, classes, classes)
+
+
+def _rates(confusion: Float64) -> tuple[Float64, Float64, Float64]:
+    """Precision, recall and F1 of each class of matrices (..., C, C).
+
+    Recall and F1 are NaN where the class does not occur, precision where it is not predicted
+    either; where it occurs and is not predicted, precision is 0.
+    """
+    right = np.diagonal(confusion, axis1=-2, axis2=-1)
+    true, predicted = confusion.sum(axis=-1), confusion.sum(axis=-2)
+    with np.errstate(invalid="ignore"):
+        precision = right / np.where(true > 0, np.maximum(predicted, 1), predicted)
+        recall = right / true
+        f1 = np.where(true > 0, 2.0 * right / (true + predicted), np.nan)
+    return precision, recall, f1
+
+
+def _macro(f1: Float64) -> Float64:
+    """Mean over the classes that occur; every resample has at least one."""
+    return np.nanmean(f1, axis=-1)
+
+
+def _interval(resampled: Float64, confusions: Float64) -> Interval | None:
+    if len(confusions) < 2:
+        return None
+    low, high = np.nanpercentile(resampled, _INTERVAL)
+    return float(low), float(high)
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,144 @@
+"""The hidden Markov model behind smoothing: its transitions, and the whole of a sound at once."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from hmmlearn.base import BaseHMM
+from numpy.typing import NDArray
+
+from models.smoothing import Float32, Float64, States, log_likelihoods
+from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+
+FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
+LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not
+
+# How long a sound goes on, in seconds, by the classes of the built-in scenarios.
+DURATIONS: Mapping[str, float] = {
+    "silence": 60.0,
+    "speech": 5.0,
+    "music": 60.0,
+    "phone_ring": 5.0,
+    "coughing": 0.5,
+    "crying": 5.0,
+    "yelling": 2.0,
+    "laughing": 2.0,
+    "objects_activity": 2.0,
+    "flushing_water": 15.0,
+    "shower": 300.0,
+    "tap_water": 10.0,
+    "bathroom_other": 5.0,
+    "other": 10.0,  # anything that is not of the bathroom
+}
+_DURATION = 5.0
+
+
+def default_transitions(classes: Sequence[str]) -> Float64:
+    """Return the transitions of classes by how long their sounds are expected to go on.
+
+    Parameters
+    ----------
+    classes : sequence of str
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+        A frame, from row to column.
+    """
+    return transitions_from_durations(expected_durations(classes), FRAME_SECONDS)
+
+
+def expected_durations(classes: Sequence[str]) -> Float64:
+    """Return how many seconds the sounds of classes are expected to go on, shape (C,)."""
+    return np.array([DURATIONS.get(name, _DURATION) for name in classes])
+
+
+def transitions_from_durations(durations: Float64, frame_seconds: float) -> Float64:
+    """Return the transitions of classes whose sounds have some mean durations.
+
+    What follows a sound may be any other, one as likely as the other.
+
+    Parameters
+    ----------
+    durations : np.ndarray [shape=(C,)], float64
+        In seconds; less than a frame counts as a frame.
+    frame_seconds : float
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+    """
+    leave = 1.0 / np.maximum(durations / frame_seconds, 1.0)
+    count = len(durations)
+    if count == 1:
+        return np.ones((1, 1))
+    transitions = np.repeat(leave[:, np.newaxis] / (count - 1), count, axis=1)
+    np.fill_diagonal(transitions, 1.0 - leave)
+    return transitions
+
+
+def transitions_from_sequences(
+    sequences: Sequence[NDArray[np.int64]],
+    durations: Float64,
+    frame_seconds: float = FRAME_SECONDS,
+) -> Float64:
+    """Learn transitions from labelled sequences, starting from expected durations.
+
+    The durations count as one visit to each class; a class that is in no sequence keeps them.
+
+    Parameters
+    ----------
+    sequences : sequence of np.ndarray [shape=(n,)], int64
+        Classes of successive frames.
+    durations : np.ndarray [shape=(C,)], float64
+        In seconds.
+    frame_seconds : float
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+    """
+    count = len(durations)
+    frames = np.maximum(durations / frame_seconds, 1.0)
+    counts = transitions_from_durations(durations, frame_seconds) * frames[:, np.newaxis]
+    for sequence in sequences:
+        pairs = sequence[:-1] * count + sequence[1:]
+        counts += np.bincount(pairs, minlength=count * count).reshape(count, count)
+    transitions: Float64 = counts / counts.sum(axis=1, keepdims=True)
+    return transitions
+
+
+def viterbi(probabilities: Float32, transitions: Float64) -> States:
+    """Return the likeliest path through a sound, shape (n,).
+
+    Parameters
+    ----------
+    probabilities : np.ndarray [shape=(n, C)], float32
+        Of a classifier, frame by frame.
+    transitions : np.ndarray [shape=(C, C)], float64
+    """
+    path: States = _model(transitions).predict(log_likelihoods(probabilities))
+    return path
+
+
+def smoothed(probabilities: Float32, transitions: Float64) -> Float64:
+    """Return the probability of each class at each frame, given the whole sound.
+
+    Takes what `viterbi` takes; gives an array of shape (n, C), float64.
+    """
+    posteriors: Float64 = _model(transitions).predict_proba(log_likelihoods(probabilities))
+    return posteriors
+
+
+def _model(transitions: Float64) -> "_ObservedHMM":
+    count = len(transitions)
+    model = _ObservedHMM(count)
+    model.startprob_ = np.full(count, 1.0 / count)
+    model.transmat_ = transitions
+    return model
+
+
+class _ObservedHMM(BaseHMM):  # type: ignore[misc]
+    """A hidden Markov model that observes the log-likelihoods of its states themselves."""
+
+    def _compute_log_likelihood(self, X: Float64) -> Float64:  # noqa: N803
+        return X

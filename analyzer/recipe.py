@@ -1,0 +1,197 @@
+"""How a support vector machine is made from segments, and tried on those it has not seen."""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from sklearn.metrics.pairwise import rbf_kernel
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+
+from analyzer.augment import augmented
+from analyzer.dataset import Dataset
+from models.inputs import Kind, window_inputs
+
+HOME_VOTE = 5.0  # of nearness, beside sums of decisions between -1 and 1
+_WORKERS = 4
+_SEED = 20_261_121
+
+Float64 = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Fold = tuple[Indices, Indices]  # segments that are seen, and those that are not
+
+
+class Recipe(NamedTuple):
+    """How to learn.
+
+    Attributes
+    ----------
+    inputs : str
+        What the classifier looks at.
+    cost : float
+    gamma : float
+        Times the number of inputs.
+    copies : int
+        How often each segment is learned from as another microphone might have heard it.
+    """
+
+    inputs: Kind
+    cost: float
+    gamma: float
+    copies: int
+
+
+RECIPES = {"bands": Recipe("bands", 4.0, 1.25, 2), "paper": Recipe("statistics", 4.0, 0.5, 0)}
+
+
+class Examples(NamedTuple):
+    """The inputs of segments, of each as it is and as other microphones might have heard it.
+
+    Attributes
+    ----------
+    inputs : np.ndarray [shape=(1 + copies, n, width)], float32
+    target : np.ndarray [shape=(n,)], intp
+    weight : np.ndarray [shape=(n,)], float64
+    """
+
+    inputs: NDArray[np.float32]
+    target: Indices
+    weight: Float64
+
+
+def prepare(recipe: Recipe, data: Dataset) -> Examples:
+    """Make the examples of a recipe from segments; the same segments give the same ones."""
+    rng = np.random.default_rng(_SEED)
+    versions = [data.windows] + [augmented(data.windows, rng) for _ in range(recipe.copies)]
+    inputs = np.stack([window_inputs(recipe.inputs, windows) for windows in versions])
+    return Examples(inputs, data.target, data.weight)
+
+
+def fit(recipe: Recipe, examples: Examples, seen: Indices | slice = slice(None)) -> Pipeline:
+    """Learn from some segments.
+
+    Returns
+    -------
+    sklearn.pipeline.Pipeline
+        A scaler and an `SVC`, classes weighted against their number.
+    """
+    copies, _, width = examples.inputs.shape
+    inputs = examples.inputs[:, seen].reshape(-1, width).astype(np.float64)
+    machine = SVC(
+        C=recipe.cost,
+        gamma=recipe.gamma / width,
+        class_weight="balanced",
+        decision_function_shape="ovo",
+    )
+    return make_pipeline(StandardScaler(), machine).fit(
+        inputs,
+        np.tile(examples.target[seen], copies),
+        svc__sample_weight=np.tile(examples.weight[seen], copies),
+    )
+
+
+def cross_validate(
+    recipe: Recipe,
+    examples: Examples,
+    classes: int,
+    folds: Iterable[Fold],
+    progress: Callable[[int, int], None],
+) -> Float64:
+    """Decide about segments with a machine that has not seen them.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, classes)]
+        Decision values; -inf for a class that was not among the seen, NaN for segments that are
+        unseen in no fold.
+    """
+    folds = list(folds)
+    decisions = np.full((len(examples.target), classes), np.nan)
+
+    def unseen_of(fold: Fold) -> Float64:
+        seen, unseen = fold
+        machine = fit(recipe, examples, seen)
+        return decide(machine, examples.inputs[0, unseen], classes)
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _WORKERS)) as pool:  # libsvm frees the lock
+        for number, decided in enumerate(pool.map(unseen_of, folds)):
+            decisions[folds[number][1]] = decided
+            progress(number + 1, len(folds))
+    return decisions
+
+
+def decide(machine: Pipeline, inputs: NDArray[np.float32], classes: int) -> Float64:
+    """Let the pairs of classes vote, each as far as it is sure.
+
+    Votes that are counted, as scikit-learn does, cannot be calibrated: most segments win just as
+    many of them. Their hyperbolic tangents keep the same winners and tell how clearly.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, classes)]
+        Sums of tanh of the decisions for a class, against each other; -inf for a class that was
+        not learned.
+    """
+    decision = machine.decision_function(inputs.astype(np.float64))
+    pairs = -decision[:, np.newaxis] if decision.ndim == 1 else decision
+    known = np.eye(classes)[machine.classes_]
+    first, second = np.triu_indices(len(known), 1)
+    sums = np.tanh(pairs) @ (known[first] - known[second])
+    sums[:, known.sum(axis=0) == 0] = -np.inf
+    return sums
+
+
+def home_votes(
+    machine: Pipeline, inputs: NDArray[np.float32], home: NDArray[np.float32], target: Indices
+) -> Float64:
+    """Let a home's own segments draw what is like them to their class.
+
+    With a few segments among thousands a support vector machine is content to get these right;
+    the nearness to them, summed up by class, is what makes them count for others. Its square
+    root, so that many of one kind do not drown the rest.
+
+    Parameters
+    ----------
+    machine : sklearn.pipeline.Pipeline
+        As `fit` makes it: for the scale and the kernel.
+    inputs, home : np.ndarray [shape=(n, width)] and [shape=(h, width)], float32
+    target : np.ndarray [shape=(h,)], intp
+        Classes of the home's segments.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, classes)]
+        To be added to the decisions; of the classes up to the highest in `target`.
+    """
+    scaler, svc = machine
+    if not len(home):
+        return np.zeros((len(inputs), 1))
+    kernel = rbf_kernel(scaler.transform(inputs), scaler.transform(home), gamma=svc.gamma)
+    return HOME_VOTE * np.sqrt(kernel @ np.eye(target.max() + 1)[target])
+
+
+def inverse_temperature(decisions: Float64, target: Indices) -> float:
+    """Find what to multiply decisions with, so that their softmax is as sure as it is right.
+
+    References
+    ----------
+    Guo et al., "On Calibration of Modern Neural Networks", 2017.
+    """
+
+    def loss(logarithm: float) -> float:
+        probabilities = softmax(np.exp(logarithm) * decisions)[np.arange(len(target)), target]
+        return float(-np.log(np.maximum(probabilities, 1e-300)).mean())
+
+    found = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
+    return float(np.exp(found.x))
+
+
+def softmax(values: Float64) -> Float64:
+    """Turn rows into probabilities; -inf has none."""
+    grown = np.exp(values - values.max(axis=1, keepdims=True))
+    return grown / grown.sum(axis=1, keepdims=True)

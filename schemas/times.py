@@ -1,0 +1,31 @@
+"""Times as text: ISO 8601, UTC unless they say otherwise, down to the nanosecond."""
+
+import re
+from datetime import UTC, datetime, timedelta
+
+from schemas.messages import NANOSECONDS
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
+
+
+def read_time(text: str) -> int:
+    """Read a time, in nanoseconds of UTC.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for them
+    moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    nanoseconds = (moment - _EPOCH) // timedelta(microseconds=1) * 1_000
+    return nanoseconds + (int(rest.group().ljust(3, "0")) if rest else 0)
+
+
+def time_text(nanoseconds: int) -> str:
+    """Write a time so that none of its digits is lost."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09}Z"

@@ -1,0 +1,50 @@
+"""A folder of models that differ, made of one without learning anew."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from models.inputs import input_width
+from models.modelfile import Model, Smoothing, load_model, save_model
+
+
+def keep_models(folder: Path, model_file: Path) -> Path:
+    """Make the models `one`, `two` and `bands`, the first of them the champion."""
+    folder.mkdir()
+    one = load_model(model_file)
+    rng = np.random.default_rng(3)
+    shift = rng.standard_normal(one.intercepts.shape)
+    save_model(one, folder / "one.safetensors")
+    save_model(replace(one, intercepts=one.intercepts + shift), folder / "two.safetensors")
+    save_model(_of_bands(one), folder / "bands.safetensors")
+    (folder / "champion.safetensors").symlink_to("one.safetensors")
+    return folder
+
+
+def put_by_hand(folder: Path, name: str) -> None:
+    """Point the champion to a file without a check."""
+    link = folder / ".by_hand"
+    link.symlink_to(name)
+    link.replace(folder / "champion.safetensors")
+
+
+def _of_bands(model: Model) -> Model:
+    """Make a model that looks at the same sounds in another way, and smooths what it sees."""
+    rng = np.random.default_rng(4)
+    width, classes = input_width("bands"), len(model.classes)
+    description = model.description.model_copy(
+        update={
+            "inputs": "bands",
+            "gamma": 0.5 / width,
+            "smoothing": Smoothing(method="hmm", lag_seconds=0.7),
+        }
+    )
+    return replace(
+        model,
+        description=description,
+        scaler_mean=rng.standard_normal(width),
+        scaler_scale=rng.uniform(10.0, 20.0, width),
+        support_vectors=rng.normal(0, 15, (len(model.support_vectors), width)).astype(np.float32),
+        transitions=np.full((classes, classes), 0.02 / classes) + 0.98 * np.eye(classes),
+    )

@@ -1,0 +1,153 @@
+"""Two models are compared on what neither has learned from, and only a clear difference is one."""
+
+import json
+from dataclasses import replace
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+from kept import keep_models
+from spliced import run
+
+from analyzer.compare import clip_recordings, compare_models
+from analyzer.dataset import cut_recordings
+from analyzer.errors import DataError
+from analyzer.evaluation.clips import scenario_of
+from analyzer.home import home_recordings
+from analyzer.manifest import read_manifest
+from analyzer.review import Mark, write_marks
+from analyzer.scenario import load_scenario
+from analyzer.train import adapt_model
+from models.modelfile import load_model, save_model
+from recorder.config import Settings
+from recorder.service import record
+from recorder.sources.replayed import FileSource
+from tools.home.simulate import write_day, write_training_set
+
+SECOND = 1_000_000_000
+DAY = 86_400 * SECOND
+START = 1_772_348_400 * SECOND
+
+
+@pytest.fixture
+def folder(tmp_path, model_file):
+    return keep_models(tmp_path / "models", model_file)
+
+
+@pytest.fixture(scope="session")
+def unheard(tmp_path_factory):
+    """A manifest of clips that no model has learned from."""
+    return write_training_set(tmp_path_factory.mktemp("unheard"), clips_per_class=4, seed=77)
+
+
+@pytest.fixture(scope="session")
+def days(tmp_path_factory):
+    """Logs of three days, and beside them what is known to have happened."""
+    folder = tmp_path_factory.mktemp("days")
+    for number in range(3):
+        sound = folder / f"{number}.flac"
+        spans = write_day(sound, minutes=1.5, seed=20 + number)
+        start = START + number * DAY
+        settings = Settings(output=folder / "logs")
+        (log,) = record(settings, FileSource([sound], start), Flag()).logs
+        marks = [
+            Mark("mic", *(start + round(time * SECOND) for time in span[:2]), span[2])
+            for span in spans
+        ]
+        write_marks(log, marks)
+    return folder / "logs"
+
+
+def compare(folder, names, recordings):
+    models = [load_model(folder / f"{name}.safetensors") for name in names]
+    return compare_models(*models, recordings, scenario_of(models[0]))
+
+
+def heard(manifest):
+    scenario = load_scenario("general")
+    return clip_recordings(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
+
+
+def test_a_model_that_guesses_is_clearly_worse(folder, unheard):
+    found = compare(folder, ["one", "bands"], heard(unheard))
+    assert found.clear
+    assert found.difference.macro_f1 < -0.3
+    assert found.difference.interval[1] < 0
+    mirrored = compare(folder, ["bands", "one"], heard(unheard))
+    assert mirrored.difference.macro_f1 == -found.difference.macro_f1
+    np.testing.assert_allclose(
+        mirrored.difference.interval[::-1], -np.array(found.difference.interval)
+    )
+    assert compare(folder, ["one", "bands"], heard(unheard)) == found
+
+
+def test_the_order_of_the_classes_changes_nothing(folder, unheard):
+    scenario = load_scenario("general")
+    turned = replace(scenario, classes=dict(reversed(scenario.classes.items())))
+    models = [load_model(folder / f"{name}.safetensors") for name in ("one", "bands")]
+    found = compare_models(*models, list(heard(unheard)), turned)
+    assert found.a.scores.classes == models[0].classes[::-1]
+    straight = compare(folder, ["one", "bands"], heard(unheard))
+    assert found.difference.macro_f1 == pytest.approx(straight.difference.macro_f1)
+
+
+def test_a_model_and_itself_do_not_differ(folder, unheard):
+    found = compare(folder, ["one", "one"], heard(unheard))
+    assert (found.difference.macro_f1, found.clear) == (0.0, False)
+
+
+def test_what_a_model_has_learned_from_is_left_out(folder, days):
+    recordings = list(home_recordings(days))
+    base = load_model(folder / "one.safetensors")
+    first = [item for item in recordings if item.group == recordings[0].group]
+    adapted = adapt_model(base, cut_recordings(first, scenario_of(base)))
+    save_model(adapted, folder / "adapted.safetensors")
+    found = compare(folder, ["one", "adapted"], recordings)
+    assert (found.a.sources_learned, found.b.sources_learned) == (0, 1)
+    assert (found.sources_left_out, found.held_out, found.a.scores.groups) == (1, True, 2)
+    assert found.a.scores == compare(folder, ["one", "two"], recordings[len(first) :]).a.scores
+
+
+def test_models_that_have_learned_from_everything_are_compared_with_a_warning(folder, days, capfd):
+    recordings = list(home_recordings(days))
+    base = load_model(folder / "one.safetensors")
+    adapted = adapt_model(base, cut_recordings(recordings, scenario_of(base)))
+    save_model(adapted, folder / "adapted.safetensors")
+    result = run(capfd, "models", "compare", "one", "adapted", "--logs", days, "--folder", folder)
+    assert result.returncode == 3
+    assert result.stderr.count("\n") == 1
+    assert "have learned from" in result.stderr
+
+
+def test_the_champion_and_the_candidate_are_compared_on_reviewed_logs(folder, days, capfd):
+    run(capfd, "models", "promote", "bands", "--to", "candidate", "--folder", folder)
+    command = ("models", "compare", "--logs", days, "--folder", folder)
+    result = run(capfd, *command)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.splitlines()[-1].startswith("one is better than bands: ")
+    found = json.loads(run(capfd, *command, "--json").stdout)
+    assert found["clear"] is True
+    assert found["difference"]["interval"][0] <= found["difference"]["macro_f1"] < 0
+    assert found["a"]["scores"]["groups"] == 3
+    assert (found["a"]["name"], found["b"]["name"]) == ("one", "bands")
+
+
+def test_one_source_tells_no_difference(folder, days, capfd):
+    log = min(days.rglob("*Z.mcap"))
+    result = run(capfd, "models", "compare", "one", "bands", "--logs", log, "--folder", folder)
+    assert result.returncode == 0
+    assert "no clear difference can be told from one source" in result.stdout
+
+
+def test_what_cannot_be_compared_is_an_error_of_one_line(folder, days, unheard, tmp_path, capfd):
+    def refusal(*arguments):
+        result = run(capfd, "models", "compare", *arguments, "--folder", folder)
+        assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+        return result.stderr
+
+    assert "there is no candidate" in refusal("--logs", days)
+    assert "does not fit" in refusal("one", "two", "--data", unheard, "--scenario", "bathroom")
+    assert "no log" in refusal("one", "two", "--logs", tmp_path)
+    with pytest.raises(DataError, match="no segment"):
+        compare(folder, ["one", "two"], [])
+    assert run(capfd, "models", "compare", "one", "two", "--folder", folder).returncode == 2

@@ -1,0 +1,211 @@
+"""A sound that was enrolled is a log of its features, all of it marked, and holds no audio."""
+
+import math
+import shutil
+import subprocess
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+from spliced import run
+
+from analyzer.enrol import enrol_file
+from analyzer.heard import find_heard
+from analyzer.review import read_marks
+from recorder.features import FRAME_SAMPLES, FeatureExtractor
+from recorder.sources.files import read_audio
+from schemas.columns import read_columns
+from schemas.files import find_logs
+from schemas.messages import NANOSECONDS
+from schemas.topics import topic
+
+RATE = 16_000
+FEATURES = topic("mic", "features")
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command and return what came of it."""
+    return partial(run, capfd)
+
+
+@pytest.fixture
+def home(tmp_path):
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def cough(household, tmp_path):
+    """Two seconds of a real sound, as another file."""
+    (samples, *_) = read_audio(min(household.glob("cough*/*.flac")))
+    path = tmp_path / "cough.wav"
+    soundfile.write(path, np.resize(samples, 2 * RATE), RATE, subtype="FLOAT")
+    return path
+
+
+def enrolled(home):
+    return [path for path in find_logs(home) if not path.name.endswith(".review.mcap")]
+
+
+def values(log):
+    return read_columns([log], {FEATURES})[FEATURES]["values"]
+
+
+def features_of(path, seconds):
+    samples = np.concatenate(list(read_audio(path)))[: round(seconds * RATE)]
+    return FeatureExtractor()(samples[: len(samples) // 800 * 800].reshape(-1, FRAME_SAMPLES))
+
+
+def check_marked(log, label, seconds):
+    """All of the log has one mark."""
+    (mark,) = read_marks(log)
+    heard = find_heard(log)["mic"]
+    assert (mark.label, mark.start, mark.end) == (label, heard.starts[0], heard.ends[0])
+    assert mark.end - mark.start == pytest.approx(seconds * NANOSECONDS, abs=1e6)
+
+
+def test_a_file_is_enrolled_as_its_features_and_doctor_is_content(hearthlog, cough, home):
+    result = hearthlog("enrol", "coughing", "--home", home, "--file", cough)
+    (log,) = enrolled(home)
+    assert result == (0, f"{log}: 2.00 s of coughing\n", "")
+    assert log.name.startswith("coughing_20")
+    assert np.array_equal(values(log), features_of(cough, 2))
+    check_marked(log, "coughing", 2)
+    assert {name for name in read_columns([log]) if "audio" in name} == set()
+    doctor = hearthlog("doctor", home)
+    assert (doctor.returncode, doctor.stdout) == (0, "")
+    assert {path.parent for path in home.rglob("*") if path.is_file()} == {log.parent}
+
+
+def test_how_a_recorder_is_configured_does_not_matter(cough, home, monkeypatch, hearthlog):
+    monkeypatch.setenv("HEARTHLOG_MODEL", "none.safetensors")
+    monkeypatch.setenv("HEARTHLOG_NODE", "attic")
+    monkeypatch.setenv("HEARTHLOG_STATISTICS_EVERY", "7")
+    assert hearthlog("enrol", "cry", "--home", home, "--file", cough).returncode == 0
+    (log,) = enrolled(home)
+    check_marked(log, "cry", 2)
+    monkeypatch.setenv("HEARTHLOG_SYNC_SECONDS", "never")
+    result = hearthlog("enrol", "cry", "--home", home, "--file", cough)
+    assert (result.returncode, "sync_seconds" in result.stderr) == (1, True)
+
+
+def test_of_a_file_only_the_first_seconds_are_taken(hearthlog, cough, home):
+    assert (
+        hearthlog("enrol", "cry", "--home", home, "--file", cough, "--seconds", 1.2).returncode == 0
+    )
+    (log,) = enrolled(home)
+    assert np.array_equal(values(log), features_of(cough, 1.2))
+    check_marked(log, "cry", 1.2)
+
+
+def test_many_files_in_a_moment_become_logs_that_do_not_overlap(hearthlog, cough, home):
+    logs = [enrol_file(home, "coughing", cough)[0].log for _ in range(4)]
+    assert len(set(logs)) == 4
+    spans = sorted((read_marks(log)[0].start, read_marks(log)[0].end) for log in logs)
+    assert all(end <= start for (_, end), (start, _) in pairwise(spans))
+    assert hearthlog("doctor", home).returncode == 0
+
+
+def test_a_span_of_logs_is_enrolled_as_it_was_recorded(hearthlog, recorded, home):
+    heard = find_heard(recorded)["mic"]
+    border = heard.starts[1]
+    start, end = (np.datetime64(border + n * 10**9, "ns") for n in (-2, 3))
+    command = ("enrol", "speech", "--home", home, "--log", recorded, "--start", start, "--end", end)
+    result = hearthlog(*command)
+    (log,) = enrolled(home)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout == f"{log}: 5.00 s of speech\n"
+    wanted = read_columns(heard.logs, {FEATURES}, int(start.astype(int)), int(end.astype(int)))
+    assert np.array_equal(values(log), wanted[FEATURES]["values"])
+    assert set(read_columns([log])) == {FEATURES, topic("mic", "info")}
+    check_marked(log, "speech", 5)
+    assert hearthlog("doctor", home).returncode == 0
+    before = log.read_bytes()
+    again = hearthlog(*command)
+    assert (again.returncode, "exists already" in again.stderr) == (1, True)
+    assert log.read_bytes() == before
+
+
+def test_what_is_no_sound_to_learn_from_is_refused(hearthlog, recorded, cough, home, tmp_path):
+    short, quiet = tmp_path / "short.wav", tmp_path / "quiet.wav"
+    soundfile.write(short, np.full(RATE - 1, 0.1), RATE)
+    noise = np.random.default_rng(1).normal(0, 10 ** (-70 / 20), 2 * RATE)
+    soundfile.write(quiet, noise, RATE)
+    at = ("--start", "2026-03-01T06:59:40", "--end", "2026-03-01T06:59:40.9")
+    for options, reason in (
+        (("cry", "--file", short), "only 0.95 s of sound; enrol at least 1 s"),
+        (("cry", "--file", quiet), "all of it is below -60 dBFS: this is silence, not cry"),
+        (("Cry!", "--file", cough), "'Cry!' cannot be the name of a class"),
+        (("cry", "--file", tmp_path / "no.wav"), f"{tmp_path}/no.wav: no such file"),
+        (("cry", "--log", recorded, *at), "only 0.90 s of sound"),
+        (
+            ("cry", "--log", recorded, "--start", "2020-01-01", "--end", "2020-01-02"),
+            "only 0.00 s of sound",
+        ),
+    ):
+        label, *rest = options
+        result = hearthlog("enrol", label, "--home", home, *rest)
+        assert (result.returncode, result.stdout) == (1, "")
+        assert result.stderr.startswith(f"hearthlog: {reason}")
+        assert result.stderr.count("\n") == 1
+        assert not home.exists()
+    assert hearthlog("enrol", "silence", "--home", home, "--file", quiet).returncode == 0
+
+
+def test_a_log_of_several_microphones_is_refused(hearthlog, recorded, home, tmp_path):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    hearthlog(
+        "record",
+        "--name",
+        "attic",
+        "-o",
+        logs / "attic",
+        _tone(tmp_path),
+        "--start",
+        "2026-03-01T07:00",
+    )
+    at = ("--start", "2026-03-01T07:00:00", "--end", "2026-03-01T07:00:02")
+    result = hearthlog("enrol", "cry", "--home", home, "--log", logs, *at)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert "is of several microphones (attic, mic)" in result.stderr
+
+
+def _tone(folder):
+    path = folder / "tone.wav"
+    soundfile.write(path, 0.1 * np.sin(math.tau * 440 * np.arange(3 * RATE) / RATE), RATE)
+    return path
+
+
+def test_wrong_use_is_told_from_what_failed(hearthlog, cough, recorded, home):
+    for options in (
+        (),
+        ("--file", cough, "--log", recorded),
+        ("--file", cough, "--seconds", "0.5"),
+        ("--file", cough, "--seconds", "nan"),
+        ("--file", cough, "--start", "2026-03-01"),
+        ("--log", recorded),
+        ("--log", recorded, "--start", "2026-03-01"),
+        ("--log", recorded, "--start", "2026-03-02", "--end", "2026-03-01"),
+        ("--log", recorded, "--start", "2026-03-01", "--end", "2026-03-02", "--seconds", "3"),
+    ):
+        assert hearthlog("enrol", "cry", "--home", home, *options).returncode == 2
+    assert not home.exists()
+
+
+def test_a_microphone_is_listened_to_for_so_long(labmic, home):
+    rng = np.random.default_rng(3)
+    labmic.configure(data=rng.normal(0, 3000, 7 * RATE).astype(np.int16))
+    command = [*HEARTHLOG, "enrol", "running_water", "--home", str(home)]
+    command += ["--microphone", labmic.device, "--seconds", "2"]
+    result = subprocess.run(
+        command, env=labmic.env, capture_output=True, text=True, timeout=60, check=False
+    )
+    (log,) = enrolled(home)
+    assert result.stderr == "hearthlog: listening for 2 s\n"
+    assert (result.returncode, result.stdout) == (0, f"{log}: 2.00 s of running_water\n")
+    assert len(values(log)) == 40
+    check_marked(log, "running_water", 2)

@@ -1,0 +1,475 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
+
+from analyzer.errors import DataError
+from analyzer.evaluation.events import (
+    Events,
+    common,
+    event_based,
+    false_alarms_per_day,
+    laid_out,
+    merged,
+    segment_based,
+    total,
+)
+from analyzer.evaluation.reference import Labelling, compare
+from analyzer.evaluation.scores import Bin, calibration_error, difference, reliability, score
+from analyzer.evaluation.table import class_table, confusion_table
+from analyzer.hmm import default_transitions
+from models.modelfile import Smoothing, load_model, save_model
+from tools.home.simulate import write_training_set
+
+SECOND = 1_000_000_000
+FRAME = SECOND // 20
+CLASSES = ("silence", "speech", "coughing")
+TOP_LEVEL = {
+    "macro_f1",
+    "macro_f1_interval",
+    "per_class",
+    "confusion",
+    "segment_based",
+    "event_based",
+    "false_alarms_per_day",
+    "groups",
+    "classes",
+}
+
+labels = st.lists(
+    st.tuples(st.integers(0, 2), st.integers(0, 2), st.integers(0, 4)), min_size=1, max_size=60
+)
+
+
+def guesses(rng, groups, per_group=8):
+    """Segments whose sources are easy or hard: (target, probabilities, group)."""
+    hardness = rng.uniform(0, 3, groups)
+    group = np.repeat(np.arange(groups), per_group)
+    target = np.repeat(rng.integers(0, 3, groups), per_group)
+    logits = rng.normal(0, 1, (len(group), 3)) * hardness[group, np.newaxis]
+    logits[np.arange(len(group)), target] += 1.5
+    probabilities = np.exp(logits)
+    return target, probabilities / probabilities.sum(axis=1, keepdims=True), group
+
+
+@given(labels)
+@settings(deadline=None)
+def test_scores_are_those_of_scikit_learn_over_the_classes_that_occur(rows):
+    target, predicted, group = np.array(rows).T
+    found = score(target, predicted, group, CLASSES)
+    present = np.unique(target)
+    expected = precision_recall_fscore_support(target, predicted, labels=present, zero_division=0)
+    ours = [found.per_class[CLASSES[i]] for i in present]
+    np.testing.assert_allclose(
+        [[c.precision, c.recall, c.f1] for c in ours], np.transpose(expected[:3])
+    )
+    assert [c.support for c in ours] == expected[3].tolist()
+    macro = f1_score(target, predicted, labels=present, average="macro", zero_division=0)
+    assert found.macro_f1 == pytest.approx(macro)
+    every = confusion_matrix(target, predicted, labels=range(3))
+    assert found.confusion == every.tolist()
+    assert found.segments == len(rows)
+    assert (found.macro_f1_interval is None) == (len(np.unique(group)) == 1)
+
+
+def test_a_class_that_does_not_occur_has_no_recall_and_is_no_part_of_the_mean():
+    found = score(np.array([0, 0, 1]), np.array([0, 2, 1]), np.arange(3), CLASSES)
+    absent = found.per_class["coughing"]
+    assert (absent.precision, absent.recall, absent.f1, absent.support) == (0.0, None, None, 0)
+    assert found.macro_f1 == pytest.approx((2 / 3 + 1) / 2)
+    assert json.loads(json.dumps(found.confusion)) == [[1, 0, 1], [0, 1, 0], [0, 0, 0]]
+
+
+def test_weights_stand_for_as_many_segments():
+    rng = np.random.default_rng(1)
+    target, predicted, group = rng.integers(0, 3, (3, 40))
+    weight = rng.integers(1, 9, 40)
+    once = score(target, predicted, group, CLASSES, weight)
+    again = score(*(np.repeat(a, weight) for a in (target, predicted, group)), CLASSES)
+    assert once == again
+
+
+def test_the_interval_is_the_same_each_time_and_covers_what_is_true():
+    rng = np.random.default_rng(2)
+    target, probabilities, _ = guesses(rng, 20_000)
+    true = f1_score(target, probabilities.argmax(axis=1), average="macro")
+    covered = 0
+    for _ in range(100):
+        sample = guesses(rng, 60)
+        found = score(sample[0], sample[1].argmax(axis=1), sample[2], CLASSES)
+        low, high = found.macro_f1_interval
+        covered += low <= true <= high
+    assert 85 <= covered <= 100
+    assert found == score(sample[0], sample[1].argmax(axis=1), sample[2], CLASSES)
+
+
+def test_the_interval_is_over_sources_not_over_segments():
+    target, probabilities, group = guesses(np.random.default_rng(3), 40, per_group=30)
+    predicted = probabilities.argmax(axis=1)
+    low, high = score(target, predicted, group, CLASSES).macro_f1_interval
+    narrow = score(target, predicted, np.arange(len(group)), CLASSES).macro_f1_interval
+    assert high - low > 1.5 * (narrow[1] - narrow[0])
+
+
+def test_a_better_model_is_told_from_one_that_is_the_same():
+    target, good, group = guesses(np.random.default_rng(4), 100)
+    poor = np.random.default_rng(5).dirichlet(np.ones(3), len(target))
+    better = difference(target, poor, good, group, CLASSES)
+    assert better.interval[0] > 0
+    macro = [f1_score(target, p.argmax(axis=1), average="macro") for p in (poor, good)]
+    assert better.macro_f1 == pytest.approx(macro[1] - macro[0])
+    same = difference(target, good, good * 0.5, group, CLASSES)
+    assert (same.macro_f1, *same.interval) == (0.0, 0.0, 0.0)
+
+
+def test_the_comparison_is_paired():
+    target, good, group = guesses(np.random.default_rng(6), 100)
+    other = good.copy()
+    other[::50] = np.roll(other[::50], 1, axis=1)
+    low, high = difference(target, good, other, group, CLASSES).interval
+    own = score(target, good.argmax(axis=1), group, CLASSES).macro_f1_interval
+    assert high - low < 0.5 * (own[1] - own[0])
+
+
+def test_reliability_adds_up_to_the_calibration_error():
+    target, probabilities, _ = guesses(np.random.default_rng(7), 300)
+    bins = reliability(probabilities, target)
+    assert sum(b.count for b in bins) == len(target)
+    right = probabilities.argmax(axis=1) == target
+    assert sum(b.accuracy * b.count for b in bins) == pytest.approx(right.sum())
+    error = sum(abs(b.accuracy - b.confidence) * b.count for b in bins) / len(target)
+    assert calibration_error(probabilities, target) == pytest.approx(error)
+    assert calibration_error(np.eye(3)[target], target) == 0.0
+    assert reliability(np.eye(3)[target], target) == [Bin(14, 1.0, 1.0, len(target))]
+
+
+def test_nothing_to_score_is_said():
+    nothing = np.empty(0, np.intp)
+    with pytest.raises(DataError, match="nothing to score"):
+        score(nothing, nothing, nothing, CLASSES)
+
+
+# Events
+
+
+def events(*rows):
+    starts, ends, numbers = np.array(rows, float).reshape(-1, 3).T
+    return Events(
+        (starts * SECOND).round().astype(np.int64),
+        (ends * SECOND).round().astype(np.int64),
+        numbers.astype(np.int64),
+    )
+
+
+def home(rng, count):
+    starts = np.sort(rng.uniform(0, 60, count))
+    return events(
+        *zip(
+            starts,
+            starts + rng.exponential(2, count) + 0.01,
+            rng.integers(0, 3, count),
+            strict=True,
+        )
+    )
+
+
+def mistaken(rng, true):
+    kept = true.taken(np.flatnonzero(rng.random(len(true)) < 0.8))
+    moved = kept.starts + (rng.normal(0, 0.15, len(kept)) * SECOND).astype(np.int64)
+    starts = np.maximum(moved, 0)
+    ends = kept.ends + (rng.normal(0, 0.3, len(kept)) * SECOND).astype(np.int64)
+    extra = home(rng, 5)
+    return Events(
+        np.concatenate([starts, extra.starts]),
+        np.concatenate([np.maximum(ends, starts + FRAME), extra.ends]),
+        np.concatenate([kept.labels, extra.labels]),
+    )
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_segments_and_events_are_scored_as_by_sed_eval(seed):
+    dcase_util = pytest.importorskip("dcase_util")
+    sound_event = pytest.importorskip("sed_eval").sound_event
+
+    def container(found):
+        rows = zip(found.starts / SECOND, found.ends / SECOND, found.labels, strict=True)
+        return dcase_util.containers.MetaDataContainer(
+            [
+                {"filename": "a", "event_label": CLASSES[i], "onset": start, "offset": end}
+                for start, end, i in rows
+            ]
+        )
+
+    rng = np.random.default_rng(seed)
+    true = home(rng, 40)
+    found = mistaken(rng, true)
+    peers = (
+        sound_event.SegmentBasedMetrics(list(CLASSES), time_resolution=1.0),
+        sound_event.EventBasedMetrics(list(CLASSES), t_collar=0.2, percentage_of_length=0.5),
+    )
+    for peer, ours in zip(peers, (segment_based, event_based), strict=True):
+        peer.evaluate(container(true), container(found))
+        theirs, mine = peer.results(), ours(true, found, CLASSES)
+        pairs = [(theirs["overall"], mine)]
+        pairs += [(theirs["class_wise"][name], mine.per_class[name]) for name in CLASSES]
+        for their, my in pairs:
+            figures = their["f_measure"]
+            expected = figures["precision"], figures["recall"], np.nan_to_num(figures["f_measure"])
+            np.testing.assert_allclose([my.precision, my.recall, my.f1], expected)
+
+
+def test_an_event_is_matched_with_one_only_and_as_many_as_possible_are():
+    true = events((1.0, 2.0, 0), (1.1, 2.0, 0))
+    assert event_based(true, events((1.0, 2.0, 0)), CLASSES).per_class["silence"].recall == 0.5
+    # The first could take either; the second only the one at 0.95 s.
+    found = events((0.95, 2.0, 0), (1.25, 2.0, 0))
+    assert event_based(true, found, CLASSES).f1 == 1.0
+
+
+def test_a_false_alarm_overlaps_nothing_of_its_class():
+    true = events((0, 10, 0), (2, 3, 1), (12, 13, 1))
+    found = events((2.9, 3.5, 1), (3.0, 3.5, 1), (5, 6, 1), (20, 21, 2), (9, 30, 0))
+    alarms = false_alarms_per_day(true, found, CLASSES, 3600 * SECOND)
+    assert alarms == {"silence": 0.0, "speech": 48.0, "coughing": 24.0}
+
+
+spans = st.lists(st.tuples(st.integers(0, 50), st.integers(1, 9)), max_size=12)
+
+
+@given(spans, spans)
+def test_spans_are_joined_and_cut_like_sets_of_moments(first, second):
+    sets = [
+        {t for start, length in rows for t in range(start, start + length)}
+        for rows in (first, second)
+    ]
+    joined = [
+        merged(*(np.array(v, np.int64) for v in ([a for a, _ in rows], [a + n for a, n in rows])))
+        for rows in (first, second)
+    ]
+    assert [total(one) for one in joined] == [len(one) for one in sets]
+    assert total(common(*joined)) == len(sets[0] & sets[1])
+
+
+def test_what_is_outside_of_the_evaluated_spans_is_left_out():
+    spans = np.array([10, 20]) * SECOND, np.array([12, 25]) * SECOND
+    laid = laid_out(events((0, 5, 0), (9, 21.5, 1), (24, 30, 2)), spans)
+    assert (laid.ends - laid.starts).tolist() == [2 * SECOND, SECOND * 3 // 2, SECOND]
+    assert (laid.starts % SECOND == 0).all()
+    assert laid.starts[1] - laid.ends[0] >= SECOND
+
+
+# A log against a reference
+
+
+def labelling(*rows):
+    starts, ends, names = zip(*rows, strict=True)
+    return Labelling(
+        (np.array(starts) * SECOND).round().astype(np.int64),
+        (np.array(ends) * SECOND).round().astype(np.int64),
+        np.array(names, object),
+    )
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=30)
+def test_frames_are_counted_as_if_each_were_looked_at(seed):
+    rng = np.random.default_rng(seed)
+    times = np.unique(rng.integers(0, 60 * SECOND, 30))
+    found = Labelling(times[:-1], times[1:], np.array(CLASSES, object)[rng.integers(0, 3, 29)])
+    times = np.unique(rng.integers(0, 60 * SECOND, 12))
+    names = np.array([*CLASSES, "doorbell"], object)[rng.integers(0, 4, 11)]
+    names[0] = "speech"
+    reference = Labelling(times[:-1], times[1:], names)
+    result = compare(reference, found, CLASSES)
+    start = max(found.starts[0], reference.starts[0])
+    end = min(found.ends[-1], reference.ends[-1])
+    middles = start + FRAME // 2 + FRAME * np.arange((end - start + FRAME // 2 - 1) // FRAME)
+    true, said = (
+        each.labels[np.searchsorted(each.starts, middles, "right") - 1]
+        for each in (reference, found)
+    )
+    known = true != "doorbell"
+    expected = confusion_matrix(true[known], said[known], labels=CLASSES)
+    assert result.scores.confusion == expected.tolist()
+
+
+def test_time_that_only_one_of_them_labels_is_not_evaluated():
+    found = labelling((10, 20, "speech"), (20, 30, "silence"))
+    result = compare(labelling((0, 15, "speech"), (25, 100, "silence")), found, CLASSES)
+    assert (result.reference_seconds, result.evaluated_seconds) == (90.0, 10.0)
+    assert result.scores.segments == 200
+    assert result.scores.macro_f1 == result.detections.event_based.f1 == 1.0
+
+
+def test_two_labels_at_a_time_are_left_out_of_the_frames_and_said():
+    reference = labelling((0, 10, "speech"), (4, 6, "coughing"))
+    result = compare(reference, labelling((0, 10, "speech")), CLASSES)
+    assert (result.ambiguous_seconds, result.scores.segments) == (2.0, 160)
+    assert result.detections.segment_based.per_class["coughing"].recall == 0.0
+
+
+def test_labels_that_the_log_does_not_know_are_said():
+    reference = labelling((0, 10, "speech"), (10, 14, "doorbell"))
+    result = compare(reference, labelling((0, 14, "speech")), CLASSES)
+    assert result.unknown_labels == {"doorbell": 4.0}
+    assert result.scores.segments == 200
+    with pytest.raises(DataError, match="none of the labels of the log"):
+        compare(labelling((0, 9, "doorbell")), labelling((0, 14, "speech")), CLASSES)
+
+
+def test_a_reference_of_another_time_is_refused():
+    with pytest.raises(DataError, match="have no time in common"):
+        compare(labelling((100, 110, "speech")), labelling((0, 14, "speech")), CLASSES)
+
+
+# The command
+
+
+def test_no_line_of_a_table_is_too_wide():
+    rng = np.random.default_rng(8)
+    classes = [f"class_of_a_long_name_{i}" for i in range(32)]
+    target, predicted, group = rng.integers(0, 32, (3, 5000))
+    weight = rng.integers(0, 10**5, 5000)
+    found = score(target, predicted, group, classes, weight)
+    lines = [*class_table(found), *confusion_table(found)]
+    assert max(map(len, lines)) <= 100
+
+
+def test_a_model_is_scored_on_real_household_sound(household, model_file, tmp_path, hearthlog):
+    picture, words = tmp_path / "scores.png", ("--model", model_file, "--data", household)
+    result = hearthlog("evaluate", *words, "--scenario", "general", "--json", "--plot", picture)
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    more = {"expected_calibration_error", "reliability", "segments", "model", "sha256", "scenario"}
+    assert TOP_LEVEL | more <= found.keys()
+    assert found["scenario"] == "general"
+    assert found["segments"] == np.sum(found["confusion"])
+    f1 = [one["f1"] for one in found["per_class"].values()]
+    assert found["macro_f1"] == pytest.approx(np.mean(f1))
+    assert 0.0 < found["macro_f1"] < 1.0
+    low, high = found["macro_f1_interval"]
+    assert low < high
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    table = hearthlog("evaluate", *words)
+    assert table.returncode == 0
+    assert max(map(len, table.stdout.splitlines())) <= 100
+    assert f"{found['macro_f1']:.3f}" in table.stdout
+
+
+def test_a_log_is_scored_against_a_label_file_and_against_its_review(recorded, tmp_path, hearthlog):
+    log = min(recorded.rglob("*.mcap"))
+    copy = tmp_path / log.name
+    copy.write_bytes(log.read_bytes())
+    track = tmp_path / "labels.txt"
+    assert hearthlog("export", copy, "-o", track, "--topics", "/mic/segment").returncode == 0
+    picture = tmp_path / "scores.png"
+    result = hearthlog("evaluate", copy, "--reference", track, "--json", "--plot", picture)
+    assert result.returncode == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert TOP_LEVEL | {"frames", "unknown_labels", "evaluated_seconds"} <= found.keys()
+    assert found["macro_f1"] > 0.99
+    assert found["event_based"]["f1"] > 0.99
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    nothing = hearthlog("evaluate", copy, "--reference", "review")
+    assert nothing.returncode == 1
+    assert "is reviewed" in nothing.stderr
+    assert hearthlog("annotate", "import", copy, track).returncode == 0
+    review = hearthlog("evaluate", copy, "--reference", "review", "--json")
+    assert review.returncode == 0, review.stderr
+    assert json.loads(review.stdout)["confusion"] == found["confusion"]
+    layer = hearthlog(
+        "evaluate", copy, "--topic", "/mic/review/segment", "--reference", track, "--json"
+    )
+    assert json.loads(layer.stdout)["macro_f1"] > 0.99
+
+
+def test_bad_references_are_one_line(recorded, tmp_path, hearthlog):
+    log = min(recorded.rglob("*.mcap"))
+    cases = {
+        "10000000\t10000009\tspeech\n": "no time in common",
+        "0\t9\tdoorbell\n": "none of the labels of the log",
+        "0\t9e99\tspeech\n": "no log has",
+        "nonsense\n": "labels.txt:1",
+        "": "holds no labels",
+    }
+    for text, said in cases.items():
+        track = tmp_path / "labels.txt"
+        track.write_text(text)
+        result = hearthlog("evaluate", log, "--reference", track)
+        assert result.returncode == 1
+        assert said in result.stderr
+        assert result.stderr.count("\n") == 1
+    track.write_text("0\t5\tspeech\n5\t9\tdoorbell\n")
+    result = hearthlog("evaluate", log, "--reference", track)
+    assert result.returncode == 3
+    assert "doorbell (4.0 s)" in result.stderr
+
+
+def test_a_model_of_another_scenario_is_refused(household, model_file, hearthlog):
+    words = ("--model", model_file, "--data", household, "--scenario", "bathroom")
+    result = hearthlog("evaluate", *words)
+    assert result.returncode == 1
+    assert "the model lacks flushing_water" in result.stderr
+    assert "the scenario lacks speech" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
+    (tmp_path / "there.png").touch()
+    cases = (
+        ((), 2, "give either"),
+        (("a.mcap", "--model", "m", "--data", "d"), 2, "give either"),
+        (("a.mcap", "--reference", "r.txt", "--plot", "p.pdf"), 2, "*.png"),
+        (("a.mcap", "--reference", "r.txt", "--plot", tmp_path / "there.png"), 1, "exists already"),
+        (("a.mcap", "--reference", "r.txt"), 1, "no such log"),
+        (("--model", "m.safetensors", "--data", "d"), 1, "no such model file"),
+    )
+    for words, status, said in cases:
+        result = hearthlog("evaluate", *words)
+        assert result.returncode == status
+        assert said in result.stderr
+
+
+@pytest.mark.parametrize("method", ["merge", "hmm"])
+def test_clips_are_labelled_as_the_recorder_labels_them(
+    method, day, model_file, tmp_path, hearthlog
+):
+    model = load_model(model_file)
+    smoothing = Smoothing(method=method, lag_seconds=3.0)
+    transitions = default_transitions(model.classes) if method == "hmm" else np.empty((0, 0))
+    about = model.description.model_copy(update={"smoothing": smoothing})
+    model_file = tmp_path / "model.safetensors"
+    save_model(replace(model, description=about, transitions=transitions), model_file)
+    (tmp_path / "day.flac").write_bytes(day.read_bytes())
+    manifest = tmp_path / "one.csv"
+    manifest.write_text("path,label,source_group\nday.flac,speech,a\n")
+    words = ("--model", model_file, "--data", manifest, "--json")
+    of_clip = json.loads(hearthlog("evaluate", *words).stdout)
+    logs = tmp_path / "logs"
+    start = "2026-03-01T08:00:00"
+    recording = hearthlog("record", day, "--model", model_file, "-o", logs, "--start", start)
+    assert recording.returncode == 0, recording.stderr
+    track = tmp_path / "labels.txt"
+    track.write_text("0\t180\tspeech\n")
+    result = hearthlog("evaluate", logs, "--reference", track, "--json")
+    of_log = json.loads(result.stdout)
+    assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.05
+    for figure in ("segment_based", "event_based", "false_alarms_per_day"):
+        assert of_log[figure] == of_clip[figure]
+    assert of_clip["macro_f1_interval"] is None
+
+
+def test_a_model_says_that_it_is_scored_on_what_it_learned_from(tmp_path, hearthlog):
+    manifest = write_training_set(tmp_path / "clips", clips_per_class=3, seed=3)
+    model = tmp_path / "own.safetensors"
+    words = ("--data", manifest, "--scenario", "general")
+    assert hearthlog("train", *words, "-o", model).returncode == 0
+    result = hearthlog("evaluate", "--model", model, "--data", manifest)
+    assert "learned from these very segments" in result.stderr
+    lines = manifest.read_text().splitlines(keepends=True)
+    manifest.write_text("".join(lines[:1] + lines[2:]))
+    assert not hearthlog("evaluate", "--model", model, "--data", manifest).stderr

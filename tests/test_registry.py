@@ -1,0 +1,202 @@
+"""A folder of models always has a champion that can be used, whatever happens to who changes it."""
+
+import json
+import random
+import subprocess
+import sys
+import time
+
+import pytest
+from kept import keep_models, put_by_hand
+from spliced import run
+
+from models.errors import ModelError
+from models.modelfile import load_model
+from models.registry import list_models, load, promote, rollback, target
+
+
+@pytest.fixture
+def folder(tmp_path, model_file):
+    return keep_models(tmp_path / "models", model_file)
+
+
+def champion(folder):
+    return load_model(folder / "champion.safetensors").name
+
+
+def test_a_model_that_is_loaded_by_an_alias_has_the_name_of_its_file(folder):
+    assert load_model(folder / "champion.safetensors").name == "one"
+
+
+def test_a_promoted_model_is_the_champion_and_the_one_before_comes_back(folder):
+    model, before = promote(folder, "two")
+    assert (model.name, before, champion(folder)) == ("two", "one", "two")
+    promote(folder, "bands")
+    assert [rollback(folder)[0].name for _ in range(2)] == ["two", "one"]
+    assert champion(folder) == "one"
+    with pytest.raises(ModelError, match="no champion before one"):
+        rollback(folder)
+
+
+def test_promoting_the_champion_changes_nothing(folder):
+    promote(folder, "two")
+    assert promote(folder, "two")[1] == "two"
+    assert rollback(folder)[0].name == "one"
+
+
+def test_the_candidate_is_promoted_by_its_alias(folder):
+    promote(folder, "two", "candidate")
+    assert champion(folder) == "one"
+    assert promote(folder, "candidate")[0].name == "two"
+    assert champion(folder) == "two"
+
+
+def test_a_model_that_cannot_be_used_is_not_promoted(folder):
+    (folder / "bad.safetensors").write_bytes(b"garbage")
+    for name in ("bad", "nowhere", "../models/two", "candidate"):
+        with pytest.raises(ModelError):
+            promote(folder, name)
+    assert champion(folder) == "one"
+
+
+def test_rollback_passes_over_champions_that_cannot_be_used(folder):
+    promote(folder, "two")
+    promote(folder, "bands")
+    (folder / "two.safetensors").unlink()
+    assert rollback(folder)[0].name == "one"
+
+
+def test_a_champion_that_leads_nowhere_can_be_replaced(folder):
+    put_by_hand(folder, "nowhere.safetensors")
+    assert promote(folder, "two")[1] == "nowhere"
+    assert champion(folder) == "two"
+
+
+def test_a_file_that_is_called_champion_is_never_replaced(folder):
+    link = folder / "champion.safetensors"
+    data = (folder / "one.safetensors").read_bytes()
+    link.unlink()
+    link.write_bytes(data)
+    with pytest.raises(ModelError, match="is no link"):
+        promote(folder, "two")
+    assert not link.is_symlink()
+    assert link.read_bytes() == data
+
+
+@pytest.mark.parametrize("text", ["champion.safetensors", "/etc/passwd", "../one.safetensors"])
+def test_a_link_to_itself_or_out_of_the_folder_is_refused(folder, text):
+    put_by_hand(folder, text)
+    with pytest.raises(ModelError, match="is no link"):
+        target(folder, "champion")
+    with pytest.raises(ModelError):
+        load_model(folder / "champion.safetensors")
+
+
+def test_the_list_has_every_file_and_what_is_wrong_with_it(folder):
+    (folder / "bad.safetensors").write_bytes(b"garbage")
+    promote(folder, "two", "candidate")
+    put_by_hand(folder, "gone.safetensors")
+    found = {entry.name: entry for entry in list_models(folder)}
+    assert list(found) == ["bad", "bands", "gone", "one", "two"]
+    assert found["gone"].aliases == ("champion",)
+    assert found["two"].aliases == ("candidate",)
+    assert {name for name, entry in found.items() if entry.model is None} == {"bad", "gone"}
+    assert "no such model file" in found["gone"].problem
+    assert found["one"].size == (folder / "one.safetensors").stat().st_size
+
+
+PROMOTING = """
+import sys
+from itertools import cycle
+from pathlib import Path
+from models.registry import promote, rollback
+folder = Path(sys.argv[1])
+for number, name in enumerate(cycle(["two", "bands", "one"])):
+    promote(folder, name)
+    if number % 4 == 3:
+        rollback(folder)
+    print(name, flush=True)
+"""
+
+
+def test_killed_at_any_moment_of_a_promotion_there_is_a_champion_and_one_before(folder):
+    rng = random.Random(5)
+    for _ in range(10):
+        command = [sys.executable, "-c", PROMOTING, str(folder)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            for _ in range(5):
+                assert process.stdout.readline()
+            end = time.monotonic() + rng.uniform(0.05, 0.3)
+            while time.monotonic() < end:
+                assert (folder / "champion.safetensors").exists()  # at every moment
+            process.kill()
+        before = champion(folder)
+        assert before in {"one", "two", "bands"}
+        lines = (folder / "history").read_text().splitlines()
+        assert set(lines) <= {"one", "two", "bands"}
+        assert len(lines) <= 100
+        assert rollback(folder)[0].name != before
+    promote(folder, "two")
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(".champion")]
+
+
+def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
+    result = run(capfd, "models", "list", "--folder", folder)
+    assert (result.returncode, result.stderr) == (0, "")
+    head, *rows = result.stdout.splitlines()
+    assert head.split() == [
+        "name",
+        "alias",
+        "classes",
+        "inputs",
+        "macro",
+        "F1",
+        "ECE",
+        "sha256",
+        "size",
+    ]
+    assert [row.split()[0] for row in rows] == ["bands", "one", "two"]
+    assert "champion" in rows[1]
+    assert load(folder, "one").sha256[:12] in rows[1]
+    (folder / "bad.safetensors").write_bytes(b"garbage")
+    result = run(capfd, "models", "list", "--json", "--folder", folder)
+    assert result.returncode == 3
+    assert result.stderr.count("\n") == 1
+    found = {entry["name"]: entry for entry in json.loads(result.stdout)}
+    assert found["one"]["aliases"] == ["champion"]
+    assert found["bad"]["problem"] in result.stderr
+
+
+def test_a_model_is_shown_by_its_card(folder, capfd):
+    result = run(capfd, "models", "show", "champion", "--folder", folder)
+    assert result.stdout == load(folder, "one").card()
+    result = run(capfd, "models", "show", "one", "--json", "--folder", folder)
+    assert json.loads(result.stdout)["sha256"] == load(folder, "one").sha256
+
+
+def test_promotion_and_rollback_say_what_was_done(folder, capfd):
+    command = ("models", "promote", "two", "--folder", folder)
+    short = load(folder, "two").sha256[:12]
+    assert run(capfd, *command).stdout == f"two ({short}) is the champion, after one\n"
+    assert run(capfd, *command).stdout == "two is the champion already\n"
+    said = run(capfd, "models", "rollback", "--folder", folder).stdout
+    assert said == f"one ({load(folder, 'one').sha256[:12]}) is the champion again, after two\n"
+    result = run(capfd, "models", "rollback", "--folder", folder)
+    assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+
+
+def test_the_folder_is_that_of_the_configured_model(folder, capfd, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert run(capfd, "models", "show", "two").returncode == 0
+    monkeypatch.chdir("/")
+    result = run(capfd, "models", "list")
+    assert result.stderr.startswith("hearthlog: models: no such folder")
+    monkeypatch.setenv("HEARTHLOG_MODEL", str(folder / "champion.safetensors"))
+    assert run(capfd, "models", "show", "two").returncode == 0
+
+
+def test_a_folder_that_cannot_be_written_is_refused_in_one_line(folder):
+    (folder / ".champion.safetensors.tmp").mkdir()
+    with pytest.raises(ModelError, match="cannot be written"):
+        promote(folder, "two")
+    assert champion(folder) == "one"

@@ -1,0 +1,363 @@
+"""Smoothing gives Viterbi's path some frames after the sound, and segments that can be replayed."""
+
+from dataclasses import replace
+from itertools import pairwise
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+from lossy import LossySource
+from rewriting import Log
+
+from analyzer.doctor import examine
+from analyzer.hmm import (
+    FRAME_SECONDS,
+    LAG_SECONDS,
+    default_transitions,
+    smoothed,
+    transitions_from_durations,
+    transitions_from_sequences,
+    viterbi,
+)
+from analyzer.replay.player import Wanted
+from analyzer.replay.replay import LogSet
+from analyzer.replay.replay import replay as replay_logs
+from models.classifier import Classifier
+from models.errors import ModelError
+from models.inputs import InputStream
+from models.modelfile import Smoothing, load_model, save_model
+from models.segments import Segmenter
+from models.smoothing import FixedLagSmoother
+from recorder.config import Settings
+from recorder.features import FRAME_SAMPLES, FeatureExtractor
+from recorder.pipeline import Pipeline
+from recorder.service import record
+from recorder.sources.files import read_audio
+from recorder.sources.replayed import FileSource
+from recorder.stream import FRAME_NANOSECONDS, Frames
+from schemas.files import find_logs
+from schemas.messages import (
+    LOG,
+    SEGMENT,
+    decode,
+    duration_message,
+    nanoseconds,
+    time_message,
+)
+from schemas.reader import LogReader
+
+SECOND = 1_000_000_000
+START = 1_772_350_200 * SECOND
+CLASSES = ["silence", "speech", "music", "coughing", "shower"]
+LAG = round(LAG_SECONDS / FRAME_SECONDS)
+
+
+def made_up(seed, frames=1500, classes=5):
+    """Probabilities that stay alike for some frames, as those of overlapping windows do."""
+    rng = np.random.default_rng(seed)
+    sounds = np.repeat(rng.dirichlet(np.full(classes, 0.3), frames // 10), 10, axis=0)
+    mixed = 0.7 * sounds + 0.3 * rng.dirichlet(np.full(classes, 0.3), len(sounds))
+    return mixed.astype(np.float32)
+
+
+def decided(smoother, probabilities, size):
+    """All states, from blocks of some size."""
+    blocks = [probabilities[i : i + size] for i in range(0, len(probabilities), size)]
+    return np.concatenate([*map(smoother.push, blocks), smoother.close()])
+
+
+def of_sounds(model_file, frames):
+    """Probabilities of a model's classes in real sound."""
+    classifier = Classifier(load_model(model_file))
+    inputs = InputStream(classifier.inputs)(FeatureExtractor()(frames))
+    return classifier.probabilities(inputs), default_transitions(classifier.classes)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_lag_over_the_whole_gives_the_path_of_viterbi(seed):
+    rng = np.random.default_rng(seed)
+    probabilities, transitions = made_up(seed), rng.dirichlet(np.ones(5), 5) + 3 * np.eye(5)
+    transitions /= transitions.sum(axis=1, keepdims=True)
+    path = viterbi(probabilities, transitions)
+    assert len(set(path.tolist())) == 5
+    states = decided(FixedLagSmoother(transitions, len(path)), probabilities, 100)
+    assert states.tolist() == path.tolist()
+
+
+def test_so_does_a_lag_that_covers_the_decisions_in_real_sound(real_frames, model_file):
+    probabilities, transitions = of_sounds(model_file, real_frames)
+    path = viterbi(probabilities, transitions)
+    assert np.count_nonzero(np.diff(path)) > 50
+    for lag in (200, len(path)):
+        states = decided(FixedLagSmoother(transitions, lag), probabilities, 1000)
+        assert states.tolist() == path.tolist()
+    states = decided(FixedLagSmoother(transitions, LAG), probabilities, 1000)
+    assert (states == path).mean() > 0.99
+
+
+@pytest.mark.parametrize("lag", [0, 1, 7, LAG])
+def test_blocks_of_any_size_give_the_same_states(lag):
+    probabilities = made_up(6)
+    smoother = FixedLagSmoother(default_transitions(CLASSES), lag)
+    whole = decided(smoother, probabilities, len(probabilities))
+    assert len(whole) == len(probabilities)
+    for size in (1, 13, 1024):
+        assert decided(smoother, probabilities, size).tolist() == whole.tolist()
+
+
+def test_a_state_is_decided_after_the_lag_and_what_comes_later_does_not_change_it():
+    transitions = default_transitions(CLASSES)
+    probabilities = made_up(7)
+    states = FixedLagSmoother(transitions, 30).push(probabilities)
+    assert len(states) == len(probabilities) - 30
+    for end in (10, 30, 31, 200):
+        seen = FixedLagSmoother(transitions, 30).push(probabilities[:end])
+        assert seen.tolist() == states[: max(end - 30, 0)].tolist()
+
+
+def test_without_a_lag_it_is_the_best_state_of_what_was_heard():
+    probabilities, transitions = made_up(8, 300), default_transitions(CLASSES)
+    states = FixedLagSmoother(transitions, 0).push(probabilities)
+    for end in (1, 2, 50, 299):
+        assert states[end - 1] == viterbi(probabilities[:end], transitions)[-1]
+
+
+def test_probabilities_of_zero_and_impossible_transitions_give_a_path():
+    probabilities = made_up(9)
+    probabilities[::3, 1] = 0.0
+    probabilities[100:200] = [0, 0, 0, 0, 1]
+    transitions = default_transitions(CLASSES)
+    transitions[:, 4] = 0.0  # nothing leads there, and from there on
+    transitions[4] = [1, 0, 0, 0, 0]
+    transitions /= transitions.sum(axis=1, keepdims=True)
+    states = decided(FixedLagSmoother(transitions, 2000), probabilities, 100)
+    assert states.tolist() == viterbi(probabilities, transitions).tolist()
+    assert 4 not in states[1:]
+    assert np.isfinite(smoothed(probabilities, transitions)).all()
+
+
+def test_a_class_that_is_never_left_is_the_rest_of_the_path():
+    transitions = default_transitions(CLASSES)
+    transitions[2] = [0, 0, 1, 0, 0]
+    probabilities = made_up(10)
+    states = decided(FixedLagSmoother(transitions, 5000), probabilities, 64)
+    assert states.tolist() == viterbi(probabilities, transitions).tolist()
+
+
+def test_what_is_smoothed_with_the_whole_sound_are_probabilities():
+    probabilities = made_up(11)
+    posteriors = smoothed(probabilities, default_transitions(CLASSES))
+    np.testing.assert_allclose(posteriors.sum(axis=1), 1.0, atol=1e-9)
+    path = viterbi(probabilities, default_transitions(CLASSES))
+    assert (posteriors.argmax(axis=1) == path).mean() > 0.95
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_once_settled_no_other_past_gives_other_states(seed):
+    rng = np.random.default_rng(seed)
+    probabilities, transitions = made_up(seed, 400), default_transitions(CLASSES)
+    blind = FixedLagSmoother(transitions, 1000)
+    blind.push(probabilities)
+    settled = blind.settled
+    assert settled is not None
+    states = blind.close()[settled - 1 :]
+    for _ in range(5):
+        past = rng.dirichlet(np.full(5, 0.1), rng.integers(1, 50)).astype(np.float32)
+        heard = np.concatenate([past, probabilities])
+        whole = decided(FixedLagSmoother(transitions, 1000), heard, 100)
+        assert whole[len(past) + settled - 1 :].tolist() == states.tolist()
+
+
+def test_sounds_go_on_for_as_long_as_expected():
+    transitions = transitions_from_durations(np.array([0.5, 5.0, 0.01]), 0.05)
+    np.testing.assert_allclose(transitions.sum(axis=1), 1.0)
+    np.testing.assert_allclose(1 / (1 - transitions.diagonal()), [10, 100, 1])
+    assert transitions[0, 1] == transitions[0, 2]
+
+
+def test_transitions_are_learned_from_sequences_and_what_was_never_seen_is_as_expected():
+    durations = np.array([1.0, 1.0, 1.0])
+    sequence = np.tile(np.repeat([0, 1], 100), 50)
+    transitions = transitions_from_sequences([sequence, sequence[:0], sequence[:1]], durations)
+    np.testing.assert_allclose(transitions.sum(axis=1), 1.0)
+    np.testing.assert_allclose(transitions[0, 1], 0.01, rtol=0.1)
+    assert 0 < transitions[0, 2] < 0.001
+    expected = transitions_from_durations(durations, FRAME_SECONDS)
+    np.testing.assert_allclose(transitions[2], expected[2])
+
+
+def test_a_single_cough_survives_and_a_flicker_does_not():
+    probabilities = np.full((400, 5), 0.01, np.float32)
+    probabilities[:, 0] = 0.96
+    probabilities[100:120] = [0.1, 0.1, 0.05, 0.7, 0.05]  # the windows that hear one cough
+    probabilities[300] = [0.4, 0.0, 0.0, 0.6, 0.0]
+    smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
+    segmenter = Segmenter(smoothing, default_transitions(CLASSES), FRAME_SECONDS)
+    stamps = np.arange(400) * FRAME_NANOSECONDS
+    segments = segmenter.push(probabilities, stamps) + segmenter.close(400 * FRAME_NANOSECONDS)
+    assert [CLASSES[segment.label] for segment in segments] == ["silence", "coughing", "silence"]
+    _, cough, last = segments
+    assert (cough.start, cough.end) == (stamps[100], stamps[120])
+    assert cough.confidence == pytest.approx(0.7)
+    assert cough.known == stamps[120 + LAG]
+    assert (last.end, last.known) == (400 * FRAME_NANOSECONDS, 400 * FRAME_NANOSECONDS)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
+def test_segments_of_a_part_are_those_of_the_whole_once_settled(lag):
+    smoothing, transitions = (
+        Smoothing(method="hmm", lag_seconds=lag),
+        default_transitions(CLASSES),
+    )
+    settled_after = []
+    for seed in range(8):
+        probabilities = made_up(seed, 1200)
+        stamps = START + np.arange(1200) * FRAME_NANOSECONDS
+        whole = Segmenter(smoothing, transitions, FRAME_SECONDS).push(probabilities, stamps)
+        for begin in range(100, 900, 100):
+            part = Segmenter(smoothing, transitions, FRAME_SECONDS)
+            frame = begin
+            while not part.settled and frame < 1200:
+                part.push(probabilities[frame : frame + 1], stamps[frame : frame + 1])
+                frame += 1
+            settled_after.append(frame - begin)
+            later = part.push(probabilities[frame:], stamps[frame:])
+            assert later == [segment for segment in whole if segment.known >= stamps[frame]]
+    assert np.median(settled_after) < 400
+
+
+@pytest.fixture(scope="module")
+def hmm_file(tmp_path_factory, model_file):
+    """The simulated model, with smoothing."""
+    model = load_model(model_file)
+    smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
+    about = model.description.model_copy(update={"smoothing": smoothing})
+    path = tmp_path_factory.mktemp("hmm") / "smoothed.safetensors"
+    transitions = default_transitions(model.classes)
+    save_model(replace(model, description=about, transitions=transitions), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda rows: rows * 1.01, "the rows of transitions are no probabilities"),
+        (lambda rows: rows - 0.5 * np.eye(len(rows)) + 0.5, "rows of transitions"),
+        (lambda rows: rows[:, :-1], "transitions has shape"),
+        (lambda rows: rows[:0, :0], "transitions is missing"),
+    ],
+)
+def test_transitions_that_are_none_are_refused(hmm_file, tmp_path, change, complaint):
+    model = load_model(hmm_file)
+    bad = replace(model, transitions=change(model.transitions))
+    with pytest.raises(ModelError, match=complaint):
+        save_model(bad, tmp_path / "bad.safetensors")
+
+
+def pushed(day, model_file, size):
+    samples = np.concatenate(list(read_audio(day))).reshape(-1, FRAME_SAMPLES)[:1200]
+    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    records = []
+    for first in range(0, len(samples), size):
+        block = samples[first : first + size]
+        stamps = START + np.arange(first, first + len(block)) * FRAME_NANOSECONDS
+        records += pipeline.push(Frames(first, block, stamps))
+    return records + pipeline.finish()
+
+
+@pytest.mark.parametrize("size", [1, 7, 200])
+def test_blocks_of_any_size_give_the_same_records(day, hmm_file, size):
+    assert pushed(day, hmm_file, size) == pushed(day, hmm_file, 1200)
+
+
+def test_segments_are_fewer_and_labels_as_they_were(day, hmm_file, model_file):
+    smooth, merged = pushed(day, hmm_file, 100), pushed(day, model_file, 100)
+    of = {
+        kind: [[r for r in records if r.topic == f"/mic/{kind}"] for records in (smooth, merged)]
+        for kind in ("label", "segment")
+    }
+    assert of["label"][0] == of["label"][1]
+    assert 3 < len(of["segment"][0]) < len(of["segment"][1])
+
+
+def test_a_segment_is_written_when_it_is_known_and_log_time_never_runs_back(day, hmm_file):
+    records = pushed(day, hmm_file, 100)
+    times = [record.log_time for record in records]
+    assert times == sorted(times)
+    over = START + 1200 * FRAME_NANOSECONDS
+    ends = []
+    for item, line in pairwise(records):
+        if item.topic == "/mic/segment":
+            segment = decode(item.data, SEGMENT)
+            start = nanoseconds(segment.header.stamp)
+            assert not ends or start == ends[-1]
+            ends.append(start + nanoseconds(segment.duration))
+            assert item.log_time == min(ends[-1] + LAG * FRAME_NANOSECONDS, over)
+            assert line.topic == "/rosout"
+            assert nanoseconds(decode(line.data, LOG).stamp) == line.log_time == item.log_time
+    assert ends[-1] == over
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, day, hmm_file):
+    """Logs of a minute, with gaps."""
+    folder = tmp_path_factory.mktemp("recorded")
+    settings = Settings(output=folder, model=hmm_file, max_bag_duration=60)
+    record(settings, LossySource(FileSource([day], START), {5: 7, 12: 150}), Flag())
+    return folder
+
+
+def replay(folder, output, model_file, **wanted):
+    model = load_model(model_file)
+    wanted = Wanted(model=lambda _: model, output=output, **wanted)
+    return replay_logs(LogSet(find_logs(folder), "features"), wanted, Flag())
+
+
+def written(folder, start=0, end=1 << 62):
+    """Segments of some span of time, as written."""
+    return [
+        (m.log_time, m.data)
+        for log in find_logs(folder)
+        for m in LogReader(log).messages()
+        if m.topic == "/mic/segment" and start <= m.log_time < end
+    ]
+
+
+def test_a_recording_comes_out_again_bit_for_bit(folder, hmm_file, tmp_path):
+    result = replay(folder, tmp_path / "again", hmm_file)
+    assert result.compared.identical
+    assert result.compared.segments == len(written(folder)) > 10
+    assert written(tmp_path / "again") == written(folder)
+
+
+@pytest.mark.parametrize("offset", [0.5, 33.33, 58.9, 121.0, 170.0])
+def test_a_part_is_as_in_the_whole(folder, hmm_file, tmp_path, offset):
+    result = replay(folder, tmp_path / "part", hmm_file, start_offset=offset, duration=10.0)
+    start = START + round(offset * SECOND)
+    recorded = written(folder, start, start + 10 * SECOND)
+    assert result.compared.identical
+    assert result.compared.segments == len(recorded)
+    assert written(tmp_path / "part")[: len(recorded)] == recorded
+
+
+def test_logs_of_a_recorder_that_smooths_are_sound(folder):
+    assert {kind for findings in examine(folder) for kind in findings.counts} == {
+        ("warning", "gap")
+    }
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "rules"),
+    [(-200.0, -100.0, {"stamp", "segment-hole"}), (-9.0, 0.5, {"stamp", "segment-overlap"})],
+)
+def test_a_segment_that_is_written_too_late_or_before_it_is_over_is_found(
+    folder, tmp_path, start, end, rules
+):
+    path = find_logs(folder)[0]
+    log = Log(path)
+    segment = log.messages("/mic/segment")[0]
+    begin = segment.log_time + round(start * SECOND)
+    duration = round((end - start) * SECOND)
+    log.change(segment, header__stamp=time_message(begin), duration=duration_message(duration))
+    (findings,) = examine(log.write(tmp_path / path.name))
+    assert {rule for level, rule in findings.counts if level == "error"} == rules

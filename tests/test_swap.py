@@ -1,0 +1,311 @@
+"""Another model takes over while the recorder runs: no sound is lost, the log says from when."""
+
+import os
+import signal
+import subprocess
+import time
+from contextlib import chdir, contextmanager
+from itertools import pairwise
+from queue import SimpleQueue
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+from kept import keep_models, put_by_hand
+from logs import features, read
+from spliced import run
+
+from models.classifier import Classifier
+from models.modelfile import load_model
+from models.registry import promote
+from recorder.config import Settings
+from recorder.features import FRAME_SAMPLES, FeatureExtractor
+from recorder.log import RollingLog
+from recorder.modelwatch import ModelWatch
+from recorder.pipeline import Pipeline
+from recorder.service import _attend, _describe
+from recorder.sources.files import read_audio
+from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from schemas.files import find_logs
+from schemas.reader import LogReader
+
+SECOND = 1_000_000_000
+START = 1_772_348_400 * SECOND
+
+
+@pytest.fixture
+def folder(tmp_path, model_file):
+    return keep_models(tmp_path / "models", model_file)
+
+
+@contextmanager
+def recording(folder, logs, *arguments, env=None):
+    """Run `hearthlog record` with the champion; at the end it is asked to stop."""
+    command = [*HEARTHLOG, "record", *map(str, arguments), "-o", str(logs)]
+    command += ["--model", str(folder / "champion.safetensors"), "--max-bag-duration", "86400"]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, env=env, text=True) as process:
+        try:
+            yield process
+            process.send_signal(signal.SIGTERM)
+            process.errors = process.communicate(timeout=20)[1]
+        finally:
+            process.kill()
+
+
+def wait_for(condition, seconds=30):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"not in {seconds} s"
+        time.sleep(0.1)
+
+
+def count(logs, kind):
+    return len(read(logs, kind)) if logs.exists() and list(logs.rglob("*.mcap*")) else 0
+
+
+def said(logs, level=None):
+    lines = [
+        item.decode() for log in find_logs(logs) for item in LogReader(log).messages(["/rosout"])
+    ]
+    return [line.msg for line in lines if level in {None, line.level}]
+
+
+def labels_by(model_path, logs):
+    """Labels of a model that has heard everything in some logs, by frame."""
+    pipeline = Pipeline("mic", Classifier(load_model(model_path)))
+    frames, stamps, values = features(logs)
+    records = pipeline.push_features(values, int(frames[0]), stamps)
+    labels = [record.data for record in records if record.topic == "/mic/label"]
+    return dict(zip(frames[19:].tolist(), labels, strict=True))
+
+
+def recorded_labels(log):
+    messages = list(LogReader(log).messages(["/mic/label"]))
+    return {item.decode().frame: item.data for item in messages}
+
+
+def check_swap(folder, logs, names):
+    """See that each model labelled its own log, and that they are one recording without a hole."""
+    frames, _, _ = features(logs)
+    np.testing.assert_array_equal(frames, np.arange(len(frames)))
+    assert [message.frame for message in read(logs, "statistics")] == frames.tolist()
+    paths = find_logs(logs)
+    assert [info.model for info in read(logs, "info")] == names
+    labelled = []
+    for path, name in zip(paths, names, strict=True):
+        model = load_model(folder / f"{name}.safetensors")
+        about = LogReader(path)
+        assert about.metadata["hearthlog"]["model_sha256"] == model.sha256
+        assert about.attachments["model_card.md"] == model.card().encode()
+        found, wanted = recorded_labels(path), labels_by(folder / f"{name}.safetensors", logs)
+        assert found == {frame: wanted[frame] for frame in found}
+        labelled += found
+    assert labelled == frames[19:].tolist()
+    for path, name in zip(paths[1:], names[1:], strict=True):
+        first = features(path)[0][0]
+        digest = load_model(folder / f"{name}.safetensors").sha256[:12]
+        assert f"model {name} ({digest}) from frame {first} on" in said(path)
+    segments = read(logs, "segment")
+    spans = [(s.header.stamp.sec * SECOND + s.header.stamp.nanosec, s.duration) for s in segments]
+    for (start, duration), (following, _) in pairwise(spans):
+        assert start + duration.sec * SECOND + duration.nanosec == following
+
+
+@pytest.mark.parametrize("names", [["one", "two"], ["one", "bands"], ["bands", "two"]])
+def test_a_promoted_model_speaks_from_a_frame_on_and_nothing_is_lost(
+    folder, tmp_path, day, capfd, names
+):
+    put_by_hand(folder, f"{names[0]}.safetensors")
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00") as process:
+        wait_for(lambda: count(logs, "label") > 20)
+        promote(folder, names[1])
+        wait_for(lambda: len(list(logs.rglob("*.mcap*"))) == 2 and count(logs, "info") == 2)
+        before = count(logs, "label")
+        wait_for(lambda: count(logs, "label") > before + 20)
+    assert (process.returncode, process.errors) == (0, "")
+    check_swap(folder, logs, names)
+    sound = np.concatenate(list(read_audio(day)))
+    values = features(logs)[2]
+    heard = sound[: len(values) * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+    np.testing.assert_array_equal(values, FeatureExtractor()(heard))
+    assert run(capfd, "doctor", logs).returncode == 0
+    with chdir(tmp_path):  # the models are looked for in `models`
+        result = run(capfd, "replay", logs, "-o", tmp_path / "again")
+    assert result.returncode == 0, result.stderr
+    for log in find_logs(logs):
+        again = LogReader(tmp_path / "again" / log.relative_to(logs)).messages()
+        assert [(m.topic, m.log_time, m.data) for m in again] == [
+            (m.topic, m.log_time, m.data) for m in LogReader(log).messages()
+        ]
+
+
+def test_one_model_for_logs_of_two_gives_what_it_would_have_given_alone(
+    folder, tmp_path, day, capfd
+):
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00"):
+        wait_for(lambda: count(logs, "label") > 20)
+        promote(folder, "two")
+        wait_for(lambda: count(logs, "info") == 2)
+    other = folder / "bands.safetensors"
+    result = run(capfd, "replay", logs, "--model", other, "-o", tmp_path / "again")
+    assert result.returncode == 0, result.stderr
+    (log,) = find_logs(tmp_path / "again")
+    assert recorded_labels(log) == labels_by(other, logs)
+
+
+def test_a_microphone_is_heard_on_while_the_model_changes(folder, tmp_path, labmic):
+    rng = np.random.default_rng(5)
+    labmic.configure(data=rng.normal(0, 3000, 16_000 * 7 + 311).astype(np.int16))
+    logs = tmp_path / "logs"
+    with recording(folder, logs, "--device", labmic.device, env=labmic.env) as process:
+        for number, name in enumerate(["two", "bands"], 2):
+            before = count(logs, "label")
+            wait_for(lambda before=before: count(logs, "label") > before + 10)
+            promote(folder, name)
+            process.send_signal(signal.SIGHUP)
+            wait_for(lambda number=number: count(logs, "info") == number)
+    assert (process.returncode, process.errors) == (0, "")
+    check_swap(folder, logs, ["one", "two", "bands"])
+
+
+def test_a_bad_model_is_refused_once_and_the_old_one_goes_on(folder, tmp_path, day, capfd):
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00") as process:
+        wait_for(lambda: count(logs, "label") > 0)
+        (folder / "bad.safetensors").write_bytes(b"garbage" * 100)
+        put_by_hand(folder, "bad.safetensors")
+        wait_for(lambda: len(said(logs, level=30)) == 1)
+        time.sleep(2.5)  # it is looked at again and again
+        assert len(said(logs, level=30)) == 1
+        process.send_signal(signal.SIGHUP)
+        wait_for(lambda: len(said(logs, level=30)) == 2)
+        (folder / "champion.safetensors").unlink()
+        wait_for(lambda: len(said(logs, level=30)) == 3)
+        promote(folder, "two")
+        wait_for(lambda: count(logs, "info") == 2)
+    assert process.returncode == 3
+    refused = said(logs, level=30)
+    assert process.errors.splitlines() == [f"hearthlog: {line}" for line in refused]
+    assert [line.startswith("model champion refused: ") for line in refused] == [True] * 3
+    assert [line.endswith("; going on with one") for line in refused] == [True] * 3
+    assert "bad.safetensors: is no model file" in refused[0] == refused[1]
+    assert "no such model file" in refused[2]
+    found = [s for m in read(logs, "diagnostics") for s in m.status if s.name.endswith(" model")]
+    assert [status.level for status in found] == [1, 1, 1, 0]
+    check_swap(folder, logs, ["one", "two"])
+    assert run(capfd, "doctor", logs).returncode == 0
+
+
+def test_a_bad_model_at_the_start_is_an_error(folder, tmp_path, day, hearthlog):
+    put_by_hand(folder, "gone.safetensors")
+    link = folder / "champion.safetensors"
+    result = hearthlog("record", day, "--model", link, "-o", tmp_path / "logs")
+    assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+    assert not list((tmp_path / "logs").rglob("*.mcap*"))
+
+
+def test_a_file_that_is_written_over_in_its_place_is_taken_too(folder):
+    path = folder / "one.safetensors"
+    watch = ModelWatch(path, SimpleQueue())
+    path.write_bytes((folder / "two.safetensors").read_bytes())
+    assert ready(watch).sha256 == load_model(folder / "two.safetensors").sha256
+    watch.close()
+
+
+def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
+    monkeypatch.setattr("recorder.modelwatch._LOOK_SECONDS", 0.01)
+    path = folder / "one.safetensors"
+    watch = ModelWatch(path, SimpleQueue())
+    (folder / "copy").write_bytes(path.read_bytes())
+    (folder / "copy").replace(path)
+    time.sleep(0.5)
+    watch.close()
+    assert list(watch.refusals()) == []
+    assert watch.ready is None
+
+
+def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
+    monkeypatch.setattr("recorder.modelwatch._LOOK_SECONDS", 3600)
+    asked = SimpleQueue()
+    watch = ModelWatch(folder / "champion.safetensors", asked)
+    promote(folder, "two")
+    asked.put(None)
+    assert ready(watch).name == "two"
+    watch.close()
+
+
+def ready(watch):
+    """Wait for the model that a watch has found."""
+    wait_for(lambda: not list(watch.refusals()) and watch.ready is not None)
+    return watch.ready.model
+
+
+class Nowhere:
+    device = "test"
+
+
+def record_and_promote(folder, logs, events):
+    """Record events; before the second block of frames another model is ready."""
+    settings = Settings(output=logs)
+    watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
+    pipeline = Pipeline("mic", watch.first.classifier)
+    log = RollingLog(_describe(settings, Nowhere(), watch.first.model), 3600, 1.0, 5.0)
+    promote(folder, "two")
+    ready(watch)
+    heard = False
+    for event in events:
+        if isinstance(event, Frames):
+            if heard:
+                _attend(watch, event, pipeline, log, lambda m: _describe(settings, Nowhere(), m))
+            heard = True
+        log.write(pipeline.push(event))
+    log.finish(pipeline.finish())
+    watch.close()
+    return log.finished
+
+
+def block(first, count):
+    rng = np.random.default_rng(first)
+    sound = rng.normal(0, 0.1, (count, FRAME_SAMPLES)).astype(np.float32)
+    return Frames(first, sound, START + np.arange(first, first + count) * FRAME_NANOSECONDS)
+
+
+def test_a_model_waits_for_the_next_second_if_a_log_began_in_this_one(folder, tmp_path):
+    blocks = [block(first, 6) for first in range(0, 60, 6)]
+    early, late = record_and_promote(folder, tmp_path / "logs", blocks)
+    names = [path.name.partition("T")[2] for path in (early, late)]
+    assert names == ["070000Z.mcap", "070001Z.mcap"]
+    assert features(late)[0].tolist() == list(range(24, 60))
+
+
+def test_a_model_that_changes_behind_a_gap_is_replayed_as_it_was(folder, tmp_path, capfd):
+    start = START + 40 * FRAME_NANOSECONDS
+    gap = Gap(start, start + 7 * FRAME_NANOSECONDS, "overrun", 7)
+    logs = tmp_path / "logs"
+    events = [block(0, 40), gap, block(47, 40), block(87, 20)]
+    early, late = record_and_promote(folder, logs, events)
+    assert (features(early)[0].max(), features(late)[0].min()) == (39, 47)
+    with chdir(tmp_path):
+        result = run(capfd, "replay", logs)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.count("bit for bit") == 2
+    assert run(capfd, "doctor", logs).returncode == 3  # the gap
+
+
+def test_a_recorder_whose_terminal_is_closed_completes_its_log(folder, tmp_path):
+    soundfile.write(tmp_path / "noise.wav", np.zeros(16_000 * 60), 16_000)
+    logs = tmp_path / "logs"
+    master, terminal = os.openpty()
+    command = ["setsid", "--ctty", *HEARTHLOG, "record", str(tmp_path / "noise.wav"), "--realtime"]
+    command += ["-o", str(logs), "--model", str(folder / "champion.safetensors")]
+    process = subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    wait_for(lambda: count(logs, "features") > 0)
+    os.close(master)
+    process.wait(timeout=20)
+    (log,) = logs.rglob("*.mcap*")
+    assert LogReader(log).complete

@@ -1,0 +1,61 @@
+"""`hearthlog enrol`: seconds of a sound into the home's own training set."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.cli.selection import wrong_use
+from tools.cli.times import parse_span
+
+
+def enrol(
+    label: Annotated[str, typer.Argument(metavar="CLASS", help="What is heard.")],
+    *,
+    home: Annotated[Path, typer.Option(help="Folder of the home's training set.")],
+    file: Annotated[Path | None, typer.Option(help="Audio file to enrol.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Log, or folder of logs, to enrol a span of.")
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="Start of the span, as 2026-03-01T07:00:00 (UTC unless it says otherwise)."
+        ),
+    ] = None,
+    end: Annotated[str | None, typer.Option(help="Its end.")] = None,
+    microphone: Annotated[
+        str | None, typer.Option(help="Microphone to listen to, as `hearthlog devices` lists it.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="How much of a file (default: all) or of a microphone (default: 5)."),
+    ] = None,
+) -> None:
+    """Take seconds of a sound from a file, a log or a microphone to learn from.
+
+    Features are kept, and no sound: a log in the folder `enrolled` of the home, all of it marked.
+    """
+    from analyzer import enrol as enrolment
+
+    least, most = enrolment.LEAST_SECONDS, enrolment.MOST_SECONDS
+    if sum(given is not None for given in (file, log, microphone)) != 1:
+        wrong_use("enrol one of --file, --log with --start and --end, or --microphone")
+    if seconds is not None and not least <= seconds <= most:
+        wrong_use(f"--seconds {seconds}: enrol from {least:.0f} to {most:.0f} s")
+    if log is None and (start, end) != (None, None):
+        wrong_use("--start and --end go with --log")
+    first, last = parse_span(start, end)
+    if file is not None:
+        done = enrolment.enrol_file(home, label, file, seconds)
+    elif log is None:
+        seconds = seconds or enrolment.SECONDS
+        say = partial(typer.echo, f"hearthlog: listening for {seconds:g} s", err=True)
+        done = enrolment.enrol_microphone(home, label, microphone or "", seconds, say)
+    elif first is None or last is None or seconds is not None:
+        wrong_use("--log wants --start and --end, and no --seconds")
+    else:
+        done = [enrolment.enrol_log(home, label, log, first, last)]
+    for enrolled in done:
+        print(f"{enrolled.log}: {enrolled.seconds:.2f} s of {label}")
