@@ -14,7 +14,7 @@ from sklearn.metrics import f1_score
 from analyzer.dataset import Dataset, Progress
 from analyzer.errors import DataError
 from analyzer.home import HOME_WEIGHT
-from analyzer.recipe import Examples, Recipe, decide, fit, home_votes, prepare
+from analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_GROUPS = 8
@@ -99,10 +99,10 @@ def _scores(
         seen = np.concatenate([others, pool[:count]])
         machine = fit(recipe, examples._replace(weight=weight), seen)
         inputs = examples.inputs[0]
-        decision = decide(machine, inputs[test], len(data.classes))
         home = pool[:count]
-        votes = home_votes(machine, inputs[test], inputs[home], data.target[home])
-        decision[:, : votes.shape[1]] += votes
+        decision = decide_with_home(
+            machine, inputs[test], len(data.classes), inputs[home], data.target[home]
+        )
         predicted = decision.argmax(axis=1)
         labels = np.unique(data.target[test])
         yield float(

@@ -15,9 +15,9 @@ from sklearn.svm import SVC
 
 from analyzer.augment import augmented
 from analyzer.dataset import Dataset
+from models.classifier import HOME_SHARPNESS, home_votes, weakest_pairs
 from models.inputs import Kind, window_inputs
 
-HOME_VOTE = 5.0  # of nearness, beside sums of decisions between -1 and 1
 _WORKERS = 4
 _SEED = 20_261_121
 
@@ -126,53 +126,46 @@ def cross_validate(
 
 
 def decide(machine: Pipeline, inputs: NDArray[np.float32], classes: int) -> Float64:
-    """Let the pairs of classes vote, each as far as it is sure.
-
-    Votes that are counted, as scikit-learn does, cannot be calibrated: most segments win just as
-    many of them. Their hyperbolic tangents keep the same winners and tell how clearly.
+    """Decide as `models.classifier.Classifier` does.
 
     Returns
     -------
     np.ndarray [shape=(n, classes)]
-        Sums of tanh of the decisions for a class, against each other; -inf for a class that was
-        not learned.
+        -inf for a class that was not learned.
     """
-    decision = machine.decision_function(inputs.astype(np.float64))
-    pairs = -decision[:, np.newaxis] if decision.ndim == 1 else decision
-    known = np.eye(classes)[machine.classes_]
-    first, second = np.triu_indices(len(known), 1)
-    sums = np.tanh(pairs) @ (known[first] - known[second])
-    sums[:, known.sum(axis=0) == 0] = -np.inf
-    return sums
+    found = machine.decision_function(inputs.astype(np.float64))
+    pairs = -found[:, np.newaxis] if found.ndim == 1 else found
+    decision = np.full((len(inputs), classes), -np.inf)
+    decision[:, machine.classes_] = weakest_pairs(pairs, len(machine.classes_))
+    return decision
 
 
-def home_votes(
-    machine: Pipeline, inputs: NDArray[np.float32], home: NDArray[np.float32], target: Indices
+def decide_with_home(
+    machine: Pipeline,
+    inputs: NDArray[np.float32],
+    classes: int,
+    home: NDArray[np.float32],
+    target: Indices,
 ) -> Float64:
-    """Let a home's own segments draw what is like them to their class.
-
-    With a few segments among thousands a support vector machine is content to get these right;
-    the nearness to them, summed up by class, is what makes them count for others. Its square
-    root, so that many of one kind do not drown the rest.
+    """Decide as `models.classifier.Classifier` does for a home with vectors of its own.
 
     Parameters
     ----------
     machine : sklearn.pipeline.Pipeline
-        As `fit` makes it: for the scale and the kernel.
+        As `fit` makes it.
     inputs, home : np.ndarray [shape=(n, width)] and [shape=(h, width)], float32
+    classes : int
     target : np.ndarray [shape=(h,)], intp
         Classes of the home's segments.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, classes)]
-        To be added to the decisions; of the classes up to the highest in `target`.
     """
-    scaler, svc = machine
+    decision = decide(machine, inputs, classes)
     if not len(home):
-        return np.zeros((len(inputs), 1))
-    kernel = rbf_kernel(scaler.transform(inputs), scaler.transform(home), gamma=svc.gamma)
-    return HOME_VOTE * np.sqrt(kernel @ np.eye(target.max() + 1)[target])
+        return decision
+    scaler, svc = machine
+    gamma, here = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
+    near = rbf_kernel(here, scaler.transform(home.astype(np.float64)), gamma=gamma)
+    others = rbf_kernel(here, svc.support_vectors_, gamma=gamma).sum(axis=1, keepdims=True)
+    return decision + home_votes(near @ np.eye(classes)[target], others)
 
 
 def inverse_temperature(decisions: Float64, target: Indices) -> float:

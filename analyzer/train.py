@@ -14,7 +14,6 @@ from analyzer.errors import DataError
 from analyzer.evaluation.scores import calibration_error
 from analyzer.hmm import LAG_SECONDS, default_transitions
 from analyzer.recipe import (
-    HOME_VOTE,
     RECIPES,
     Fold,
     Recipe,
@@ -83,9 +82,6 @@ def train_model(
     machine = fit(recipe, examples)
     progress(len(folds) + 1, len(folds) + 1)
     hidden = smoothing == "hmm"
-    smooth = (
-        Smoothing(method="hmm", lag_seconds=LAG_SECONDS) if hidden else Smoothing(method="merge")
-    )
     about = Description(
         format=2,
         kind="svm-rbf",
@@ -156,9 +152,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     found = {name: Amount(**asdict(amount)) for name, amount in home.amounts.items()}
     training = about.training_data.model_copy(update={"home": found, "base_sha256": base.sha256})
     return replace(
-        _model(
-            about.model_copy(update={"training_data": training, "home_vote": HOME_VOTE}), machine
-        ),
+        _model(about.model_copy(update={"training_data": training}), machine),
         home_vectors=examples.inputs[0, len(base.training_windows) :],
         home_target=home.target.astype(np.int64),
         transitions=base.transitions,

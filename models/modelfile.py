@@ -136,7 +136,6 @@ class Description(_Record):
     """Everything about a model that is no array.
 
     `inverse_temperature` calibrates: it multiplies the decision values before the softmax.
-    `home_vote` is what the nearness of the home's own vectors adds to the decision for a class.
     `copies` says how often each segment was learned from as another microphone would hear it.
     """
 
@@ -152,7 +151,6 @@ class Description(_Record):
     cost: _Positive
     gamma: _Positive
     copies: _Count = 0
-    home_vote: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
     calibration: Literal["temperature"]
     inverse_temperature: _Positive
     smoothing: Smoothing

@@ -284,7 +284,7 @@ def test_a_description_that_makes_no_sense_is_refused_by_name(tmp_path, key, val
     assert reason in refusal(tmp_path, content(description() | {key: value}))
 
 
-@pytest.mark.parametrize("key", sorted(description().keys() - {"inputs", "copies", "home_vote"}))
+@pytest.mark.parametrize("key", sorted(description().keys() - {"inputs", "copies"}))
 def test_nothing_of_the_description_may_be_missing(tmp_path, key):
     about = description()
     del about[key]

@@ -1,0 +1,276 @@
+"""A model learns a home's own sounds: from marks in its logs, in little, and the same each time."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import soundfile
+from blobs import blobs, ignore_progress
+
+from analyzer.adaptation import CORRECTED, adaptation_curve
+from analyzer.augment import augmented
+from analyzer.dataset import Recording, cut_recordings
+from analyzer.errors import DataError
+from analyzer.evaluation.folds import KINDS, evaluate_recipe
+from analyzer.home import home_recordings
+from analyzer.recipe import (
+    RECIPES,
+    decide_with_home,
+    fit,
+    inverse_temperature,
+    prepare,
+    softmax,
+)
+from analyzer.review import Mark, write_marks
+from analyzer.scenario import Scenario
+from analyzer.train import adapt_model, train_model
+from models.classifier import Classifier
+from models.inputs import bands_of, window_inputs
+from models.modelfile import load_model, save_model
+from recorder.features import FeatureExtractor
+from schemas.columns import read_columns
+from schemas.files import find_logs
+
+RATE = 16_000
+BANDS = RECIPES["bands"]
+
+
+def split(data, kept):
+    """Return the segments of some groups, and the others."""
+    inside = np.isin(data.group, kept)
+    return rows(data, inside), rows(data, ~inside)
+
+
+def rows(data, chosen):
+    names = ("windows", "target", "group", "collection", "weight")
+    return dataclasses.replace(data, **{name: getattr(data, name)[chosen] for name in names})
+
+
+def moved(data, amount):
+    """Let a home sound like nothing that was heard before."""
+    windows = data.windows.copy()
+    windows[:, :, 9:] += np.float32(amount)
+    return dataclasses.replace(data, windows=windows, weight=np.full(len(data), 5.0))
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A model, and a home where everything sounds different: a part to learn from, and the rest."""
+    data, scenario = blobs(4, 60, spread=0.6)
+    learned, other = split(data, data.group[data.group % 6 < 4])
+    few, rest = split(moved(other, 40.0), other.group[other.group % 6 == 4])
+    return train_model(learned, scenario, ignore_progress), few, rest
+
+
+def accuracy(model, data):
+    inputs = window_inputs(model.description.inputs, data.windows)
+    return (Classifier(model).probabilities(inputs).argmax(axis=1) == data.target).mean()
+
+
+def test_a_model_that_was_adapted_knows_the_home_better(world):
+    base, few, rest = world
+    adapted = adapt_model(base, few)
+    assert accuracy(adapted, rest) > accuracy(base, rest) + 0.2
+    about = adapted.description.training_data
+    assert about.base_sha256 == base.sha256
+    assert sum(amount.segments for amount in about.home.values()) == len(few)
+    assert "Adapted to a home" in adapted.card()
+
+
+def test_adapting_to_the_same_home_gives_the_same_file(world, tmp_path):
+    base, few, _ = world
+    for name in ("a", "b"):
+        save_model(adapt_model(base, few), tmp_path / f"{name}.safetensors")
+    a, b = (load_model(tmp_path / f"{name}.safetensors") for name in ("a", "b"))
+    assert a.sha256 == b.sha256
+
+
+def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world):
+    base, few, _ = world
+    once = adapt_model(base, few)
+    twice = adapt_model(once, few)
+    np.testing.assert_array_equal(once.support_vectors, twice.support_vectors)
+    np.testing.assert_array_equal(once.dual_coefficients, twice.dual_coefficients)
+
+
+def test_a_class_the_home_has_not_is_not_forgotten(world):
+    base, few, _ = world
+    three = rows(few, few.target != 2)
+    windows = base.training_windows[base.training_target == 2]
+    inputs = window_inputs("bands", windows)
+    predicted = Classifier(adapt_model(base, three)).probabilities(inputs).argmax(axis=1)
+    assert (predicted == 2).mean() > 0.9
+
+
+def test_a_model_without_what_it_learned_from_is_refused(world):
+    base, few, _ = world
+    bare = dataclasses.replace(base, name="bare", training_windows=base.training_windows[:0])
+    with pytest.raises(DataError, match="bare: has not kept what it learned from"):
+        adapt_model(bare, few)
+
+
+def test_a_home_without_segments_is_refused(world):
+    base, few, _ = world
+    with pytest.raises(DataError, match="no segments of a class of the model"):
+        adapt_model(base, rows(few, few.target < 0))
+
+
+def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
+    base, few, rest = world
+    adapted = adapt_model(base, few)
+    joined = dataclasses.replace(
+        few,
+        windows=np.concatenate([base.training_windows, few.windows]),
+        target=np.concatenate([base.training_target, few.target]),
+        weight=np.concatenate([np.ones(len(base.training_target)), few.weight]),
+    )
+    machine = fit(BANDS, prepare(BANDS, joined))
+    inputs, home = (window_inputs("bands", data.windows) for data in (rest, few))
+    decision = decide_with_home(machine, inputs, 4, home, few.target)
+    expected = softmax(base.description.inverse_temperature * decision)
+    ours = Classifier(adapted).probabilities(inputs)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
+
+
+def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorded):
+    log = find_logs(recorded)[0]
+    heard = read_columns([log], ["/mic/features"])["/mic/features"]
+    stamps = heard["header.stamp"]
+    marks = [
+        Mark("mic", int(stamps[100]), int(stamps[160]), "speech"),
+        Mark("mic", int(stamps[300]), int(stamps[306]), "coughing"),
+    ]
+    layer = write_marks(log, marks)
+    try:
+        found = list(home_recordings(recorded))
+    finally:
+        layer.unlink()
+    assert [item.label for item in found] == ["speech", "coughing"]
+    np.testing.assert_array_equal(found[0].features, heard["values"][100:160])
+    np.testing.assert_array_equal(found[1].features, heard["values"][293:313])  # a whole second
+    assert found[0].group == found[1].group
+    data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
+    assert data.weight.min() == 5.0
+
+
+def test_a_second_across_a_gap_is_not_learned_from(recorded):
+    for log in find_logs(recorded):
+        heard = read_columns([log], ["/mic/features"])["/mic/features"]
+        stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)
+        if len(gaps := np.flatnonzero(np.diff(frames) != 1)):
+            break
+    gap = gaps[0]
+    layer = write_marks(log, [Mark("mic", int(stamps[gap - 9]), int(stamps[gap + 31]), "speech")])
+    try:
+        found = list(home_recordings(recorded))
+    finally:
+        layer.unlink()
+    assert [len(item.features) for item in found] == [10, 30]
+
+
+def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
+    hearthlog, recorded, model_file, tmp_path
+):
+    log = find_logs(recorded)[0]
+    labels = tmp_path / "labels.txt"
+    labels.write_text("2.0\t8.0\tspeech\n10.0\t14.0\tsilence\n")
+    layer = log.with_name(f"{log.stem}.review.mcap")
+    assert hearthlog("annotate", "import", log, labels).returncode == 0
+    try:
+        output = tmp_path / "home.safetensors"
+        done = hearthlog("train", "--base", model_file, "--home", recorded, "-o", output, "--json")
+    finally:
+        layer.unlink()
+    assert done.returncode == 0, done.stderr
+    about = json.loads(done.stdout)["training_data"]["home"]
+    assert about["speech"]["seconds"] == pytest.approx(6.0, abs=0.1)
+    assert about["silence"]["seconds"] == pytest.approx(4.0, abs=0.1)
+    adapted = load_model(output)
+    assert adapted.classes == load_model(model_file).classes
+    assert len(adapted.home_vectors) == about["speech"]["segments"] + about["silence"]["segments"]
+
+
+def test_augmented_sound_is_what_the_other_microphone_would_give():
+    """A gain of the samples is one of the features."""
+    rng = np.random.default_rng(0)
+    samples = (0.05 * rng.standard_normal(RATE)).astype(np.float32).reshape(20, -1)
+    quiet, loud = FeatureExtractor()(samples), FeatureExtractor()(2 * samples)
+    windows = np.repeat(quiet[np.newaxis], 400, axis=0)
+    changed = augmented(windows, np.random.default_rng(1))
+    assert changed.shape == windows.shape
+    assert changed.dtype == np.float32
+    untouched = (changed == windows).all(axis=(1, 2)).mean()
+    assert 0.0 < untouched < 0.2
+    np.testing.assert_array_equal(changed[:, :, 1:8], windows[:, :, 1:8])
+    # Energy and bands move together: 6 dB are 6 dB.
+    energy = 10 * np.log10(loud[:, 0] / quiet[:, 0])
+    bands = (bands_of(loud[:, 8:]) - bands_of(quiet[:, 8:])).mean(axis=1)
+    np.testing.assert_allclose(energy, bands, atol=0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_folds_by_segment_flatter_and_all_kinds_are_scored(kind):
+    data, _ = blobs(3, 60, spread=2.0)
+    collections = dataclasses.replace(
+        data, collection=data.group % 3, collection_names=("a", "b", "c")
+    )
+    found = evaluate_recipe(collections, BANDS, kind, ignore_progress)
+    assert found.folds == {"segment": 5, "source": 5, "collection": 3}[kind]
+    assert found.scores.segments == 180
+    assert 0.2 < found.scores.macro_f1 <= 1.0
+
+
+def test_one_collection_cannot_be_left_out():
+    data, _ = blobs(3, 30)
+    with pytest.raises(DataError, match="all recordings are of one collection"):
+        evaluate_recipe(data, BANDS, "collection", ignore_progress)
+
+
+def test_the_curve_of_adaptation_rises_where_homes_differ():
+    data, _ = blobs(3, 400, spread=1.0)
+    group = np.arange(len(data)) // 4
+    far = data.windows + np.float32(20.0) * (group % 2).astype(np.float32)[:, None, None]
+    data = dataclasses.replace(
+        data, windows=far, group=group, collection=group % 2, collection_names=("a", "b")
+    )
+    curve = adaptation_curve(data, BANDS._replace(copies=0), ignore_progress)
+    assert curve.corrected == CORRECTED
+    assert set(curve.collections) == {"a", "b"}
+    assert curve.mean[-1] > curve.mean[0]
+
+
+def test_no_collection_is_like_a_home_if_all_are_small():
+    data, _ = blobs(3, 30)
+    with pytest.raises(DataError, match="none can stand for a new home"):
+        adaptation_curve(data, BANDS, ignore_progress)
+
+
+def test_the_temperature_makes_probabilities_as_sure_as_they_are_right():
+    rng = np.random.default_rng(0)
+    truth = softmax(rng.normal(0.0, 2.0, (20_000, 3)))
+    target = (truth.cumsum(axis=1) < rng.random((len(truth), 1))).sum(axis=1)
+    decisions = np.log(truth) / 3.0
+    assert inverse_temperature(decisions, target) == pytest.approx(3.0, rel=0.05)
+
+
+def test_segments_that_are_all_alike_are_refused():
+    data, scenario = blobs(3, 30)
+    flat = dataclasses.replace(data, windows=np.ones_like(data.windows))
+    with pytest.raises(DataError, match="all segments are alike"):
+        train_model(flat, scenario, ignore_progress)
+
+
+def test_an_enrolled_sound_is_learned_from(hearthlog, model_file, tmp_path):
+    rng = np.random.default_rng(3)
+    soundfile.write(tmp_path / "kettle.wav", 0.1 * rng.standard_normal(3 * RATE), RATE)
+    home = tmp_path / "home"
+    enrolled = hearthlog("enrol", "coughing", "--home", home, "--file", tmp_path / "kettle.wav")
+    assert enrolled.returncode == 0, enrolled.stderr
+    (found,) = home_recordings(home)
+    assert isinstance(found, Recording)
+    assert (found.label, len(found.features)) == ("coughing", 60)
+    output = tmp_path / "home.safetensors"
+    done = hearthlog("train", "--base", model_file, "--home", home, "-o", output)
+    assert done.returncode == 0, done.stderr
+    assert "learned from the home besides" in done.stdout
