@@ -87,7 +87,7 @@ def evaluate(
         assert data is not None
         _evaluate_model(model, data, scenario, plot, as_json=as_json)
     else:
-        wrong_use("give a log and --reference, or --model and --data, or --folds and --data")
+        wrong_use("give either a log and --reference, or --model and --data, or --folds and --data")
 
 
 def _evaluate_model(
