@@ -165,8 +165,8 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
     """Cut recordings into segments of a second, half a second apart.
 
     A segment is kept if it is no more than 12 dB below its recording's mean level and above
-    -60 dBFS; of silence all are. At most 24 segments, evenly spaced, are kept for each class and
-    source group.
+    -60 dBFS; of silence all are. At most 24 segments, times their weight, evenly spaced, are kept
+    for each class and source group.
     """
     classes = tuple(scenario.classes)
     class_of = {name: name for name in classes} | scenario.class_of
@@ -192,13 +192,14 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
         collection = collections.setdefault(item.collection, len(collections))
         rows.append(np.tile([classes.index(name), group, collection], (len(found), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
-    kept = _thinned(target * len(groups) + group_of)
+    weight = np.concatenate(weights)
+    kept = _thinned(target * len(groups) + group_of, weight)
     return Dataset(
         np.concatenate(windows)[kept],
         target[kept],
         group_of[kept],
         collection_of[kept],
-        np.concatenate(weights)[kept],
+        weight[kept],
         classes,
         seconds,
         tuple(collections),
@@ -244,11 +245,14 @@ def _segments(recording: Recording, class_of: Mapping[str, str]) -> tuple[str, F
     return ("" if len(found) else "nowhere above -60 dBFS"), found
 
 
-def _thinned(key: Indices) -> Indices:
-    """Choose at most 24 evenly spaced rows of each key; return their indices in order."""
+def _thinned(key: Indices, weight: NDArray[np.float64]) -> Indices:
+    """Choose evenly spaced rows of each key; return their indices in order.
+
+    At most 24 are chosen, and more of what weighs more.
+    """
     kept = [np.empty(0, np.intp)]
     for value in np.unique(key):
         rows = np.flatnonzero(key == value)
-        count = min(len(rows), SEGMENTS_PER_GROUP)
+        count = min(len(rows), int(SEGMENTS_PER_GROUP * weight[rows[0]]))
         kept.append(rows[np.linspace(0, len(rows) - 1, count).round().astype(np.intp)])
     return np.sort(np.concatenate(kept))

@@ -28,7 +28,9 @@ def measure(work: Workload) -> Table:
     theirs = calibrated.predict_proba
     rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
+    machine[-1].decision_function_shape = "ovo"
     decision = decide(machine, rows, len(work.model.classes))
+    machine[-1].decision_function_shape = "ovr"
     expected = softmax(work.model.description.inverse_temperature * decision)
     difference = np.abs(ours(rows) - expected).max()
     found = []
@@ -53,6 +55,7 @@ def _scikit_learn(work: Workload) -> tuple[Pipeline, CalibratedClassifierCV]:
     recipe = RECIPES["bands"]
     examples = prepare(recipe, data)
     machine = fit(recipe, examples)
+    machine[-1].decision_function_shape = "ovr"  # the default, which its calibration needs
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
     )
