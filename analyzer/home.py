@@ -1,6 +1,6 @@
 """A home's own sound to learn from: what was marked in its logs, and what was enrolled."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from analyzer.dataset import Recording
 from analyzer.review import Mark, read_marks
 from models.inputs import WINDOW_FRAMES
+from recorder.stream import FRAME_NANOSECONDS
 from schemas.columns import Columns, read_columns
 from schemas.files import find_logs
 from schemas.messages import NANOSECONDS
@@ -46,6 +47,45 @@ def home_recordings(folder: Path) -> Iterator[Recording]:
             heard = columns.get(topic(mark.microphone, "features"))
             if heard is not None and len(heard):
                 yield from _recordings(heard, mark)
+
+
+def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
+    """Read what follows what in a home, where its marks leave no time between them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of logs, with review layers beside them.
+    classes : sequence of str
+
+    Returns
+    -------
+    list of np.ndarray [shape=(n,)], int64
+        Classes of successive frames; a mark on its own tells nothing and is left out.
+    """
+    numbers = {name: number for number, name in enumerate(classes)}
+    found: list[Int64] = []
+    for log in find_logs(folder):
+        runs: list[list[Mark]] = []
+        for mark in sorted(read_marks(log)):
+            last = runs[-1][-1] if runs else None
+            follows = (
+                last is not None
+                and mark.microphone == last.microphone
+                and mark.start - last.end < FRAME_NANOSECONDS
+                and mark.label in numbers
+            )
+            if follows and last is not None and last.label in numbers:
+                runs[-1].append(mark)
+            else:
+                runs.append([mark])
+        found += [_frames_of(run, numbers) for run in runs if len(run) > 1]
+    return found
+
+
+def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
+    frames = [max((mark.end - mark.start) // FRAME_NANOSECONDS, 1) for mark in run]
+    return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
 def _recordings(heard: Columns, mark: Mark) -> Iterator[Recording]:

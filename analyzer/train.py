@@ -1,5 +1,6 @@
 """Learn a model from segments, and measure it on sources that it has not heard."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 
@@ -12,7 +13,12 @@ from sklearn.pipeline import Pipeline
 from analyzer.dataset import Dataset, Progress
 from analyzer.errors import DataError
 from analyzer.evaluation.scores import calibration_error
-from analyzer.hmm import LAG_SECONDS, default_transitions
+from analyzer.hmm import (
+    LAG_SECONDS,
+    default_transitions,
+    expected_durations,
+    transitions_from_sequences,
+)
 from analyzer.recipe import (
     RECIPES,
     Fold,
@@ -113,7 +119,7 @@ def train_model(
     )
 
 
-def adapt_model(base: Model, home: Dataset) -> Model:
+def adapt_model(base: Model, home: Dataset, sequences: Sequence[NDArray[np.int64]] = ()) -> Model:
     """Learn once more what a model has learned, and a home's own segments with it.
 
     Parameters
@@ -122,6 +128,9 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         With its training windows.
     home : Dataset
         Of the same classes; it need not have segments of all of them.
+    sequences : sequence of np.ndarray [shape=(n,)], int64
+        Classes of successive frames in the home, from which the transitions of its sounds are
+        learned.
 
     Returns
     -------
@@ -138,7 +147,10 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     if not len(base.training_windows):
         raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
     if not len(home):
-        raise DataError("the home has no segments of a class of the model to learn from")
+        reasons = "; ".join(f"{count} recordings: {why}" for why, count in home.skipped.items())
+        raise DataError(
+            f"the home has no segments of a class of the model ({reasons or 'nothing is marked'})"
+        )
     joined = replace(
         home,
         windows=np.concatenate([base.training_windows, home.windows]),
@@ -155,7 +167,11 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         _model(about.model_copy(update={"training_data": training}), machine),
         home_vectors=examples.inputs[0, len(base.training_windows) :],
         home_target=home.target.astype(np.int64),
-        transitions=base.transitions,
+        transitions=(
+            transitions_from_sequences(sequences, expected_durations(base.classes))
+            if len(base.transitions) and len(sequences)
+            else base.transitions
+        ),
         training_windows=base.training_windows,
         training_target=base.training_target,
         training_group=base.training_group,

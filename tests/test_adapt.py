@@ -13,7 +13,7 @@ from analyzer.augment import augmented
 from analyzer.dataset import Recording, cut_recordings
 from analyzer.errors import DataError
 from analyzer.evaluation.folds import KINDS, evaluate_recipe
-from analyzer.home import home_recordings
+from analyzer.home import home_recordings, home_sequences
 from analyzer.recipe import (
     RECIPES,
     decide_with_home,
@@ -112,7 +112,7 @@ def test_a_model_without_what_it_learned_from_is_refused(world):
 
 def test_a_home_without_segments_is_refused(world):
     base, few, _ = world
-    with pytest.raises(DataError, match="no segments of a class of the model"):
+    with pytest.raises(DataError, match="nothing is marked"):
         adapt_model(base, rows(few, few.target < 0))
 
 
@@ -152,6 +152,32 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     assert found[0].group == found[1].group
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
     assert data.weight.min() == 5.0
+
+
+def test_marks_without_time_between_them_say_what_follows_what(recorded):
+    log = find_logs(recorded)[0]
+    stamps = read_columns([log], ["/mic/features"])["/mic/features"]["header.stamp"]
+    marks = [
+        Mark("mic", int(stamps[100]), int(stamps[140]), "speech"),
+        Mark("mic", int(stamps[140]), int(stamps[150]), "coughing"),
+        Mark("mic", int(stamps[300]), int(stamps[400]), "speech"),
+    ]
+    layer = write_marks(log, marks)
+    try:
+        (found,) = home_sequences(recorded, ["coughing", "speech"])
+    finally:
+        layer.unlink()
+    assert found.tolist() == [1] * 40 + [0] * 10
+
+
+def test_a_home_teaches_how_long_its_sounds_go_on(world):
+    base, few, _ = world
+    sequence = np.repeat([0, 1, 0], [1000, 10, 1000])
+    learned, kept = adapt_model(base, few, [sequence]), adapt_model(base, few)
+    assert learned.transitions[0, 0] > kept.transitions[0, 0]
+    assert learned.transitions[1, 0] > kept.transitions[1, 0]
+    np.testing.assert_array_equal(learned.transitions[2], kept.transitions[2])
+    np.testing.assert_array_equal(kept.transitions, base.transitions)
 
 
 def test_a_second_across_a_gap_is_not_learned_from(recorded):

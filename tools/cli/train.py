@@ -91,13 +91,15 @@ def _learned(
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from analyzer.dataset import cut_recordings
+    from analyzer.home import home_sequences
     from analyzer.train import adapt_model
     from models.modelfile import load_model
 
     model = load_model(base)
     segments = cut_recordings(_heard_at(home), _scenario(model))
     with progress(f"learning from {len(segments)} segments of the home besides"):
-        return adapt_model(model, segments), segments
+        sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
+        return adapt_model(model, segments, sequences), segments
 
 
 def _scenario(model: "Model") -> "Scenario":
