@@ -1,7 +1,5 @@
 """Marks in files of others: label tracks of Audacity, and CSV."""
 
-import csv
-import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
@@ -13,6 +11,7 @@ from typing import NamedTuple
 from analyzer.errors import DataError
 from analyzer.heard import Heard
 from analyzer.review import Mark
+from analyzer.textfile import csv_records, read_text
 from models.modelfile import CLASS_NAME
 from schemas.files import new_file
 from schemas.messages import NANOSECONDS
@@ -94,7 +93,7 @@ def read_lines(
     list of (int, Mark)
         With the lines they are in.
     """
-    text = _read_text(path)
+    text = read_text(path, "label file", _SIZE_LIMIT)
     lines = list(_csv_lines(path, text) if path.suffix == ".csv" else _track_lines(path, text))
     if not lines:
         raise DataError(f"{path}: holds no labels")
@@ -140,23 +139,6 @@ def _seconds(nanoseconds: int) -> str:
     return f"{nanoseconds // NANOSECONDS}.{nanoseconds % NANOSECONDS:09}"
 
 
-def _read_text(path: Path) -> str:
-    try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such label file")
-        with path.open("rb") as stream:
-            raw = stream.read(_SIZE_LIMIT + 1)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(raw) > _SIZE_LIMIT:
-        raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no label file")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        raise DataError(f"{path}:{line}: is not UTF-8; save the labels as UTF-8") from error
-
-
 def _track_lines(path: Path, text: str) -> Iterator[_Line]:
     for number, line in enumerate(text.split("\n"), 1):
         if not line.strip() or line.startswith("\\"):  # the pitch of a spectral selection
@@ -170,7 +152,7 @@ def _track_lines(path: Path, text: str) -> Iterator[_Line]:
 
 def _csv_lines(path: Path, text: str) -> Iterator[_Line]:
     columns: list[str] = []
-    for number, record in _records(path, text):
+    for number, record in csv_records(path, text):
         values = [value.strip() for value in record]
         if not columns:
             columns = _checked_header(path, number, values)
@@ -191,21 +173,6 @@ def _checked_header(path: Path, number: int, names: list[str]) -> list[str]:
             "start,end,label,microphone"
         )
     return names
-
-
-def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the records that are not blank, each with the line it starts in."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    while True:
-        line = reader.line_num + 1
-        try:
-            record = next(reader)
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise DataError(f"{path}:{line}: is not CSV ({error})") from error
-        if any(field.strip() for field in record):
-            yield line, record
 
 
 def _found(

@@ -1,12 +1,11 @@
 """The manifest of labelled clips: a CSV file beside the audio."""
 
-import csv
-import io
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from analyzer.errors import DataError
+from analyzer.textfile import csv_records, read_text
 from models.modelfile import TEXT
 
 REQUIRED = ("path", "label", "source_group")
@@ -52,7 +51,7 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
         With file and line, if a column, a value or an audio file is missing, a label is unknown,
         a clip is listed twice, or the file is no CSV in UTF-8.
     """
-    lines = _records(path, _read_text(path))
+    lines = csv_records(path, read_text(path, "manifest", _SIZE_LIMIT))
     first = next(lines, None)
     if first is None:
         raise DataError(f"{path}: is empty; it needs a first line that names the columns")
@@ -73,37 +72,6 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
     if not clips:
         raise DataError(f"{path}: lists no clips")
     return clips
-
-
-def _read_text(path: Path) -> str:
-    try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such manifest")
-        if path.stat().st_size > _SIZE_LIMIT:
-            raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no manifest")
-        raw = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        raise DataError(f"{path}:{line}: is not UTF-8; save the manifest as UTF-8") from error
-
-
-def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the records that are not blank, each with the line it starts in."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    while True:
-        line = reader.line_num + 1
-        try:
-            record = next(reader)
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise DataError(f"{path}:{line}: is not CSV ({error})") from error
-        if any(field.strip() for field in record):
-            yield line, record
 
 
 def _clip(

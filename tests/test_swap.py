@@ -300,7 +300,8 @@ def test_a_recorder_whose_terminal_is_closed_completes_its_log(folder, tmp_path)
     soundfile.write(tmp_path / "noise.wav", np.zeros(16_000 * 60), 16_000)
     logs = tmp_path / "logs"
     master, terminal = os.openpty()
-    command = ["setsid", "--ctty", *HEARTHLOG, "record", str(tmp_path / "noise.wav"), "--realtime"]
+    command = ["env", "--default-signal=HUP"]  # for tests that run under nohup
+    command += ["setsid", "--ctty", *HEARTHLOG, "record", str(tmp_path / "noise.wav"), "--realtime"]
     command += ["-o", str(logs), "--model", str(folder / "champion.safetensors")]
     process = subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal)
     os.close(terminal)

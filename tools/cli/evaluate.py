@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.cli.progress import share_done
+from tools.cli.progress import steps_done
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
@@ -103,10 +103,8 @@ def _evaluate_model(
     chosen = scenario_of(model) if scenario is None else load_scenario(scenario)
     check_classes(model, chosen)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
-    with share_done(f"listening to {len(clips)} clips") as share:
-        found = evaluate_model(
-            model, clips, chosen, lambda done, total: share(done / max(total, 1))
-        )
+    with steps_done(f"listening to {len(clips)} clips") as report:
+        found = evaluate_model(model, clips, chosen, report)
     if plot is not None:
         _save_plot(plot, f"{model.name} on {data} ({chosen.name})", found.scores, found.reliability)
     if as_json:
@@ -153,10 +151,8 @@ def _evaluate_recipe(
     if not kinds:
         wrong_use(f"--folds {folds}: choose one of {', '.join(KINDS)}")
     segments = _segments(data, scenario)
-    with share_done(f"learning from {len(segments)} segments") as share:
-        found = evaluate_recipe(
-            segments, recipe, kinds[0], lambda done, total: share(done / max(total, 1))
-        )
+    with steps_done(f"learning from {len(segments)} segments") as report:
+        found = evaluate_recipe(segments, recipe, kinds[0], report)
     if plot is not None:
         _save_plot(
             plot, f"{method} on {data} ({scenario}), by {folds}", found.scores, found.reliability
@@ -191,8 +187,8 @@ def _evaluate_adaptation(
         wrong_use("--plot does not go with --adaptation")
     recipe = _recipe(method)
     segments = _segments(data, scenario)
-    with share_done(f"learning from {len(segments)} segments") as share:
-        found = adaptation_curve(segments, recipe, lambda done, total: share(done / max(total, 1)))
+    with steps_done(f"learning from {len(segments)} segments") as report:
+        found = adaptation_curve(segments, recipe, report)
     if as_json:
         _print_json({"scenario": scenario, "method": method} | found._asdict())
         return
@@ -218,8 +214,8 @@ def _segments(data: Path, scenario: str) -> "Dataset":
 
     chosen = load_scenario(scenario)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
-    with share_done(f"listening to {len(clips)} clips") as share:
-        return build_dataset(clips, chosen, lambda done, total: share(done / max(total, 1)))
+    with steps_done(f"listening to {len(clips)} clips") as report:
+        return build_dataset(clips, chosen, report)
 
 
 def _evaluate_log(

@@ -30,3 +30,12 @@ def share_done(what: str) -> Iterator[Callable[[float], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+@contextmanager
+def steps_done(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show how many of how many steps the block reports; without a terminal, say what begins."""
+    if not sys.stderr.isatty():
+        print(f"hearthlog: {what}", file=sys.stderr)
+    with share_done(what) as share:
+        yield lambda done, total: share(done / max(total, 1))

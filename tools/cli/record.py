@@ -102,15 +102,15 @@ def record(
 def _look_at_hangup(stop: Flag) -> SimpleQueue[None]:
     """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
     asked: SimpleQueue[None] = SimpleQueue()
-    at_terminal = sys.stderr.isatty()
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it
+    at_terminal = sys.stderr.isatty() and not ignored
 
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
         asked.put(None)
 
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup wants it
-        signal.signal(signal.SIGHUP, handle)
+    signal.signal(signal.SIGHUP, handle)
     return asked
 
 

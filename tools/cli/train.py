@@ -1,13 +1,13 @@
 """`hearthlog train`: labelled sound to a model file."""
 
 import json
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from tools.cli.progress import steps_done
 
 if TYPE_CHECKING:
     from analyzer.dataset import Dataset, Recording
@@ -82,10 +82,10 @@ def _learned(
         raise typer.BadParameter(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
-    with progress(f"listening to {len(clips)} clips") as report:
+    with steps_done(f"listening to {len(clips)} clips") as report:
         segments = build_dataset(clips, chosen, report, _heard_at(home))
     _warn_of_few(segments)
-    with progress(f"learning from {len(segments)} segments") as report:
+    with steps_done(f"learning from {len(segments)} segments") as report:
         return train_model(segments, chosen, report, RECIPES[method], smoothing), segments
 
 
@@ -97,7 +97,7 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
 
     model = load_model(base)
     segments = cut_recordings(_heard_at(home), _scenario(model))
-    with progress(f"learning from {len(segments)} segments of the home besides"):
+    with steps_done(f"learning from {len(segments)} segments of the home besides"):
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         return adapt_model(model, segments, sequences), segments
 
@@ -129,21 +129,6 @@ def _warn_of_few(segments: "Dataset") -> None:
                 f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s",
                 err=True,
             )
-
-
-@contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on stderr if that is a terminal, else one line."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    if not sys.stderr.isatty():
-        typer.echo(f"hearthlog: {what}", err=True)
-        yield lambda _done, _total: None
-        return
-    with Progress(console=Console(stderr=True)) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
