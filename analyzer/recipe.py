@@ -46,7 +46,7 @@ class Recipe(NamedTuple):
     copies: int
 
 
-RECIPES = {"bands": Recipe("bands", 4.0, 1.25, 2), "paper": Recipe("statistics", 4.0, 0.5, 0)}
+RECIPES = {"bands": Recipe("bands", 4.0, 1.25, 1), "paper": Recipe("statistics", 4.0, 0.5, 0)}
 
 
 class Examples(NamedTuple):
