@@ -238,6 +238,16 @@ def test_an_output_that_exists_is_refused_before_anything_is_read(tmp_path):
     assert "exists already" in str(result.exception)
 
 
+@pytest.mark.parametrize(
+    "words", [(), ("--data", "x"), ("--base", "x"), ("--base", "x", "--home", "y", "--data", "z")]
+)
+def test_wrong_use_of_the_command_is_one_line(tmp_path, words):
+    result = run(*words, "--output", tmp_path / "a.safetensors")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("hearthlog: ")
+    assert result.stderr.count("\n") == 1
+
+
 def test_household_sounds_are_told_apart_across_sources(household):
     per_group: dict[tuple[str, str], int] = {}
     labels = ("silence", "coughing", "crying", "yelling", "objects_activity")

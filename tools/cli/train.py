@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tools.cli.progress import steps_done
+from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
     from analyzer.dataset import Dataset, Recording
@@ -50,11 +51,11 @@ def train(
     check_output(output)
     if base is not None:
         if data or scenario or not home:
-            raise typer.BadParameter("--base goes with --home, and without --data and --scenario")
+            wrong_use("--base goes with --home, and without --data and --scenario")
         model, segments = _adapted(base, home)
     else:
         if not data or not scenario:
-            raise typer.BadParameter("give --data and --scenario, or --base and --home")
+            wrong_use("give --data and --scenario, or --base and --home")
         model, segments = _learned(data, scenario, home or [], method, smoothing)
     save_model(model, output)
     saved = load_model(output)
@@ -77,9 +78,9 @@ def _learned(
     from analyzer.train import SMOOTHINGS, train_model
 
     if method not in RECIPES:
-        raise typer.BadParameter(f"--method {method}: choose one of {', '.join(RECIPES)}")
+        wrong_use(f"--method {method}: choose one of {', '.join(RECIPES)}")
     if smoothing not in SMOOTHINGS:
-        raise typer.BadParameter(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
+        wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
     with steps_done(f"listening to {len(clips)} clips") as report:
