@@ -1,6 +1,5 @@
 """Marks: what a reviewer says that was heard, in a layer beside the log it speaks about."""
 
-import os
 import re
 import tempfile
 from bisect import bisect_left, bisect_right
@@ -19,7 +18,7 @@ from models.modelfile import CLASS_NAME
 from schemas import messages
 from schemas.columns import Columns
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, sync_folder
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, replaced_file
 from schemas.topics import Topic, check_microphone_name, topic
 from schemas.writer import LogWriter, Rows
 
@@ -102,17 +101,8 @@ def write_marks(log: Path, marks: Iterable[Mark]) -> Path:
         "log": log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX) + SUFFIX,
     }
     path = review_path(log)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with replaced_file(path) as temporary:
         temporary.write_bytes(_layer(path.name, _checked([*_left(old, new), *new]), about))
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

@@ -68,9 +68,10 @@ class Classifier:
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
             extended = self._extended(inputs[rows])
-            decision = weakest_pairs(self._pairs(extended), len(self.classes))
+            pairs, others = self._pairs(extended)
+            decision = weakest_pairs(pairs, len(self.classes))
             if self._home_blocks:
-                decision += self._home(extended)
+                decision += home_votes(self._home(extended), others)
             decision *= self._inverse_temperature
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
@@ -83,26 +84,35 @@ class Classifier:
         square = np.vecdot(scaled, scaled)[:, np.newaxis]
         return np.concatenate([scaled, square, np.ones_like(square)], axis=1)
 
-    def _pairs(self, extended: Float64) -> Float64:
-        """Decision of every pair of classes, shape (n, C (C - 1) / 2)."""
+    def _pairs(self, extended: Float64) -> tuple[Float64, Float64]:
+        """Decide for every pair of classes, and sum the sharp kernels of the support vectors.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, C (C - 1) / 2)]
+        np.ndarray [shape=(n, 1)]
+            Zeros, where no home has vectors to be compared with.
+        """
         classes = len(self.classes)
         against = np.zeros((classes, len(extended), classes - 1))
+        others = np.zeros((len(extended), 1))
         for index, weights, coefficients in self._blocks:
-            against[index] += rowwise_matmul(_kernel(extended, weights), coefficients)
+            distance = _distance(extended, weights)
+            if self._home_blocks:
+                sharp = np.exp(HOME_SHARPNESS * distance)
+                others += rowwise_matmul(sharp, np.ones((len(coefficients), 1)))
+            kernel = np.exp(distance, out=distance)
+            against[index] += rowwise_matmul(kernel, coefficients)
         first, second = self._first, self._second
         decision = against[first, :, second - 1] + against[second, :, first]
-        return decision.T + self._intercepts
+        return decision.T + self._intercepts, others
 
     def _home(self, extended: Float64) -> Float64:
-        """Return what the home's own vectors add to the classes, shape (n, C)."""
+        """Sum the sharp kernels of the home's vectors by class, shape (n, C)."""
         home = np.zeros((len(extended), len(self.classes)))
         for weights, one_hot in self._home_blocks:
-            home += rowwise_matmul(_kernel(extended, HOME_SHARPNESS * weights), one_hot)
-        others = np.zeros((len(extended), 1))
-        for _, weights, coefficients in self._blocks:
-            kernel = _kernel(extended, HOME_SHARPNESS * weights)
-            others += rowwise_matmul(kernel, np.ones((len(coefficients), 1)))
-        return home_votes(home, others)
+            home += rowwise_matmul(np.exp(HOME_SHARPNESS * _distance(extended, weights)), one_hot)
+        return home
 
 
 def weakest_pairs(pairs: Float64, classes: int) -> Float64:
@@ -146,10 +156,10 @@ def home_votes(home: Float64, others: Float64) -> Float64:
     return HOME_VOTE * home / (home.sum(axis=1, keepdims=True) + others + _TINY)
 
 
-def _kernel(extended: Float64, weights: Float64) -> Float64:
-    kernel = rowwise_matmul(extended, weights)
-    np.minimum(kernel, 0.0, out=kernel)  # a distance rounded to less than none
-    return np.exp(kernel, out=kernel)
+def _distance(extended: Float64, weights: Float64) -> Float64:
+    """Return -gamma |x - s|^2, which rounding must not make positive."""
+    distance = rowwise_matmul(extended, weights)
+    return np.minimum(distance, 0.0, out=distance)
 
 
 def _blocks(model: Model) -> list[tuple[int, Float64, Float64]]:

@@ -82,12 +82,32 @@ def new_file(path: Path) -> Iterator[Path]:
         If there is such a file already, or if it cannot be written.
     """
     check_new(path)
+    with _put_in_place(path, new=True) as temporary:
+        yield temporary
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
+
+    Raises
+    ------
+    LogError
+        If it cannot be written.
+    """
+    with _put_in_place(path, new=False) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield temporary
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
-        path.open("xb").close()  # the name is ours now: unlike a rename, never over another file
+        if new:  # from here on the name is ours: unlike a rename, never over another file
+            path.open("xb").close()
         temporary.replace(path)
         sync_folder(path.parent)
     except OSError as error:

@@ -65,7 +65,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
 def judged(classifier, rows):
     """Probabilities, and before their rounding to float32 the decisions behind them."""
     return np.concatenate(
-        [classifier.probabilities(rows), classifier._pairs(classifier._extended(rows))], axis=1
+        [classifier.probabilities(rows), classifier._pairs(classifier._extended(rows))[0]], axis=1
     )
 
 
