@@ -25,7 +25,7 @@ from analyzer.recipe import (
 from analyzer.review import Mark, write_marks
 from analyzer.scenario import Scenario
 from analyzer.train import adapt_model, train_model
-from models.classifier import Classifier
+from models.classifier import HOME_VOTE, Classifier, home_votes
 from models.inputs import bands_of, window_inputs
 from models.modelfile import load_model, save_model
 from recorder.features import FeatureExtractor
@@ -133,6 +133,15 @@ def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
 
 
+def test_what_is_near_to_the_home_is_drawn_to_its_class_and_nothing_else():
+    home, others = np.array([[0.5, 0.0], [0.0, 0.0], [1e-9, 0.0]]), np.array([[0.0], [1.0], [1.0]])
+    votes = home_votes(home, others)
+    assert votes[0].tolist() == [HOME_VOTE, 0.0]
+    assert votes[1].tolist() == [0.0, 0.0]
+    assert 0.0 < votes[2, 0] < 1e-6
+    assert HOME_VOTE > 1.0  # more than the decision of a pair at its margin
+
+
 def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorded):
     log = find_logs(recorded)[0]
     heard = read_columns([log], ["/mic/features"])["/mic/features"]
@@ -229,6 +238,10 @@ def test_augmented_sound_is_what_the_other_microphone_would_give():
     untouched = (changed == windows).all(axis=(1, 2)).mean()
     assert 0.0 < untouched < 0.2
     np.testing.assert_array_equal(changed[:, :, 1:8], windows[:, :, 1:8])
+    gain = 10 * np.log10(changed[:, 0, 0] / windows[:, 0, 0])
+    level = (changed[:, :, 8] - windows[:, :, 8]).mean(axis=1)
+    assert gain.std() > 3.0
+    assert np.corrcoef(gain, level)[0, 1] > 0.5
     # Energy and bands move together: 6 dB are 6 dB.
     energy = 10 * np.log10(loud[:, 0] / quiet[:, 0])
     bands = (bands_of(loud[:, 8:]) - bands_of(quiet[:, 8:])).mean(axis=1)

@@ -1,9 +1,11 @@
 """Topics read as columns are what is read message by message, whatever the file looks like."""
 
 import json
+import struct
 import subprocess
 import sys
 import threading
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -20,6 +22,7 @@ from recorder.service import record_files
 from recorder.sources.replayed import FileSource
 from schemas import messages
 from schemas.chunks import read_chunks
+from schemas.chunkwriter import ChunkWriter, StoredChunk
 from schemas.columns import iterate_columns, read_columns
 from schemas.errors import LogError
 from schemas.files import active_path
@@ -414,3 +417,36 @@ def test_reading_that_is_given_up_leaves_no_file_open_and_no_thread(log):
     for _ in iterate_columns([log]):
         break
     assert held() == before
+
+
+def test_chunks_that_overlap_in_time_are_one_series(tmp_path):
+    topic = Topic("/a", "std_msgs/msg/Header")
+    logs = []
+    for part in range(2):
+        writer = LogWriter(tmp_path / f"{part}.mcap", [topic], {})
+        for first in range(0, 100_000, 20_000):
+            times = np.arange(first + part, first + 30_000, 2 + part)
+            text = {"stamp": times, "frame_id": "x" * 300}
+            writer.write_columns([Rows("/a", times, text)])
+            writer.flush()
+        logs.append(writer.finish())
+    expected = sorted(m.log_time for log in logs for m in LogReader(log).messages())
+    found = [c.log_times for batch in iterate_columns(logs) for c in batch]
+    assert len(found) > 5
+    assert np.concatenate(found).tolist() == expected
+
+
+def test_an_index_that_leads_to_one_message_again_and_again_is_refused(tmp_path):
+    path = tmp_path / "1.mcap"
+    with path.open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/Header", "ros2msg", b"string frame_id")
+        writer.register_channel("/a", "cdr", schema, {})
+        record = struct.pack("<BQHIQQ", 5, 22 + 1000, 1, 0, 7, 7) + bytes(1000)
+        entries = {1: struct.pack("<QQ", 7, 0) * 2}
+        crc = zlib.crc32(record)
+        writer.copy_chunk(StoredChunk(b"", record, len(record), crc, 7, 7, entries))
+        writer.finish()
+    with pytest.raises(LogError, match="the index of a chunk does not belong to it"):
+        read_columns([path])
