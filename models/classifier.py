@@ -52,7 +52,11 @@ class Classifier:
         self._first, self._second = np.triu_indices(count, 1)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute the probability of each class.
+        """Compute the probability of each class; the first of what `classify` returns."""
+        return self.classify(inputs)[0]
+
+    def classify(self, inputs: Float32) -> tuple[Float32, Float32]:
+        """Compute the probability of each class, and how unlike anything learned a window is.
 
         Parameters
         ----------
@@ -61,14 +65,19 @@ class Classifier:
 
         Returns
         -------
-        np.ndarray [shape=(n, C)], float32
+        probabilities : np.ndarray [shape=(n, C)], float32
             In the order of the model's classes; every row sums to 1.
+        novelty : np.ndarray [shape=(n,)], float32
+            One minus the kernel of the nearest support vector: 0 where it is the same, towards 1
+            where nothing is near.
         """
         result = np.empty((len(inputs), len(self.classes)), np.float32)
+        novelty = np.empty(len(inputs), np.float32)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
             extended = self._extended(inputs[rows])
-            pairs, others = self._pairs(extended)
+            pairs, others, nearest = self._pairs(extended)
+            novelty[rows] = -np.expm1(nearest)
             decision = weakest_pairs(pairs, len(self.classes))
             if self._home_blocks:
                 decision += home_votes(self._home(extended), others)
@@ -76,7 +85,7 @@ class Classifier:
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)
-        return result
+        return result, novelty
 
     def _extended(self, inputs: Float32) -> Float64:
         """Scaled inputs x as (x, |x|^2, 1), shape (n, width + 2)."""
@@ -84,20 +93,24 @@ class Classifier:
         square = np.vecdot(scaled, scaled)[:, np.newaxis]
         return np.concatenate([scaled, square, np.ones_like(square)], axis=1)
 
-    def _pairs(self, extended: Float64) -> tuple[Float64, Float64]:
-        """Decide for every pair of classes, and sum the sharp kernels of the support vectors.
+    def _pairs(self, extended: Float64) -> tuple[Float64, Float64, Float64]:
+        """Decide for every pair of classes, by the kernels of the support vectors.
 
         Returns
         -------
-        np.ndarray [shape=(n, C (C - 1) / 2)]
-        np.ndarray [shape=(n, 1)]
-            Zeros, where no home has vectors to be compared with.
+        decisions : np.ndarray [shape=(n, C (C - 1) / 2)]
+        others : np.ndarray [shape=(n, 1)]
+            Sums of the sharp kernels; zeros, where no home has vectors to be compared with.
+        nearest : np.ndarray [shape=(n,)]
+            Logarithm of the largest kernel.
         """
         classes = len(self.classes)
+        nearest = np.full(len(extended), -np.inf)
         against = np.zeros((classes, len(extended), classes - 1))
         others = np.zeros((len(extended), 1))
         for index, weights, coefficients in self._blocks:
             distance = _distance(extended, weights)
+            np.maximum(nearest, distance.max(axis=1), out=nearest)
             if self._home_blocks:
                 sharp = np.exp(HOME_SHARPNESS * distance)
                 others += rowwise_matmul(sharp, np.ones((len(coefficients), 1)))
@@ -105,7 +118,7 @@ class Classifier:
             against[index] += rowwise_matmul(kernel, coefficients)
         first, second = self._first, self._second
         decision = against[first, :, second - 1] + against[second, :, first]
-        return decision.T + self._intercepts, others
+        return decision.T + self._intercepts, others, nearest
 
     def _home(self, extended: Float64) -> Float64:
         """Sum the sharp kernels of the home's vectors by class, shape (n, C)."""

@@ -6,6 +6,7 @@ smooth mel bands they stand for, and besides mean and deviation how much a value
 to frame.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -56,11 +57,10 @@ class InputStream:
         count = max(len(features) - WINDOW_FRAMES + 1, 0)
         inputs = np.empty((count, input_width(self._kind)), np.float32)
         for start in range(0, count, _FRAMES_AT_ONCE):
-            part = values[start : start + _FRAMES_AT_ONCE + WINDOW_FRAMES - 1]
-            windows = np.lib.stride_tricks.sliding_window_view(part, WINDOW_FRAMES, axis=0)
-            inputs[start : start + _FRAMES_AT_ONCE] = _reduced(
-                self._kind, windows.transpose(0, 2, 1)
-            )
+            end = min(start + _FRAMES_AT_ONCE, count)
+            part = values[start : end + WINDOW_FRAMES - 1]
+            changes = successive(np.abs(np.diff(part, axis=0)), WINDOW_FRAMES - 1)
+            _reduce(self._kind, successive(part, WINDOW_FRAMES), changes, inputs[start:end])
         return inputs
 
 
@@ -81,8 +81,9 @@ def window_inputs(kind: Kind, windows: Float32) -> Float32:
     for start in range(0, len(windows), _FRAMES_AT_ONCE):
         part = windows[start : start + _FRAMES_AT_ONCE]
         values = frame_values(kind, part.reshape(-1, part.shape[-1]))
-        reduced = _reduced(kind, values.reshape(len(part), WINDOW_FRAMES, -1))
-        inputs[start : start + _FRAMES_AT_ONCE] = reduced
+        frames = values.reshape(len(part), WINDOW_FRAMES, -1).swapaxes(0, 1)
+        changes = np.abs(np.diff(frames, axis=0))
+        _reduce(kind, [*frames], [*changes], inputs[start : start + _FRAMES_AT_ONCE])
     return inputs
 
 
@@ -127,18 +128,50 @@ def dct_weights() -> Float64:
     return weights
 
 
-def mean_and_std(windows: Float32 | Float64) -> tuple[Float64, Float64]:
-    """Reduce windows of shape (n, frames, d) along their frames, in float64."""
-    frames = windows.shape[1]
-    mean = windows.sum(axis=1, dtype=np.float64) / frames
-    deviation = windows - mean[:, np.newaxis]
-    np.square(deviation, out=deviation)
-    return mean, np.sqrt(deviation.sum(axis=1) / frames)
+def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
+    """Return the first rows of all windows of so many successive rows, the second ones, and so on.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, d)]
+    length : int
+    """
+    count = len(values) - length + 1
+    return [values[place : place + count] for place in range(length)]
 
 
-def _reduced(kind: Kind, windows: Float32 | Float64) -> Float64:
-    """Statistics of windows of shape (n, 20, d)."""
-    parts = [*mean_and_std(windows)]
+def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
+    """Reduce windows to mean and standard deviation, in float64.
+
+    Frame after frame for many windows at once: what is summed stays in the cache.
+
+    Parameters
+    ----------
+    frames : sequence of np.ndarray [shape=(n, d)]
+        The first frames of all windows, the second ones, and so on.
+    """
+    mean = _sum(frames) / len(frames)
+    square = np.zeros_like(mean)
+    deviation = np.empty_like(mean)
+    for values in frames:
+        np.subtract(values, mean, out=deviation)
+        np.square(deviation, out=deviation)
+        square += deviation
+    return mean, np.sqrt(square / len(frames))
+
+
+def _reduce(
+    kind: Kind, frames: Sequence[NDArray[Any]], changes: Sequence[NDArray[Any]], out: Float32
+) -> None:
+    """Put the statistics of windows into rows."""
+    parts = [*mean_and_std(frames)]
     if kind == "bands":
-        parts.append(np.abs(np.diff(windows, axis=1)).sum(axis=1) / (WINDOW_FRAMES - 1))
-    return np.concatenate(parts, axis=1)
+        parts.append(_sum(changes) / len(changes))
+    np.concatenate(parts, axis=1, out=out, casting="same_kind")
+
+
+def _sum(frames: Sequence[NDArray[Any]]) -> Float64:
+    total = frames[0].astype(np.float64)
+    for values in frames[1:]:
+        total += values
+    return total

@@ -4,9 +4,7 @@ The state of a frame is the likeliest class, which is the paper's first way (sec
 the likeliest path through a hidden Markov model, which is known some frames later.
 """
 
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,29 +16,61 @@ Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 States = NDArray[np.intp]
 
+_UNITS = 1 << 30  # to 1: finer than what a float32 below 1 can tell
 
-@dataclass(frozen=True)
-class Segment:
-    """A span of one state.
+
+class Run(NamedTuple):
+    """Successive frames of one state, of which more may follow.
 
     Attributes
     ----------
-    start, end : int
-        In nanoseconds of UTC.
     label : int
         Index of the class.
-    confidence : float
-        Its mean probability.
+    start : int
+        In nanoseconds of UTC.
+    frames : int
+    confidence : int
+        Sum of the probabilities of the class, in units of 2**-30: whole numbers give the same sum
+        in any order.
+    """
+
+    label: int
+    start: int
+    frames: int
+    confidence: int
+
+
+class Segment(NamedTuple):
+    """A run that has ended.
+
+    Attributes
+    ----------
+    run : Run
+    end : int
+        In nanoseconds of UTC.
     known : int
         Start of the frame with which it was known where the segment ends, in nanoseconds of UTC;
         where the sound ends, its end.
     """
 
-    start: int
+    run: Run
     end: int
-    label: int
-    confidence: float
     known: int
+
+    @property
+    def start(self) -> int:
+        """In nanoseconds of UTC."""
+        return self.run.start
+
+    @property
+    def label(self) -> int:
+        """Index of the class."""
+        return self.run.label
+
+    @property
+    def confidence(self) -> float:
+        """Mean probability of its class."""
+        return self.run.confidence / self.run.frames / _UNITS
 
 
 class Segmenter:
@@ -72,6 +102,24 @@ class Segmenter:
         self._count = 0  # of frames
         self._settled_at: int | None = None  # the stamp from which on states are sure
         self.settled = False
+
+    @property
+    def sure(self) -> bool:
+        """Whether sound before the first frame would leave no trace in the states to come."""
+        if self._waiting is None or self._settled_at is None:
+            return False
+        stamps = self._waiting[1]
+        return not len(stamps) or self._settled_at <= int(stamps[0])
+
+    @property
+    def open(self) -> Run | None:
+        """The frames behind the last segment, so far as their states are known."""
+        return self._merger.open
+
+    def forget(self) -> None:
+        """Count no frame of what is open: the next run begins with the states to come."""
+        if self._merger.open is not None:
+            self._merger.open = self._merger.open._replace(frames=0, confidence=0)
 
     def push(self, probabilities: Float32, stamps: Int64) -> list[Segment]:
         """Add successive frames and return the segments of which the end is now known.
@@ -121,19 +169,17 @@ class Segmenter:
         self._count += len(stamps)
 
 
-@dataclass
-class _Open:
-    start: int
-    label: int
-    frames: int = 0
-    confidence_sum: float = 0.0
-
-
 class SegmentMerger:
-    """Merges the states of one stream; at most one segment is open."""
+    """Merges the states of one stream.
+
+    Attributes
+    ----------
+    open : Run or None
+        The run that has not ended.
+    """
 
     def __init__(self) -> None:
-        self._open: _Open | None = None
+        self.open: Run | None = None
 
     def push(
         self, states: States, confidences: Float32, stamps: Int64, known: Int64
@@ -151,26 +197,34 @@ class SegmentMerger:
         known : np.ndarray [shape=(n,)], int64
             When their states were known.
         """
-        closed = []
-        starts = np.flatnonzero(np.diff(states, prepend=-1)).tolist()
-        for start, end in pairwise([*starts, len(states)]):
-            label = int(states[start])
-            if self._open is None or self._open.label != label:
-                closed += self.close(int(stamps[start]), int(known[start]))
-                self._open = _Open(int(stamps[start]), label)
-            # A running sum from left to right, so that blocks of any size give the same bits.
-            run = np.concatenate([[self._open.confidence_sum], confidences[start:end]])
-            self._open.confidence_sum = float(np.add.accumulate(run)[-1])
-            self._open.frames += end - start
+        closed: list[Segment] = []
+        starts = np.flatnonzero(np.diff(states, prepend=-1))
+        if not len(starts):
+            return closed
+        units = np.rint(confidences.astype(np.float64) * _UNITS).astype(np.int64)
+        columns = (
+            states[starts],
+            stamps[starts],
+            np.diff(starts, append=len(states)),
+            np.add.reduceat(units, starts),
+        )
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for run, when in zip(map(Run._make, rows), known[starts].tolist(), strict=True):
+            last = self.open
+            if last is not None and last.label == run.label:
+                frames, confidence = last.frames + run.frames, last.confidence + run.confidence
+                self.open = last._replace(frames=frames, confidence=confidence)
+            else:
+                closed += self.close(run.start, when)
+                self.open = run
         return closed
 
     def close(self, end: int, known: int) -> list[Segment]:
-        """End the open segment, if there is one, at `end`, which is known at `known`."""
-        if self._open is None:
+        """End the open run, if there is one, at `end`, which is known at `known`."""
+        if self.open is None:
             return []
-        last, self._open = self._open, None
-        confidence = last.confidence_sum / last.frames
-        return [Segment(last.start, end, last.label, confidence, known)]
+        last, self.open = self.open, None
+        return [Segment(last, end, known)]
 
 
 def _of(states: States, probabilities: Float32) -> NDArray[Any]:

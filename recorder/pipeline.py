@@ -197,7 +197,7 @@ class Pipeline:
         classifier, segmenter = self._classifier, self._segmenter
         if classifier is None or segmenter is None or not len(inputs):
             return []
-        probabilities = classifier.probabilities(inputs)
+        probabilities, novelty = classifier.classify(inputs)
         best = probabilities.argmax(axis=1)
         confidence = probabilities[np.arange(len(best)), best]
         closed = segmenter.push(probabilities, stamps)
@@ -205,7 +205,7 @@ class Pipeline:
         columns = {
             "label": [classifier.classes[i] for i in best],
             "confidence": confidence,
-            "novelty": np.full(len(best), np.nan, np.float32),
+            "novelty": novelty,
             "probabilities": probabilities,
         }
         return self._segment_records(closed) + self._rows("label", frames, stamps, columns)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import WINDOW_FRAMES, mean_and_std
+from models.inputs import WINDOW_FRAMES, mean_and_std, successive
 
 _FRAMES_AT_ONCE = 256
 
@@ -53,8 +53,8 @@ class RollingStatistics:
         heard = np.concatenate([recent, features])
         filling = min(max(WINDOW_FRAMES - 1 - len(recent), 0), len(features))
         for i in range(filling):
-            mean[i : i + 1], std[i : i + 1] = mean_and_std(heard[np.newaxis, : len(recent) + i + 1])
+            frames = [*heard[: len(recent) + i + 1, np.newaxis]]
+            mean[i : i + 1], std[i : i + 1] = mean_and_std(frames)
         if filling < len(features):
-            windows = np.lib.stride_tricks.sliding_window_view(heard, WINDOW_FRAMES, axis=0)
-            mean[filling:], std[filling:] = mean_and_std(windows.transpose(0, 2, 1))
+            mean[filling:], std[filling:] = mean_and_std(successive(heard, WINDOW_FRAMES))
         self._recent = heard[max(len(heard) - WINDOW_FRAMES + 1, 0) :].copy()

@@ -6,6 +6,7 @@ import pytest
 from blobs import blobs, ignore_progress
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
@@ -116,3 +117,26 @@ def test_a_class_without_support_vectors_is_no_obstacle():
     counts[0] = 0
     result = Classifier(dataclasses.replace(model, support_counts=counts)).probabilities(unseen(3))
     assert np.isfinite(result).all()
+
+
+def test_novelty_is_what_the_nearest_support_vector_leaves():
+    model, rows = trained(3), unseen(3)
+    about = model.description
+    here, there = (
+        (x.astype(np.float64) - model.scaler_mean) / model.scaler_scale
+        for x in (rows, model.support_vectors)
+    )
+    nearest = rbf_kernel(here, there, gamma=about.gamma).max(axis=1)
+
+    probabilities, novelty = Classifier(model).classify(rows)
+
+    np.testing.assert_allclose(novelty, 1 - nearest, atol=1e-6)
+    np.testing.assert_array_equal(probabilities, Classifier(model).probabilities(rows))
+
+
+def test_what_was_learned_is_not_novel_and_what_is_far_from_it_is():
+    model = trained(3)
+    _, of_learned = Classifier(model).classify(model.support_vectors)
+    _, of_far = Classifier(model).classify(model.support_vectors * 100)
+    assert of_learned.max() < 1e-6
+    assert of_far.min() > 0.99
