@@ -174,6 +174,13 @@ class ChunkWriter:
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = _Chunk()  # in progress
 
+    def __getstate__(self) -> dict[str, object]:
+        return self.__dict__ | {"_stream": None}
+
+    def continue_on(self, stream: BinaryIO) -> None:
+        """Go on with a stream that has, and is behind, all that was flushed."""
+        self._stream = stream
+
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
         self._stream.write(MAGIC)

@@ -1,54 +1,26 @@
 """Write a log: MCAP of profile `ros2`, under another name until it is complete."""
 
 import fcntl
-import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
-import numpy as np
-
-from schemas import rosbag2
-from schemas.chunkwriter import Block, ChunkWriter
+from schemas.content import (
+    ENCODING,
+    METADATA,
+    PROFILE,
+    SCHEMA_ENCODING,
+    Attachment,
+    LogContent,
+    Rows,
+)
 from schemas.errors import LogError
 from schemas.files import active_path, sync_folder
-from schemas.messages import definition, type_hash
-from schemas.rows import Column, Int64, encode_groups
 from schemas.topics import Topic
 
-PROFILE = "ros2"
-ENCODING = "cdr"
-SCHEMA_ENCODING = "ros2msg"
-METADATA = "hearthlog"
-
-
-@dataclass(frozen=True)
-class Attachment:
-    """A file carried inside a log."""
-
-    name: str
-    media_type: str
-    data: bytes
-
-
-class Rows(NamedTuple):
-    """Messages of one topic as columns.
-
-    Attributes
-    ----------
-    topic : str
-    log_times : np.ndarray [shape=(n,)], int64
-        Nanoseconds; the publish times are the same.
-    fields : mapping of str to column
-        As `schemas.rows.encode_groups` takes them.
-    """
-
-    topic: str
-    log_times: Int64
-    fields: Mapping[str, Column]
+__all__ = ["ENCODING", "METADATA", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
 
 
 class LogWriter:
@@ -86,56 +58,23 @@ class LogWriter:
     ) -> None:
         self.path = path
         self.active_path = active_path(path)
-        self._channels: dict[str, int] = {}
-        self._counts: dict[str, rosbag2.TopicCount] = {}
-        self._span: tuple[int, int] | None = None
         self._stream = _create(path, self.active_path)
-        self._writer = ChunkWriter(self._stream)
-        self._writer.start(profile=PROFILE, library="hearthlog")
-        self._writer.add_metadata(METADATA, dict(metadata))
-        for item in attachments:
-            self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
-        schemas: dict[str, int] = {}
-        for topic in topics:
-            if topic.type not in schemas:
-                schemas[topic.type] = self._writer.register_schema(
-                    topic.type, SCHEMA_ENCODING, definition(topic.type).encode()
-                )
-            about = _channel_metadata(topic)
-            self._counts[topic.name] = rosbag2.TopicCount(topic.type, about)
-            self._channels[topic.name] = self._writer.register_channel(
-                topic.name, ENCODING, schemas[topic.type], about
-            )
+        self._content = LogContent(self._stream, topics)
+        self._content.add_metadata(METADATA, metadata)
+        for attachment in attachments:
+            self._content.add_attachment(attachment, created)
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         """Append one encoded message; its publish time is its log time."""
-        self._writer.add_message(self._channels[topic], log_time, data, log_time)
-        self._count(topic, 1, log_time, log_time)
+        self._content.write(topic, log_time, data)
 
     def write_columns(self, batch: Sequence[Rows]) -> None:
-        """Append messages of several topics, in the order of their log times.
-
-        Messages of one time are written in the order of the batch. The file is the same as if
-        they had been encoded and written one by one.
-        """
-        blocks = []
-        first = 0
-        for part in batch:
-            count = len(part.log_times)
-            for rows, payloads in encode_groups(self._counts[part.topic].type, part.fields, count):
-                times = part.log_times[rows]
-                sequences = np.zeros(len(rows), np.uint32)
-                channel = self._channels[part.topic]
-                blocks.append(Block(channel, times, times, sequences, payloads, first + rows))
-            first += count
-            if count:
-                span = int(part.log_times.min()), int(part.log_times.max())
-                self._count(part.topic, count, *span)
-        self._writer.write(blocks)
+        """Append messages of several topics, as `LogContent.write_columns` does."""
+        self._content.write_columns(batch)
 
     def flush(self) -> None:
         """End the chunk and hand it to the operating system."""
-        self._writer.flush()
+        self._content.flush()
         self._stream.flush()
 
     def sync(self) -> None:
@@ -144,9 +83,7 @@ class LogWriter:
 
     def finish(self) -> Path:
         """Complete the log, give it its name and return it."""
-        about = rosbag2.file_metadata(self.path.name, self._counts, self._span or (0, 0))
-        self._writer.add_metadata(rosbag2.METADATA, about)
-        self._writer.finish()
+        self._content.finish(self.path.name)
         self._stream.flush()
         self.sync()
         self._stream.close()
@@ -158,11 +95,6 @@ class LogWriter:
         """Stop writing and leave the active file as it is, after the disk refused it."""
         with suppress(OSError):  # it is the reason for being here
             self._stream.close()
-
-    def _count(self, topic: str, messages: int, first: int, last: int) -> None:
-        self._counts[topic].messages += messages
-        start, end = self._span or (first, last)
-        self._span = min(start, first), max(end, last)
 
 
 def _create(path: Path, active: Path) -> BinaryIO:
@@ -179,9 +111,3 @@ def _create(path: Path, active: Path) -> BinaryIO:
     fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     sync_folder(path.parent)
     return stream
-
-
-def _channel_metadata(topic: Topic) -> dict[str, str]:
-    names = {f"{key}_names": json.dumps(list(value)) for key, value in topic.array_names.items()}
-    ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
-    return ros | names

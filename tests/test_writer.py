@@ -1,6 +1,7 @@
 """Logs written from arrays are, byte for byte, what the writer of mcap makes of single messages."""
 
-from io import BytesIO
+import pickle
+from io import SEEK_END, BytesIO
 from operator import itemgetter
 
 import numpy as np
@@ -12,6 +13,7 @@ from mcap.writer import Writer
 from schemas import messages
 from schemas.chunks import read_chunks
 from schemas.chunkwriter import Block, ChunkWriter, blocks_of
+from schemas.content import LogContent
 from schemas.files import find_logs
 from schemas.logfile import LogFile
 from schemas.messages import NANOSECONDS, encode, header, message
@@ -216,3 +218,27 @@ def test_a_log_says_how_many_messages_it_has_and_from_when_to_when(tmp_path):
     assert about.message_start_time == 7
     assert about.message_end_time == 4 * NANOSECONDS + 7
     assert about.channel_message_counts == {1: 5}
+
+
+def test_a_log_goes_on_in_another_process_as_if_nothing_had_been():
+    wholes, parts = BytesIO(), BytesIO()
+    whole, part = LogContent(wholes, TOPICS), LogContent(parts, TOPICS)
+    for first in (0, 40, 80):
+        times = 10**18 + np.arange(first, first + 40) * NANOSECONDS
+        fields = {
+            "header.stamp": times,
+            "header.frame_id": "mic",
+            "label": ["speech"] * 40,
+            "probabilities": np.ones((40, 2), np.float32),
+        }
+        for one in (whole, part):
+            one.write_columns([Rows("/mic/label", times, fields)])
+            one.flush()
+        part = pickle.loads(pickle.dumps(part))
+        parts = BytesIO(parts.getvalue())
+        parts.seek(0, SEEK_END)
+        part.continue_on(parts)
+    for one in (whole, part):
+        one.add_metadata("hearthlog", {"node": "home"})
+        one.finish("a.mcap")
+    assert parts.getvalue() == wholes.getvalue()
