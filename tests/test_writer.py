@@ -228,7 +228,10 @@ def test_a_log_goes_on_in_another_process_as_if_nothing_had_been():
         fields = {
             "header.stamp": times,
             "header.frame_id": "mic",
+            "frame": np.arange(first, first + 40),
             "label": ["speech"] * 40,
+            "confidence": np.ones(40, np.float32),
+            "novelty": np.zeros(40, np.float32),
             "probabilities": np.ones((40, 2), np.float32),
         }
         for one in (whole, part):
