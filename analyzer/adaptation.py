@@ -4,16 +4,17 @@ A collection that the machine has never heard stands for the home: it is adapted
 half of the collection's groups, and tried on those of the other half.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 
 from analyzer.dataset import Dataset, Progress
 from analyzer.errors import DataError
 from analyzer.home import HOME_WEIGHT
+from analyzer.parallel import in_parallel
 from analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
 
 CORRECTED = (0, 10, 30, 60)  # segments
@@ -64,11 +65,12 @@ def adaptation_curve(data: Dataset, recipe: Recipe, progress: Progress) -> Curve
             f"{2 * _FEWEST_SEGMENTS} segments: none can stand for a new home"
         )
     examples = prepare(recipe, data)
-    jobs = [(number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
-    scores = np.empty((len(jobs), len(CORRECTED)))
-    for place, (number, shuffle) in enumerate(jobs):
-        scores[place] = list(_scores(recipe, examples, data, number, shuffle))
-        progress(place + 1, len(jobs))
+    splits = [_split(data, number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
+    calls = (delayed(_scores)(recipe, len(data.classes), split, *examples) for split in splits)
+    scores = np.empty((len(splits), len(CORRECTED)))
+    for place, found in enumerate(in_parallel(calls)):
+        scores[place] = found
+        progress(place + 1, len(splits))
     each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
     found = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
     return Curve(CORRECTED, found, each.mean(axis=0).tolist())
@@ -83,31 +85,41 @@ def _is_like_a_home(data: Dataset, number: int) -> bool:
     )
 
 
-def _scores(
-    recipe: Recipe, examples: Examples, data: Dataset, number: int, shuffle: int
-) -> Iterator[float]:
+class _Split(NamedTuple):
+    """Segments of other homes, those of this one to correct, in this order, and to be tried on."""
+
+    others: Indices
+    pool: Indices
+    test: Indices
+
+
+def _split(data: Dataset, number: int, shuffle: int) -> _Split:
     rng = np.random.default_rng(shuffle)
     inside = data.collection == number
     groups = rng.permutation(np.unique(data.group[inside]))
     mine = np.isin(data.group, groups[: len(groups) // 2])
     pool = _turn_about(np.flatnonzero(inside & mine), data.target, rng)
-    test = np.flatnonzero(inside & ~mine)
     others = np.flatnonzero(~inside & ~np.isin(data.group, groups))
+    return _Split(others, pool, np.flatnonzero(inside & ~mine))
+
+
+def _scores(recipe: Recipe, classes: int, split: _Split, *arrays: Any) -> list[float]:
+    examples = Examples(*arrays)
+    inputs, target = examples.inputs[0], examples.target
+    right = target[split.test]
+    scores = []
     for count in CORRECTED:
+        home = split.pool[:count]
         weight = examples.weight.copy()
-        weight[pool[:count]] = HOME_WEIGHT
-        seen = np.concatenate([others, pool[:count]])
+        weight[home] = HOME_WEIGHT
+        seen = np.concatenate([split.others, home])
         machine = fit(recipe, examples._replace(weight=weight), seen)
-        inputs = examples.inputs[0]
-        home = pool[:count]
         decision = decide_with_home(
-            machine, inputs[test], len(data.classes), inputs[home], data.target[home]
+            machine, inputs[split.test], classes, inputs[home], target[home]
         )
-        predicted = decision.argmax(axis=1)
-        labels = np.unique(data.target[test])
-        yield float(
-            f1_score(data.target[test], predicted, labels=labels, average="macro", zero_division=0)
-        )
+        predicted, labels = decision.argmax(axis=1), np.unique(right)
+        scores.append(f1_score(right, predicted, labels=labels, average="macro", zero_division=0))
+    return scores
 
 
 def _turn_about(rows: Indices, target: Indices, rng: np.random.Generator) -> Indices:

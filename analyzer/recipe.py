@@ -1,11 +1,11 @@
 """How a support vector machine is made from segments, and tried on those it has not seen."""
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
+from joblib import delayed
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from sklearn.metrics.pairwise import rbf_kernel
@@ -15,10 +15,10 @@ from sklearn.svm import SVC
 
 from analyzer.augment import augmented
 from analyzer.dataset import Dataset
+from analyzer.parallel import in_parallel
 from models.classifier import HOME_SHARPNESS, home_votes, weakest_pairs
 from models.inputs import Kind, window_inputs
 
-_WORKERS = 4
 _SEED = 20_261_121
 
 Float64 = NDArray[np.float64]
@@ -96,33 +96,47 @@ def fit(recipe: Recipe, examples: Examples, seen: Indices | slice = slice(None))
 
 
 def cross_validate(
-    recipe: Recipe,
+    recipes: Sequence[Recipe],
     examples: Examples,
     classes: int,
     folds: Iterable[Fold],
     progress: Callable[[int, int], None],
 ) -> Float64:
-    """Decide about segments with a machine that has not seen them.
+    """Decide about segments with machines that have not seen them.
+
+    Parameters
+    ----------
+    recipes : sequence of Recipe
+        With the inputs and copies that the examples were made with.
+    examples : Examples
+    classes : int
+    folds : iterable of (seen, unseen)
+    progress : callable
+        Told how many fits of how many are done.
 
     Returns
     -------
-    np.ndarray [shape=(n, classes)]
+    np.ndarray [shape=(recipes, n, classes)]
         Decision values; -inf for a class that was not among the seen, NaN for segments that are
         unseen in no fold.
     """
     folds = list(folds)
-    decisions = np.full((len(examples.target), classes), np.nan)
-
-    def unseen_of(fold: Fold) -> Float64:
-        seen, unseen = fold
-        machine = fit(recipe, examples, seen)
-        return decide(machine, examples.inputs[0, unseen], classes)
-
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _WORKERS)) as pool:  # libsvm frees the lock
-        for number, decided in enumerate(pool.map(unseen_of, folds)):
-            decisions[folds[number][1]] = decided
-            progress(number + 1, len(folds))
+    decisions = np.full((len(recipes), len(examples.target), classes), np.nan)
+    tasks = list(product(range(len(recipes)), folds))
+    calls = (
+        delayed(_decide_unseen)(recipes[number], classes, fold, *examples) for number, fold in tasks
+    )
+    for done, decided in enumerate(in_parallel(calls)):
+        number, (_, unseen) = tasks[done]
+        decisions[number, unseen] = decided
+        progress(done + 1, len(tasks))
     return decisions
+
+
+def _decide_unseen(recipe: Recipe, classes: int, fold: Fold, *arrays: Any) -> Float64:
+    """Decide about what is unseen; each array is an argument, which joblib sends once."""
+    examples, (seen, unseen) = Examples(*arrays), fold
+    return decide(fit(recipe, examples, seen), examples.inputs[0, unseen], classes)
 
 
 def decide(machine: Pipeline, inputs: NDArray[np.float32], classes: int) -> Float64:

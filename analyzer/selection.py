@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -11,12 +12,17 @@ from mcap.records import Channel, Metadata, Schema
 
 from schemas.chunks import RawMessages, read_chunks
 from schemas.errors import LogError
-from schemas.files import find_logs
+from schemas.files import CATALOG, find_logs
 from schemas.logfile import LogFile, time_span
-from schemas.series import iterate_messages
+from schemas.ranges import map_logs, store_errors
+from schemas.series import iterate_messages, time_spans
 from schemas.writer import METADATA
 
+if TYPE_CHECKING:
+    from analyzer.catalog import Catalog
+
 _LAST = (1 << 63) - 1  # log time
+_BATCH = 2 << 20  # bytes, stored and decompressed together, that are verified at once
 Progress = Callable[[float], None]
 Described = tuple[Channel, Schema | None]
 
@@ -75,8 +81,10 @@ class Selection:
             with LogFile(path) as file:
                 ends, starts = file.chunks["end"], file.chunks["start"]
                 wanted = (ends >= (self.start or 0)) & (starts < (self.end or _LAST))
-                for i in np.flatnonzero(wanted).tolist():
-                    read_chunks(file, file.chunks[i : i + 1], topics=(), check=True)
+                chunks = file.chunks[wanted]
+                batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH
+                for part in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
+                    read_chunks(file, part, topics=(), check=True)
 
     def only(self, topics: Collection[str]) -> "Selection":
         """Leave out all other topics."""
@@ -111,14 +119,17 @@ def select(
     LogError
         If there is no such log, if one is damaged, or if a pattern fits no topic.
     """
-    found = {path.resolve(): path for each in paths for path in find_logs(each)}
-    spans = sorted((*span, path) for path in found.values() if (span := time_span(path)))
+    catalogs: dict[Path, Catalog | None] = {}
+    for each in paths:
+        catalogs |= dict.fromkeys(find_logs(each), _catalog(each))
+    found = {path.resolve(): path for path in catalogs}
+    spans = time_spans(found.values(), lambda path: _span(path, catalogs[path]))
     wanted = [
         (first, last, path)
         for first, last, path in spans
         if (start is None or last >= start) and (end is None or first < end)
     ]
-    contents = [_Content(path) for _, _, path in wanted]
+    contents = list(map_logs(_Content, [path for _, _, path in wanted]))
     channels = _by_topic(channel for content in contents for channel in content.channels)
     topics = _matching(patterns, channels) if patterns and contents else None
     metadata: list[Mapping[str, str]] = []
@@ -139,6 +150,24 @@ def select(
             max((last for _, last, _ in wanted), default=0),
         ),
     )
+
+
+def _catalog(folder: Path) -> "Catalog | None":
+    """Read the catalogue of a folder, if it has one and there is what reads it."""
+    with store_errors(folder):
+        exists = (folder / CATALOG).exists()
+    if not exists:
+        return None
+    try:
+        from analyzer.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
+    except ModuleNotFoundError:
+        return None
+    return read_catalog(folder)
+
+
+def _span(path: Path, catalog: "Catalog | None") -> tuple[int, int] | None:
+    """Return the span of a log, from the catalogue if that speaks of the file as it is now."""
+    return (catalog and catalog.span(path)) or time_span(path)
 
 
 class _Content:

@@ -83,7 +83,7 @@ def train_model(
     def report(done: int, _total: int) -> None:
         progress(done, len(folds) + 1)
 
-    decisions = cross_validate(recipe, examples, len(data.classes), folds, report)
+    [decisions] = cross_validate([recipe], examples, len(data.classes), folds, report)
     inverse = inverse_temperature(decisions, data.target)
     machine = fit(recipe, examples)
     progress(len(folds) + 1, len(folds) + 1)

@@ -1,10 +1,12 @@
 """Probabilities of a model's classes, with numpy alone."""
 
+from itertools import combinations, pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.modelfile import Model
-from models.rowwise import rowwise_matmul
+from models.rowwise import aligned, rowwise_matmul
 
 _ROWS_AT_ONCE = 256
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
@@ -15,6 +17,7 @@ _SUPPORT_AT_ONCE = 256  # a product this small no BLAS divides among threads
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+_Part = tuple[int, slice, Float64]  # a class, its columns, their coefficients
 
 
 class Classifier:
@@ -108,14 +111,16 @@ class Classifier:
         nearest = np.full(len(extended), -np.inf)
         against = np.zeros((classes, len(extended), classes - 1))
         others = np.zeros((len(extended), 1))
-        for index, weights, coefficients in self._blocks:
+        rows = np.arange(len(extended))
+        for weights, parts in self._blocks:
             distance = _distance(extended, weights)
-            np.maximum(nearest, distance.max(axis=1), out=nearest)
+            np.maximum(nearest, distance[rows, distance.argmax(axis=1)], out=nearest)
             if self._home_blocks:
                 sharp = np.exp(HOME_SHARPNESS * distance)
-                others += rowwise_matmul(sharp, np.ones((len(coefficients), 1)))
+                others += rowwise_matmul(sharp, np.ones((len(weights.T), 1)))
             kernel = np.exp(distance, out=distance)
-            against[index] += rowwise_matmul(kernel, coefficients)
+            for index, columns, coefficients in parts:
+                against[index] += rowwise_matmul(kernel[:, columns], coefficients)
         first, second = self._first, self._second
         decision = against[first, :, second - 1] + against[second, :, first]
         return decision.T + self._intercepts, others, nearest
@@ -145,7 +150,7 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
     np.ndarray [shape=(n, C)]
     """
     decision = np.full((len(pairs), classes), np.inf)
-    for place, (first, second) in enumerate(zip(*np.triu_indices(classes, 1), strict=True)):
+    for place, (first, second) in enumerate(combinations(range(classes), 2)):
         np.minimum(decision[:, first], pairs[:, place], out=decision[:, first])
         np.minimum(decision[:, second], -pairs[:, place], out=decision[:, second])
     return decision
@@ -175,17 +180,20 @@ def _distance(extended: Float64, weights: Float64) -> Float64:
     return np.minimum(distance, 0.0, out=distance)
 
 
-def _blocks(model: Model) -> list[tuple[int, Float64, Float64]]:
-    """Support vectors class by class, as (class, weights, coefficients)."""
+def _blocks(model: Model) -> list[tuple[Float64, list[_Part]]]:
+    """Divide the support vectors into blocks of weights, and these by class."""
     weights = _weights(model, model.support_vectors)
+    ends = np.cumsum(model.support_counts).tolist()
     blocks = []
-    end = 0
-    for index, count in enumerate(model.support_counts):
-        start, end = end, end + int(count)
-        for low in range(start, end, _SUPPORT_AT_ONCE):
-            part = slice(low, min(low + _SUPPORT_AT_ONCE, end))
-            coefficients = np.ascontiguousarray(model.dual_coefficients[:, part].T)
-            blocks.append((index, np.ascontiguousarray(weights[part].T), coefficients))
+    for low in range(0, len(weights), _SUPPORT_AT_ONCE):
+        high = min(low + _SUPPORT_AT_ONCE, len(weights))
+        parts = []
+        for index, (start, end) in enumerate(pairwise([0, *ends])):
+            first, last = max(start, low), min(end, high)
+            if first < last:
+                coefficients = aligned(model.dual_coefficients[:, first:last].T)
+                parts.append((index, slice(first - low, last - low), coefficients))
+        blocks.append((aligned(weights[low:high].T), parts))
     return blocks
 
 
@@ -197,7 +205,7 @@ def _home_blocks(model: Model) -> list[tuple[Float64, Float64]]:
     one_hot = np.eye(len(model.classes))[model.home_target]
     cuts = range(_SUPPORT_AT_ONCE, len(weights), _SUPPORT_AT_ONCE)
     return [
-        (np.ascontiguousarray(part.T), of)
+        (aligned(part.T), of)
         for part, of in zip(np.split(weights, cuts), np.split(one_hot, cuts), strict=True)
     ]
 

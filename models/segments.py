@@ -39,6 +39,13 @@ class Run(NamedTuple):
     frames: int
     confidence: int
 
+    def behind(self, before: "Run | None") -> "Run":
+        """Return this run with the frames before it, which had the same label."""
+        if before is None:
+            return self
+        frames, confidence = before.frames + self.frames, before.confidence + self.confidence
+        return before._replace(frames=frames, confidence=confidence)
+
 
 class Segment(NamedTuple):
     """A run that has ended.
@@ -212,8 +219,7 @@ class SegmentMerger:
         for run, when in zip(map(Run._make, rows), known[starts].tolist(), strict=True):
             last = self.open
             if last is not None and last.label == run.label:
-                frames, confidence = last.frames + run.frames, last.confidence + run.confidence
-                self.open = last._replace(frames=frames, confidence=confidence)
+                self.open = run.behind(last)
             else:
                 closed += self.close(run.start, when)
                 self.open = run

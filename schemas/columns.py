@@ -14,6 +14,7 @@ from schemas.chunks import RawMessages, bounds
 from schemas.errors import LogError
 from schemas.layout import message_type
 from schemas.logfile import topic_counts
+from schemas.ranges import map_logs
 from schemas.rows import Fields, Int64, decode_rows, ragged
 from schemas.series import iterate_pieces
 
@@ -105,7 +106,7 @@ def read_columns(
     """
     logs = list(logs)
     whole = start is None and end is None
-    expected = sum(map(topic_counts, logs), Counter()) if whole else Counter()
+    expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
     found: dict[str, _Pile] = {}
     for batch in iterate_columns(logs, topics, start, end, fields):
         for columns in batch:

@@ -1,17 +1,21 @@
-"""Names of logs on disk: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`, in UTC."""
+"""Names of logs: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`, in UTC."""
 
 import os
 import re
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from schemas.errors import LogError
 from schemas.messages import NANOSECONDS
+from schemas.ranges import is_local, store_errors
 
 SUFFIX = ".mcap"
 ACTIVE_SUFFIX = SUFFIX + ".active"
+CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
 
 
 def check_node_name(name: str) -> str:
@@ -43,6 +47,8 @@ def find_logs(path: Path) -> list[Path]:
     LogError
         If there is none.
     """
+    if not is_local(path):
+        return _find_stored(path)
     if path.is_dir():
         found = [p for p in path.rglob("*") if p.name.endswith((SUFFIX, ACTIVE_SUFFIX))]
         if not found:
@@ -51,6 +57,18 @@ def find_logs(path: Path) -> list[Path]:
     if not path.exists():
         raise LogError(f"{path}: no such log")
     return [path]
+
+
+def _find_stored(path: Any) -> list[Path]:
+    """List the logs under a name in a store, in which folders are parts of names."""
+    with store_errors(path):
+        names = path.fs.find(path.path)
+    if names == [path.path]:
+        return [path]
+    found = [name for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX))]
+    if not found:
+        raise LogError(f"{path}: no log (*{SUFFIX}) under this name")
+    return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(found)]
 
 
 def sync_folder(folder: Path) -> None:
@@ -63,18 +81,40 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_new(path: Path) -> None:
-    """Raise LogError unless a file or folder can be made under this name."""
+    """Raise LogError unless a file or folder can be made under this name.
+
+    Whether a store lets us write is known only when we do.
+    """
+    if not is_local(path):
+        _check_new_stored(path)
+        return
     if os.path.lexists(path):
-        raise LogError(f"{path}: exists already; choose another name, or delete it first")
+        raise _exists(path)
     if not path.parent.is_dir():
         raise LogError(f"{path}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK):
         raise LogError(f"{path}: the folder cannot be written to")
 
 
+def _check_new_stored(path: Any) -> None:
+    with store_errors(path):
+        exists = path.fs.exists(path.path)
+    if exists:
+        raise _exists(path)
+
+
+def _exists(path: Path) -> LogError:
+    return LogError(f"{path}: exists already; choose another name, or delete it first")
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Make a file: yield a temporary name to write to, and give it its own when that went well.
+
+    For a path in a store the temporary file is one of this machine, and is put there at the end.
+    S3 shows it whole or not at all, and refuses to put it over another one. That is not sure of
+    every store: between a last look and the end of putting, another file of this name may be
+    replaced, and a store that has real folders may keep a part of a file when it is cut off.
 
     Raises
     ------
@@ -82,7 +122,8 @@ def new_file(path: Path) -> Iterator[Path]:
         If there is such a file already, or if it cannot be written.
     """
     check_new(path)
-    with _put_in_place(path, new=True) as temporary:
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=True) as temporary:
         yield temporary
 
 
@@ -95,7 +136,8 @@ def replaced_file(path: Path) -> Iterator[Path]:
     LogError
         If it cannot be written.
     """
-    with _put_in_place(path, new=False) as temporary:
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=False) as temporary:
         yield temporary
 
 
@@ -114,3 +156,24 @@ def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
         raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _put_in_store(path: Any, *, new: bool) -> Iterator[Path]:
+    try:
+        with tempfile.TemporaryDirectory(prefix="hearthlog-") as folder:
+            temporary = Path(folder) / path.name
+            yield temporary
+            with store_errors(path):
+                _put(temporary, path, new=new)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _put(file: Path, path: Any, *, new: bool) -> None:
+    if new:
+        check_new(path)  # again: not every store minds `create`
+    try:
+        path.fs.put_file(str(file), path.path, mode="create" if new else "overwrite")
+    except FileExistsError as error:
+        raise _exists(path) from error

@@ -1,14 +1,14 @@
-"""What one log on disk consists of, from its index, or by walking from record to record."""
+"""What one log consists of, from its index, or by walking from record to record."""
 
-import os
+import io
 import struct
 import zlib
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from mcap import records
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import LogError
 from schemas.files import ACTIVE_SUFFIX
+from schemas.ranges import LocalFile, Section, StoredFile, open_file
 from schemas.records import HEAD, LIMIT, MAGIC, McapError, parse
 
 FOOTER_SIZE = HEAD.size + 20 + len(MAGIC)
@@ -55,6 +56,7 @@ class LogFile:
     Parameters
     ----------
     path : Path
+        On this machine, or a `upath.UPath` of a store, which is read by ranges.
     indexed : bool
         Whether to use the index of a finished log; without it `chunks` is empty, and `walk` gives
         the chunks.
@@ -79,7 +81,7 @@ class LogFile:
     Raises
     ------
     LogError
-        If it is no MCAP file, or is damaged.
+        If it cannot be read, is no MCAP file, or is damaged.
     """
 
     def __init__(self, path: Path, *, indexed: bool = True) -> None:
@@ -94,10 +96,7 @@ class LogFile:
         self.channel_sets: list[frozenset[int]] = []
         self.chunks = np.empty(0, CHUNKS)
         self.end = len(MAGIC)  # of the records that were walked through
-        try:
-            self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        except OSError as error:
-            raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+        self._file = open_file(path)
         self._sets: dict[frozenset[int], int] = {}
         try:
             self._check_magic()
@@ -115,27 +114,24 @@ class LogFile:
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._descriptor)
+        self._file.close()
 
     @property
     def size(self) -> int:
-        """Bytes of the file as it is now."""
-        return os.fstat(self._descriptor).st_size
+        """Bytes of the file: one of this machine may grow, one of a store does not."""
+        return self._file.size
 
     def is_at(self, path: Path) -> bool:
         """Tell whether the file of this name is this one."""
-        try:
-            return os.path.samestat(os.fstat(self._descriptor), path.stat())
-        except FileNotFoundError:
-            return False
+        return self._file.is_at(path)
 
     def read(self, offset: int, length: int) -> bytes:
         """Read some bytes; fewer at the end of the file."""
-        return os.pread(self._descriptor, length, offset)
+        return self._file.read(offset, length)
 
     def read_into(self, out: memoryview, offset: int) -> None:
         """Read as many bytes as there is room for, or fewer at the end of the file."""
-        os.preadv(self._descriptor, [out], offset)
+        self._file.read_into(out, offset)
 
     def record(self, place: Place) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages."""
@@ -199,8 +195,7 @@ class LogFile:
 
     def _records(self, start: int, end: int) -> Iterator[tuple[Place, bytes]]:
         """Read the records of a section one by one, heads included."""
-        with os.fdopen(os.dup(self._descriptor), "rb", buffering=1 << 20) as stream:
-            stream.seek(start)
+        with io.BufferedReader(Section(self._file, start), 1 << 20) as stream:
             while start < end:
                 head = stream.read(HEAD.size)
                 opcode, length = HEAD.unpack(head)
@@ -341,57 +336,58 @@ def time_span(path: Path) -> tuple[int, int] | None:
         If it is no MCAP file, or is damaged.
     """
     try:
-        with path.open("rb") as stream:
-            about = _statistics(stream)
-    except (OSError, McapError, struct.error):
+        with closing(open_file(path)) as file:
+            about = _statistics(file)
+    except (McapError, struct.error):
         about = None
     if about is not None:
         times = about.message_start_time, about.message_end_time
         return times if about.message_count else None
-    with LogFile(path) as file:
-        if not len(file.chunks):
+    with LogFile(path) as log:
+        if not len(log.chunks):
             return None
-        return int(file.chunks["start"].min()), int(file.chunks["end"].max())
+        return int(log.chunks["start"].min()), int(log.chunks["end"].max())
 
 
 def topic_counts(path: Path) -> Counter[str]:
     """Count the messages of each topic as a finished log says, so far as that can be true."""
     found: Counter[str] = Counter()
-    with suppress(OSError, McapError, UnicodeDecodeError, struct.error), path.open("rb") as stream:
-        about = _statistics(stream)
+    with (
+        suppress(LogError, McapError, UnicodeDecodeError, struct.error),
+        closing(open_file(path)) as file,
+    ):
+        about = _statistics(file)
         counts = {} if about is None else about.channel_message_counts
-        for channel in _summary_group(stream, Opcode.CHANNEL):
+        for channel in _summary_group(file, Opcode.CHANNEL):
             if isinstance(channel, records.Channel):
-                most = os.fstat(stream.fileno()).st_size  # a message takes more than a byte
+                most = file.size  # a message takes more than a byte
                 found[channel.topic] += min(counts.get(channel.id, 0), most)
     return found
 
 
-def _statistics(stream: BinaryIO) -> records.Statistics | None:
+def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
     """Read the statistics of a finished log, which are found without reading its index."""
-    for found in _summary_group(stream, Opcode.STATISTICS):
+    for found in _summary_group(file, Opcode.STATISTICS):
         if isinstance(found, records.Statistics):
             return found
     return None
 
 
-def _summary_group(stream: BinaryIO, opcode: int) -> list[McapRecord | None]:
+def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord | None]:
     """Read the records of one kind in the summary of a finished log."""
-    stream.seek(-FOOTER_SIZE, os.SEEK_END)
-    tail = stream.read()
+    end = max(file.size - FOOTER_SIZE, 0)
+    tail = file.read(end, FOOTER_SIZE)
     if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
         return []
     footer = parse(Opcode.FOOTER, tail[HEAD.size :])
     assert isinstance(footer, records.Footer)
-    end = stream.tell() - FOOTER_SIZE
     size = end - footer.summary_offset_start
     if not footer.summary_offset_start or not 0 <= size <= _RUN_LIMIT:
         return []
-    stream.seek(footer.summary_offset_start)
-    for group, start, length in _SUMMARY_OFFSET.iter_unpack(stream.read(size)):
+    offsets = file.read(footer.summary_offset_start, size)
+    for group, start, length in _SUMMARY_OFFSET.iter_unpack(offsets):
         if group == opcode and length <= _RUN_LIMIT and start < end:
-            stream.seek(start)
-            return _split(stream.read(length))
+            return _split(file.read(start, length))
     return []
 
 

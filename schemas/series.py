@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from schemas.ahead import map_ahead
 from schemas.chunks import RawMessages, read_chunks
 from schemas.logfile import LogFile, time_span
+from schemas.ranges import map_logs
 from schemas.records import LIMIT
 
 _BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
@@ -28,6 +29,29 @@ class Messages(Protocol):
 
 
 Piece = TypeVar("Piece", bound=Messages)
+
+
+def time_spans(
+    logs: Iterable[Path], span_of: Callable[[Path], tuple[int, int] | None] = time_span
+) -> list[tuple[int, int, Path]]:
+    """Return first and last log time of each log that has messages, in the order of time.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    span_of : callable
+        Finds out those of one log, or None.
+
+    Raises
+    ------
+    LogError
+        If one is no MCAP file, or is damaged.
+    """
+    paths = list(logs)
+    found = zip(map_logs(span_of, paths), paths, strict=True)
+    spans = [(*span, path) for span, path in found if span is not None]
+    # Paths of this machine and of a store do not compare; their parts do.
+    return sorted(spans, key=lambda span: (*span[:2], tuple(span[2].parts)))
 
 
 class _Log:
@@ -65,6 +89,7 @@ class _Query(NamedTuple):
     topics: Collection[str] | None
     start: int
     end: int
+    check: bool = False
 
     def wanted(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a wanted message."""
@@ -79,7 +104,8 @@ class _Query(NamedTuple):
         """Read the wanted messages of a batch."""
         found: list[RawMessages] = []
         for file, chunks in batch.parts:
-            found += _between(read_chunks(file, chunks, self.topics), self.start, self.end)
+            read = read_chunks(file, chunks, self.topics, check=self.check)
+            found += _between(read, self.start, self.end)
         return found
 
 
@@ -106,6 +132,8 @@ def iterate_messages(
     topics: Collection[str] | None = None,
     start: int | None = None,
     end: int | None = None,
+    *,
+    check: bool = False,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
 
@@ -116,6 +144,8 @@ def iterate_messages(
         All by default.
     start, end : int, optional
         Log times, in nanoseconds: from `start` on, before `end`.
+    check : bool
+        Whether to compare chunks with their checksums.
 
     Yields
     ------
@@ -128,7 +158,7 @@ def iterate_messages(
     LogError
         If a log is damaged.
     """
-    return iterate_pieces(logs, topics, start, end, list)
+    return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
 
 
 def iterate_pieces(
@@ -147,8 +177,16 @@ def iterate_pieces(
     list of Piece
         What the function made of messages: of those of the next span of time.
     """
-    query = _Query(topics, _FIRST if start is None else start, _LAST if end is None else end)
+    return _iterate(logs, _query(topics, start, end), function)
 
+
+def _query(topics: Collection[str] | None, start: int | None, end: int | None) -> _Query:
+    return _Query(topics, _FIRST if start is None else start, _LAST if end is None else end)
+
+
+def _iterate(
+    logs: Iterable[Path], query: _Query, function: Callable[[list[RawMessages]], list[Piece]]
+) -> Iterator[list[Piece]]:
     def read(batch: _Batch) -> tuple[_Batch, list[Piece]]:
         return batch, function(query.read(batch))
 
@@ -175,10 +213,9 @@ class _Queue:
 
     def __init__(self, logs: Iterable[Path], query: _Query) -> None:
         self._query = query
-        spans = sorted((*span, path) for path in logs if (span := time_span(path)) is not None)
         self._closed = [
             (first, path)
-            for first, last, path in reversed(spans)
+            for first, last, path in reversed(time_spans(logs))
             if last >= query.start and first < query.end
         ]
         self._open: list[_Log] = []

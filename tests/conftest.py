@@ -3,23 +3,34 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from spliced import record_logs
+from stores import bucket, in_memory, s3_account
 
 from analyzer.dataset import build_dataset
+from analyzer.hmm import LAG_SECONDS, default_transitions
 from analyzer.manifest import read_manifest
 from analyzer.scenario import load_scenario
 from analyzer.train import train_model
-from models.modelfile import save_model
+from models.modelfile import Smoothing, load_model, save_model
 from recorder.features import FRAME_SAMPLES
 from recorder.sources.files import read_audio
 from tools.home.simulate import write_day, write_training_set
 
-__all__ = ["labmic", "labmic_plugin", "pulse_daemon", "pulse_microphone"]
+__all__ = [
+    "bucket",
+    "in_memory",
+    "labmic",
+    "labmic_plugin",
+    "pulse_daemon",
+    "pulse_microphone",
+    "s3_account",
+]
 
 _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 HEARTHLOG = [sys.executable, "-m", "tools.cli.main"]
@@ -67,6 +78,18 @@ def model_file(tmp_path_factory) -> Path:
     data = build_dataset(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
     path = folder / "simulated.safetensors"
     save_model(train_model(data, scenario, lambda *_: None, smoothing="merge"), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def hmm_file(tmp_path_factory, model_file) -> Path:
+    """The same model, with smoothing."""
+    model = load_model(model_file)
+    smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
+    about = model.description.model_copy(update={"smoothing": smoothing})
+    path = tmp_path_factory.mktemp("hmm") / "smoothed.safetensors"
+    transitions = default_transitions(model.classes)
+    save_model(replace(model, description=about, transitions=transitions), path)
     return path
 
 

@@ -226,18 +226,6 @@ def test_segments_of_a_part_are_those_of_the_whole_once_settled(lag):
     assert np.median(settled_after) < 400
 
 
-@pytest.fixture(scope="module")
-def hmm_file(tmp_path_factory, model_file):
-    """The simulated model, with smoothing."""
-    model = load_model(model_file)
-    smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
-    about = model.description.model_copy(update={"smoothing": smoothing})
-    path = tmp_path_factory.mktemp("hmm") / "smoothed.safetensors"
-    transitions = default_transitions(model.classes)
-    save_model(replace(model, description=about, transitions=transitions), path)
-    return path
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [

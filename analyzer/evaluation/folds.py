@@ -55,9 +55,9 @@ def evaluate_recipe(
         If there are too few sources or collections.
     """
     check_varied(data)
-    folds = _folds(data, kind)
+    folds = divide(data, kind)
     examples = prepare(recipe, data)
-    decisions = cross_validate(recipe, examples, len(data.classes), folds, progress)
+    [decisions] = cross_validate([recipe], examples, len(data.classes), folds, progress)
     probabilities = softmax(inverse_temperature(decisions, data.target) * decisions)
     return CrossValidation(
         len(folds),
@@ -67,7 +67,14 @@ def evaluate_recipe(
     )
 
 
-def _folds(data: Dataset, kind: Kind) -> list[Fold]:
+def divide(data: Dataset, kind: Kind) -> list[Fold]:
+    """Divide segments into folds, of which a `kind` is never on both sides.
+
+    Raises
+    ------
+    DataError
+        If there are too few sources or collections.
+    """
     if kind == "source":
         return group_folds(data)
     if kind == "segment":

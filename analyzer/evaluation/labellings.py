@@ -1,5 +1,6 @@
 """Labellings of a log: its own segments, a layer's, a reviewer's, or those of a label file."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,12 +15,12 @@ from analyzer.known import is_of_type
 from analyzer.review import read_marks
 from analyzer.selection import Selection, select
 from schemas import messages
-from schemas.columns import read_columns
+from schemas.columns import Columns, read_columns
 from schemas.errors import LogError
 from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs
 
 REVIEW = "review"
-_FIELDS = {"header.stamp", "duration", "label"}
+FIELDS = {"header.stamp", "duration", "label"}
 _MOST_CLASSES = 100
 _LATEST = 1 << 62  # nanoseconds
 
@@ -63,24 +64,52 @@ def read_labelled(path: Path, topic: str | None = None) -> Labelled:
     LogError
         If a log is damaged, or has no such segments.
     """
-    selection = select(_with_layers(path))
+    selection = select(with_layers(path))
     topic = _segment_topic(selection, topic)
-    columns = read_columns(selection.logs, {topic}, fields=_FIELDS).get(topic)
+    columns = read_columns(selection.logs, {topic}, fields=FIELDS).get(topic)
     if columns is None or not (columns["duration"] > 0).any():
         raise LogError(f"{path}: there is no segment on {topic}")
-    columns = columns.taken(np.flatnonzero(columns["duration"] > 0))
-    columns = columns.taken(np.argsort(columns["header.stamp"], kind="stable"))
-    starts, labels = columns["header.stamp"], columns["label"]
-    ends = starts + columns["duration"]
-    if (starts[1:] < ends[:-1]).any():
-        raise LogError(f"{topic}: segments overlap; is a log there twice, or those of two homes?")
+    labelling = labelling_of(columns)
     channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
     named = [names_of(channel.metadata, "probabilities") for channel, _ in channels]
-    classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
+    classes = all_classes(topic, named, labelling)
+    return Labelled(topic, classes, labelling, tuple(selection.unfinished))
+
+
+def labelling_of(segments: Columns) -> Labelling:
+    """Put segments in the order of time; those that are over at once are left out.
+
+    Raises
+    ------
+    LogError
+        If they overlap.
+    """
+    segments = segments.taken(np.flatnonzero(segments["duration"] > 0))
+    segments = segments.taken(np.argsort(segments["header.stamp"], kind="stable"))
+    starts = segments["header.stamp"]
+    ends = starts + segments["duration"]
+    if (starts[1:] < ends[:-1]).any():
+        raise LogError(
+            f"{segments.topic}: segments overlap; is a log there twice, or those of two homes?"
+        )
+    return Labelling(starts, ends, segments["label"])
+
+
+def all_classes(
+    topic: str, named: Iterable[Sequence[str]], labelling: Labelling
+) -> tuple[str, ...]:
+    """List the labels that there may be: those that logs name, and those that there are.
+
+    Raises
+    ------
+    LogError
+        If they are too many.
+    """
+    names = [name for names in named for name in names]
+    classes = tuple(dict.fromkeys([*names, *labelling.labels]))
     if len(classes) > _MOST_CLASSES:
         raise LogError(f"{topic}: has {len(classes)} different labels; no classifier has so many")
-    labelling = Labelling(starts, ends, labels)
-    return Labelled(topic, classes, labelling, tuple(selection.unfinished))
+    return classes
 
 
 def read_reference(source: str, path: Path, microphone: str) -> Labelling:
@@ -117,7 +146,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
     return Labelling(np.array(starts), np.array(ends), np.array(labels, object))
 
 
-def _with_layers(path: Path) -> list[Path]:
+def with_layers(path: Path) -> list[Path]:
     """List a log and the layers beside it."""
     if not path.is_file():
         return [path]

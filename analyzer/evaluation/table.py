@@ -1,9 +1,13 @@
 """Scores as lines of text, at most 100 characters wide."""
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from analyzer.evaluation.events import Detections
 from analyzer.evaluation.scores import Bin, Interval, Scores
+
+if TYPE_CHECKING:
+    from analyzer.search import Tried  # which imports scikit-learn
 
 WIDTH = 100
 _NAME = 16  # objects_activity
@@ -59,6 +63,16 @@ def reliability_table(bins: Sequence[Bin], error: float) -> Iterator[str]:
         ("segments", [str(b.count) for b in bins]),
     ):
         yield f"{title:9}" + "".join(f"{value:>6}" for value in values)
+
+
+def search_table(tried: Sequence["Tried"]) -> Iterator[str]:
+    """Yield a line for each recipe that was tried."""
+    yield f"{'cost':>8} {'gamma':>8} {'macro F1':>9}   95 %"
+    for recipe, scores in tried:
+        yield (
+            f"{recipe.cost:8g} {recipe.gamma:8g} {scores.macro_f1:9.3f}   "
+            f"{_between(scores.macro_f1_interval)}"
+        )
 
 
 def shown(name: str) -> str:

@@ -18,12 +18,8 @@ from schemas.rows import Fields
 from schemas.series import iterate_messages
 from schemas.topics import DIAGNOSTICS, topic
 
-_TYPES = {
-    "features": messages.FEATURES,
-    "gap": messages.GAP,
-    "label": messages.LABEL,
-    "segment": messages.SEGMENT,
-}
+_HEARD = {"features": messages.FEATURES, "gap": messages.GAP}
+_TYPES = _HEARD | {"label": messages.LABEL, "segment": messages.SEGMENT}
 _LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be made of
 _LARGEST_FRAME = 1 << 62
 _PLACE_BITS = 40
@@ -55,7 +51,9 @@ class Piece(NamedTuple):
     segments: list[RawMessages]
 
 
-def read_recorded(origin: Origin, start: int, end: int) -> Iterator[Piece]:
+def read_recorded(
+    origin: Origin, start: int, end: int, *, heard_only: bool = False
+) -> Iterator[Piece]:
     """Read a log piece by piece.
 
     Parameters
@@ -64,16 +62,20 @@ def read_recorded(origin: Origin, start: int, end: int) -> Iterator[Piece]:
         Of the log.
     start, end : int
         Log times, in nanoseconds: from `start` on, before `end`.
+    heard_only : bool
+        Read features and gaps and nothing else, and compare the checksums of what is read.
 
     Raises
     ------
     LogError
         If the log is damaged, or its messages are not those of a recorder.
     """
-    topics = {topic(origin.microphone, kind): type_ for kind, type_ in _TYPES.items()}
-    topics[DIAGNOSTICS] = messages.DIAGNOSTICS
-    for batch in iterate_messages([origin.path], topics, start, end):
-        found: _Found = {type_: [] for type_ in topics.values()}
+    kinds = _HEARD if heard_only else _TYPES
+    topics = {topic(origin.microphone, kind): type_ for kind, type_ in kinds.items()}
+    if not heard_only:
+        topics[DIAGNOSTICS] = messages.DIAGNOSTICS
+    for batch in iterate_messages([origin.path], topics, start, end, check=heard_only):
+        found: _Found = {type_: [] for type_ in (*_TYPES.values(), messages.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if is_of_type(raw.channel, raw.schema, type_):

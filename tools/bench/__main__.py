@@ -17,12 +17,12 @@ from typing import Annotated
 import typer
 
 from schemas.errors import HearthlogError
-from tools.bench import features, inference, live, reading, recording, size, writing
+from tools.bench import features, inference, live, reading, recording, relabel, size, writing
 from tools.bench.workload import Workload
 
 MEASUREMENTS = {
     module.__name__.rpartition(".")[2]: module.measure
-    for module in (features, recording, live, inference, size, reading, writing)
+    for module in (features, recording, live, inference, size, reading, writing, relabel)
 }
 
 

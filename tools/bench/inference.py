@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
-from sklearn.pipeline import Pipeline
 
+from analyzer.dataset import Dataset
 from analyzer.recipe import RECIPES, decide, fit, prepare, softmax
 from models.classifier import Classifier
 from models.inputs import InputStream
@@ -25,7 +25,8 @@ _THE_SAME = Target(1e-5, at_most=True)
 def measure(work: Workload) -> Table:
     """Measure both on statistics of the sound."""
     ours = Classifier(work.model).probabilities
-    machine, calibrated = _scikit_learn(work)
+    calibrated = fit_scikit_learn(work.training[0])
+    machine = calibrated.estimator.estimator
     theirs = calibrated.predict_proba
     rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
@@ -52,9 +53,8 @@ def measure(work: Workload) -> Table:
     return Table(f"inference: {support} support vectors, {classes} classes, CPU time", found)
 
 
-def _scikit_learn(work: Workload) -> tuple[Pipeline, CalibratedClassifierCV]:
-    """Fit what `analyzer.train` did, and calibrate it as scikit-learn does."""
-    data, _ = work.training
+def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
+    """Fit what `analyzer.train` does, and calibrate it as scikit-learn does."""
     recipe = RECIPES["bands"]
     examples = prepare(recipe, data)
     machine = fit(recipe, examples)
@@ -62,7 +62,7 @@ def _scikit_learn(work: Workload) -> tuple[Pipeline, CalibratedClassifierCV]:
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
     )
-    return machine, calibrated.fit(examples.inputs[0].astype(np.float64), data.target)
+    return calibrated.fit(examples.inputs[0].astype(np.float64), data.target)
 
 
 def _inputs(work: Workload) -> NDArray[np.float32]:

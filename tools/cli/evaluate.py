@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tools.cli.progress import steps_done
+from tools.cli.recipe import chosen_recipe
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
     from analyzer.dataset import Dataset
     from analyzer.evaluation.events import Detections
+    from analyzer.evaluation.folds import Kind
     from analyzer.evaluation.scores import Bin, Scores
-    from analyzer.recipe import Recipe
 
 
 def evaluate(
@@ -59,6 +60,15 @@ def evaluate(
             help="F1 against corrected segments of a home, each collection of --data in its place.",
         ),
     ] = False,
+    search: Annotated[
+        bool,
+        typer.Option(
+            "--search", help="Cross-validate learning with other costs and gammas, best first."
+        ),
+    ] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Learn on this Dask cluster, as tcp://host:port.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option(help="Picture to make, *.png.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -67,15 +77,26 @@ def evaluate(
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
     of_log, of_model = (log, reference), (model, data)
-    if folds is not None or adaptation:
-        if not data or not scenario or any((*of_log, topic, model)) or (folds and adaptation):
-            wrong_use("--folds, or --adaptation, goes with --data and --scenario alone")
-        if adaptation:
-            _evaluate_adaptation(data, scenario, method, plot, as_json=as_json)
-            return
+    if folds is not None or adaptation or search:
+        from analyzer.parallel import joblib_on
+
+        if not data or not scenario or any((*of_log, topic, model)):
+            wrong_use("--folds, --adaptation or --search goes with --data and --scenario alone")
+        if adaptation and (folds or search):
+            wrong_use("--adaptation goes without --folds and --search")
+        if plot is not None and (adaptation or search):
+            wrong_use("--plot does not go with --adaptation and --search")
         _check_plot(plot)
-        assert folds is not None
-        _evaluate_recipe(data, scenario, folds, method, plot, as_json=as_json)
+        with joblib_on(scheduler):
+            if adaptation:
+                _evaluate_adaptation(data, scenario, method, as_json=as_json)
+            elif search:
+                _search(data, scenario, folds or "source", method, as_json=as_json)
+            else:
+                assert folds is not None
+                _evaluate_recipe(data, scenario, folds, method, plot, as_json=as_json)
+    elif scheduler is not None:
+        wrong_use("--scheduler goes with --folds, --adaptation or --search")
     elif all(of_log) and not any((*of_model, scenario)):
         _check_plot(plot)
         assert log is not None
@@ -143,16 +164,13 @@ def _evaluate_model(
 def _evaluate_recipe(
     data: Path, scenario: str, folds: str, method: str, plot: Path | None, *, as_json: bool
 ) -> None:
-    from analyzer.evaluation.folds import KINDS, evaluate_recipe
+    from analyzer.evaluation.folds import evaluate_recipe
     from analyzer.evaluation.table import reliability_table
 
-    recipe = _recipe(method)
-    kinds = [kind for kind in KINDS if kind == folds]
-    if not kinds:
-        wrong_use(f"--folds {folds}: choose one of {', '.join(KINDS)}")
+    recipe, kind = chosen_recipe(method), _kind(folds)
     segments = _segments(data, scenario)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        found = evaluate_recipe(segments, recipe, kinds[0], report)
+        found = evaluate_recipe(segments, recipe, kind, report)
     if plot is not None:
         _save_plot(
             plot, f"{method} on {data} ({scenario}), by {folds}", found.scores, found.reliability
@@ -178,14 +196,42 @@ def _evaluate_recipe(
     print(*reliability_table(found.reliability, found.expected_calibration_error), sep="\n")
 
 
-def _evaluate_adaptation(
-    data: Path, scenario: str, method: str, plot: Path | None, *, as_json: bool
-) -> None:
+def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool) -> None:
+    from analyzer.evaluation.table import search_table
+    from analyzer.search import around, search
+
+    recipes, kind = around(chosen_recipe(method)), _kind(folds)
+    segments = _segments(data, scenario)
+    with steps_done(f"learning from {len(segments)} segments") as report:
+        tried = search(segments, recipes, kind, report)
+    if as_json:
+        found = [
+            {"cost": one.recipe.cost, "gamma": one.recipe.gamma} | asdict(one.scores)
+            for one in tried
+        ]
+        _print_json({"scenario": scenario, "method": method, "by": folds, "tried": found})
+        return
+    print(
+        f"method {method}, scenario {scenario}: {len(segments)} segments of 1 s, folds by {folds}\n"
+    )
+    print(*search_table(tried), sep="\n")
+    best = tried[0].recipe
+    print(f"\nhearthlog train --method {method} --cost {best.cost:g} --gamma {best.gamma:g} …")
+
+
+def _kind(folds: str) -> "Kind":
+    from analyzer.evaluation.folds import KINDS
+
+    kinds = [kind for kind in KINDS if kind == folds]
+    if not kinds:
+        wrong_use(f"--folds {folds}: choose one of {', '.join(KINDS)}")
+    return kinds[0]
+
+
+def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: bool) -> None:
     from analyzer.adaptation import adaptation_curve
 
-    if plot is not None:
-        wrong_use("--plot does not go with --adaptation")
-    recipe = _recipe(method)
+    recipe = chosen_recipe(method)
     segments = _segments(data, scenario)
     with steps_done(f"learning from {len(segments)} segments") as report:
         found = adaptation_curve(segments, recipe, report)
@@ -197,14 +243,6 @@ def _evaluate_adaptation(
     print(f"{'collection left out':{width}}", *(f"{count:6}" for count in found.corrected))
     for name, row in (found.collections | {"mean": found.mean}).items():
         print(f"{name:{width}}", *(f"{value:6.3f}" for value in row))
-
-
-def _recipe(method: str) -> "Recipe":
-    from analyzer.recipe import RECIPES
-
-    if method not in RECIPES:
-        wrong_use(f"--method {method}: choose one of {', '.join(RECIPES)}")
-    return RECIPES[method]
 
 
 def _segments(data: Path, scenario: str) -> "Dataset":

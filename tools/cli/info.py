@@ -3,31 +3,50 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
+
+from tools.cli.selection import log_location
+from tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
 
 if TYPE_CHECKING:
     from analyzer.summary import Summary
 
-_PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
-_SHOWN = 10  # of a list
 
 
 def info(
-    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="A log, or a folder of logs, or a URL such as s3://bucket/home.",
+            parser=log_location,
+        ),
+    ],
     *,
+    catalog: Annotated[
+        bool,
+        typer.Option(
+            "--catalog",
+            help="Write FOLDER/catalog.parquet, a row a file, and show the homes in the folder. "
+            "Files that are as it says already are not read again.",
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show what is in a log: span, topics, rates, gaps, labels, model, sizes.
 
-    Exit status 3: a file is unfinished or damaged, or sound is missing.
+    Exit status 3: a file is unfinished or damaged, or (without --catalog) sound is missing.
     """
+    if catalog:
+        from tools.cli.fleet import make_catalog
+
+        make_catalog(path, as_json=as_json)
+        return
     from analyzer.summary import summarise
     from schemas.files import find_logs
     from tools.cli.progress import track
@@ -57,8 +76,8 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
         "compression_ratio": summary.compression_ratio,
         "profiles": sorted(summary.profiles),
         "libraries": sorted(summary.libraries),
-        "start": _time(first),
-        "end": _time(last),
+        "start": moment(first),
+        "end": moment(last),
         "seconds": summary.seconds,
         "streams": summary.streams,
         "topics": {
@@ -79,7 +98,7 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
             microphone: dict(labels.most_common())
             for microphone, labels in summary.segments.items()
         },
-        "gaps": [asdict(gap) | {"start": _time(gap.start)} for gap in summary.gaps],
+        "gaps": [asdict(gap) | {"start": moment(gap.start)} for gap in summary.gaps],
         "gap_seconds": summary.gap_seconds,
         "health": _health(summary),
         "attachments": sorted(summary.attachments),
@@ -96,7 +115,7 @@ def _health(summary: "Summary") -> dict[str, str] | None:
         "level": level,
         "name": health.name,
         "message": health.message,
-        "time": str(_time(health.time)),
+        "time": str(moment(health.time)),
     }
 
 
@@ -104,7 +123,7 @@ def _print(summary: "Summary") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    width = None if sys.stdout.isatty() else _PLAIN_WIDTH
+    width = None if sys.stdout.isatty() else PLAIN_WIDTH
     console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True, width=width)
 
     def show(table: Table) -> None:
@@ -112,33 +131,33 @@ def _print(summary: "Summary") -> None:
             console.print(table, soft_wrap=False)
 
     for line in _lines(summary):
-        console.print(_printable(line))
+        console.print(printable(line))
     topics = Table("topic", "type", "messages", "per second", "MB raw", box=None)
     for name, topic in sorted(summary.topics.items()):
         encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
         size = "-" if topic.bytes is None else f"{topic.bytes / 1e6:.2f}"
         count, rate = str(topic.messages), f"{topic.rate:.3g}"
-        topics.add_row(_printable(name), _printable(topic.type + encoding), count, rate, size)
+        topics.add_row(printable(name), printable(topic.type + encoding), count, rate, size)
     show(topics)
     labels = Table("microphone", "label", "minutes", "segments", box=None)
     for microphone, label, seconds, segments in _label_rows(summary):
         minutes = f"{seconds / 60:.2f}"
-        labels.add_row(_printable(microphone), _printable(label), minutes, str(segments))
+        labels.add_row(printable(microphone), printable(label), minutes, str(segments))
     show(labels)
     for line in _gap_lines(summary):
-        console.print(_printable(line))
+        console.print(printable(line))
 
 
 def _lines(summary: "Summary") -> Iterator[str]:
     """Say what the files are, and what they say of themselves."""
-    chunks = f", {_number(summary.chunks, 'chunk')}" if summary.chunks else ""
+    chunks = f", {number(summary.chunks, 'chunk')}" if summary.chunks else ""
     ratio = summary.compression_ratio
     packed = f", compressed {ratio:.2f} to 1" if ratio else ""
-    yield f"{_number(len(summary.files), 'file')}, {summary.size / 1e6:.1f} MB{chunks}{packed}"
+    yield f"{number(len(summary.files), 'file')}, {summary.size / 1e6:.1f} MB{chunks}{packed}"
     if summary.span is None:
         yield "no messages"
     else:
-        start, end = map(_time, summary.span)
+        start, end = map(moment, summary.span)
         yield f"{start} to {end} ({_duration(summary.seconds)})"
     about = {
         "written by": summary.libraries,
@@ -147,8 +166,8 @@ def _lines(summary: "Summary") -> Iterator[str]:
         "attachments": summary.attachments,
     }
     yield "; ".join(f"{what} {', '.join(sorted(names))}" for what, names in about.items() if names)
-    yield from _first("unfinished", [str(path) for path in summary.unfinished])
-    yield from _first("layer", [str(path) for path in summary.layers])
+    yield from first_of("unfinished", [str(path) for path in summary.unfinished])
+    yield from first_of("layer", [str(path) for path in summary.layers])
     for stream in summary.streams:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
         yield (
@@ -162,20 +181,13 @@ def _lines(summary: "Summary") -> Iterator[str]:
 
 def _gap_lines(summary: "Summary") -> Iterator[str]:
     if summary.gaps:
-        yield f"{_number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
+        yield f"{number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
     lines = [
-        f"{gap.microphone} {_time(gap.start)} {gap.seconds:.3f} s, "
-        f"{_number(gap.frames_lost, 'frame')}: {gap.reason}"
+        f"{gap.microphone} {moment(gap.start)} {gap.seconds:.3f} s, "
+        f"{number(gap.frames_lost, 'frame')}: {gap.reason}"
         for gap in summary.gaps
     ]
-    yield from _first("gap", lines)
-
-
-def _first(what: str, lines: Sequence[str]) -> Iterator[str]:
-    for line in lines[:_SHOWN]:
-        yield f"{what}: {line}"
-    if len(lines) > _SHOWN:
-        yield f"{what}: and {len(lines) - _SHOWN} more (--json lists all)"
+    yield from first_of("gap", lines)
 
 
 def _label_rows(summary: "Summary") -> Iterator[tuple[str, str, float, int]]:
@@ -184,19 +196,6 @@ def _label_rows(summary: "Summary") -> Iterator[tuple[str, str, float, int]]:
         segments = summary.segments.get(microphone, Counter())
         for label in dict.fromkeys([*(name for name, _ in seconds.most_common()), *segments]):
             yield microphone, label, seconds[label], segments[label]
-
-
-def _printable(text: str) -> str:
-    """Leave out what would steer the terminal: it may come from a foreign file."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def _time(stamp: int | None) -> str | None:
-    return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
 
 
 def _duration(seconds: float) -> str:

@@ -15,6 +15,7 @@ from tools.cli.cat import cat
 from tools.cli.cut import cut
 from tools.cli.demo import demo
 from tools.cli.devices import devices
+from tools.cli.diff import diff
 from tools.cli.doctor import doctor
 from tools.cli.enrol import enrol
 from tools.cli.evaluate import evaluate
@@ -24,6 +25,7 @@ from tools.cli.merge import merge
 from tools.cli.models import models
 from tools.cli.record import record
 from tools.cli.recover import recover
+from tools.cli.relabel import relabel
 from tools.cli.replay import replay
 from tools.cli.review import review
 from tools.cli.train import train
@@ -47,8 +49,10 @@ for verb in (
     train,
     enrol,
     evaluate,
+    diff,
     review,
     replay,
+    relabel,
     demo,
 ):
     app.command()(verb)

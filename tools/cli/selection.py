@@ -8,7 +8,23 @@ import typer
 if TYPE_CHECKING:
     from analyzer.selection import Selection
 
-Logs = Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")]
+
+def log_location(text: str) -> Path:
+    """Read the name of a log or a folder, which may be the URL of a store."""
+    if "://" not in text:
+        return Path(text)
+    from analyzer.storage import location
+
+    return location(text)
+
+
+Logs = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
+        parser=log_location,
+    ),
+]
 Topics = Annotated[
     list[str] | None,
     typer.Option("--topics", help="Topic, or pattern such as '/mic/*'; may be given again."),

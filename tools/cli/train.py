@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tools.cli.progress import steps_done
+from tools.cli.recipe import chosen_recipe
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
     from analyzer.dataset import Dataset, Recording
+    from analyzer.recipe import Recipe
     from analyzer.scenario import Scenario
     from models.modelfile import Model
 
@@ -40,9 +42,18 @@ def train(
     method: Annotated[
         str, typer.Option(help="bands, or paper: the 42 statistics and SVM of the paper.")
     ] = "bands",
+    cost: Annotated[
+        float | None, typer.Option(help="Of a wrong segment; evaluate --search finds a good one.")
+    ] = None,
+    gamma: Annotated[
+        float | None, typer.Option(help="Of the kernel, times the number of inputs; as --cost.")
+    ] = None,
     smoothing: Annotated[
         str, typer.Option(help="How labels become segments: hmm, or merge (the paper's).")
     ] = "hmm",
+    scheduler: Annotated[
+        str | None, typer.Option(help="Learn on this Dask cluster, as tcp://host:port.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn a model from labelled sound, and measure it on sources it has not heard."""
@@ -50,13 +61,17 @@ def train(
 
     check_output(output)
     if base is not None:
-        if data or scenario or not home:
-            wrong_use("--base goes with --home, and without --data and --scenario")
+        if data or scenario or not home or scheduler or (cost, gamma) != (None, None):
+            wrong_use("--base goes with --home, and with nothing that is about --data")
         model, segments = _adapted(base, home)
     else:
         if not data or not scenario:
             wrong_use("give --data and --scenario, or --base and --home")
-        model, segments = _learned(data, scenario, home or [], method, smoothing)
+        from analyzer.parallel import joblib_on
+
+        recipe = chosen_recipe(method, cost, gamma)
+        with joblib_on(scheduler):
+            model, segments = _learned(data, scenario, home or [], recipe, smoothing)
     save_model(model, output)
     saved = load_model(output)
     if as_json:
@@ -69,16 +84,13 @@ def train(
 
 
 def _learned(
-    data: list[Path], scenario: str, home: list[Path], method: str, smoothing: str
+    data: list[Path], scenario: str, home: list[Path], recipe: "Recipe", smoothing: str
 ) -> tuple["Model", "Dataset"]:
     from analyzer.dataset import build_dataset
     from analyzer.manifest import read_manifest
-    from analyzer.recipe import RECIPES
     from analyzer.scenario import load_scenario
     from analyzer.train import SMOOTHINGS, train_model
 
-    if method not in RECIPES:
-        wrong_use(f"--method {method}: choose one of {', '.join(RECIPES)}")
     if smoothing not in SMOOTHINGS:
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
@@ -87,7 +99,7 @@ def _learned(
         segments = build_dataset(clips, chosen, report, _heard_at(home))
     _warn_of_few(segments)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        return train_model(segments, chosen, report, RECIPES[method], smoothing), segments
+        return train_model(segments, chosen, report, recipe, smoothing), segments
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:

@@ -1,0 +1,181 @@
+"""Workers of a Dask cluster that runs already."""
+
+import gc
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from analyzer.calls import pack_call, read_reply
+from analyzer.errors import WorkerError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_CONNECT_SECONDS = 10.0
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@contextmanager
+def connected(scheduler: str) -> Iterator["Client"]:
+    """Connect to a Dask cluster whose workers have this version of hearthlog.
+
+    Raises
+    ------
+    WorkerError
+        If Dask is not installed, there is no such scheduler, it has no workers, or a worker has
+        another version of hearthlog.
+    """
+    try:
+        from distributed import Client  # noqa: PLC0415  part of the extra `cluster`
+    except ModuleNotFoundError as error:
+        raise WorkerError("Dask is not installed; try: pip install 'hearthlog[cluster]'") from error
+    with _silence():
+        client = None
+        with suppress(OSError, ValueError):
+            client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
+        if client is None:
+            gc.collect()  # else what is left of it locks up the next one, if it ends at that time
+            raise WorkerError(f"no Dask scheduler at {scheduler}; start one with: dask scheduler")
+        try:
+            _check_versions(client, scheduler)
+            yield client
+        finally:
+            client.close(timeout=_CONNECT_SECONDS)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep Dask from logging: what goes wrong is said once, by us."""
+    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+
+
+def gone(scheduler: str) -> WorkerError:
+    """Return what to raise when the scheduler was lost."""
+    return WorkerError(f"the Dask scheduler at {scheduler} is gone; start it, and run this again")
+
+
+class Cluster:
+    """Workers of a Dask cluster.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        As `connected` makes it.
+    scheduler : str
+        For messages.
+    """
+
+    def __init__(self, client: "Client", scheduler: str) -> None:
+        self._client, self._scheduler = client, scheduler
+        self._executor = client.get_executor(pure=False)
+        self._guard = _guard(version("hearthlog"))
+
+    @property
+    def parallel(self) -> int:
+        """Threads of all workers just now; at least 1."""
+        if self._client.status != "running":
+            return 1
+        return max(sum(self._client.nthreads().values()), 1)
+
+    def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
+        """Run a function that a module has at its top on any worker."""
+        wanted: Future[T] = Future()
+        if self._client.status != "running":
+            wanted.set_exception(gone(self._scheduler))
+            return wanted
+        sent = self._executor.submit(self._guard, pack_call(function, args))
+        sent.add_done_callback(lambda done: self._deliver(done, wanted))
+        return wanted
+
+    def _deliver(self, done: Future[Any], wanted: Future[Any]) -> None:
+        if not wanted.set_running_or_notify_cancel():
+            return
+        try:
+            wanted.set_result(self._read(done))
+        except Exception as error:  # noqa: BLE001  raised where the result is asked for
+            wanted.set_exception(error)
+
+    def _read(self, done: Future[Any]) -> Any:
+        try:
+            refusal, reply = done.result()
+        except CancelledError as error:
+            raise gone(self._scheduler) from error
+        except Exception as error:
+            raise_if_killed(error)
+            raise
+        if refusal:
+            raise WorkerError(refusal)
+        return read_reply(reply)
+
+
+def raise_if_killed(error: Exception) -> None:
+    """Raise WorkerError if a task killed its workers."""
+    from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
+
+    if isinstance(error, KilledWorker):
+        times = error.allowed_failures + 1
+        raise WorkerError(
+            f"the task lost its worker {times} times: killed, or out of memory"
+        ) from error
+
+
+def _check_versions(client: "Client", scheduler: str) -> None:
+    """Refuse a cluster whose workers would compute something else."""
+    try:
+        client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
+    except TimeoutError as error:
+        raise WorkerError(
+            f"the Dask scheduler at {scheduler} has no workers; start some with: "
+            f"dask worker {scheduler}"
+        ) from error
+    ours = version("hearthlog")
+    # A function of the standard library, so that a worker without hearthlog can answer.
+    found = client.run(version, "hearthlog", on_error="return")
+    for worker, theirs in found.items():
+        if theirs != ours:
+            raise WorkerError(_refusal(worker, theirs, ours))
+
+
+def _refusal(worker: str, theirs: Any, ours: str) -> str:
+    has = f"hearthlog {theirs}" if isinstance(theirs, str) else "no hearthlog"
+    return f"the Dask worker at {worker} has {has}, this is {ours}; install {ours} there"
+
+
+def _guard(ours: str) -> Callable[[bytes], tuple[str, bytes]]:
+    """Make the function that workers run: it lets a worker of this version do a call.
+
+    It is a function within a function for Dask to send it as code: a worker that joined later may
+    have no hearthlog to import it from.
+    """
+
+    def guarded(call: bytes) -> tuple[str, bytes]:
+        from importlib import metadata  # noqa: PLC0415  runs elsewhere
+
+        from distributed import get_worker  # noqa: PLC0415  runs elsewhere
+
+        try:
+            theirs = metadata.version("hearthlog")
+        except metadata.PackageNotFoundError:
+            theirs = ""
+        if theirs != ours:
+            has = f"hearthlog {theirs}" if theirs else "no hearthlog"
+            worker = get_worker().address
+            return f"the Dask worker at {worker} has {has}, this is {ours}: not used", b""
+        from analyzer.calls import attempt  # noqa: PLC0415  not before it is known to be there
+
+        return "", attempt(call)
+
+    return guarded

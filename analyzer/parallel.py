@@ -1,0 +1,69 @@
+"""Learning many machines at once, in threads or on a Dask cluster, with the same code."""
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import joblib
+
+from analyzer.cluster import connected, gone, raise_if_killed
+from schemas.errors import HearthlogError
+
+_MOST_THREADS = 4
+
+
+def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
+    """Yield what calls return, in their order.
+
+    Parameters
+    ----------
+    calls : iterable of joblib.delayed
+        They run in threads, since libsvm frees the lock, or where `joblib.parallel_config` says.
+    """
+    threads = min(os.cpu_count() or 1, _MOST_THREADS)
+    return joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
+
+
+@contextmanager
+def joblib_on(scheduler: str | None) -> Iterator[None]:
+    """Let what joblib runs in the block run on a Dask cluster, if one is named.
+
+    Raises
+    ------
+    WorkerError
+        As `analyzer.cluster.connected` does, and if the cluster goes away or a fit kills its
+        workers.
+    """
+    if scheduler is None:
+        yield
+        return
+    with connected(scheduler) as client, joblib.parallel_config(_backend(client)):
+        try:
+            yield
+        except HearthlogError:
+            raise
+        except Exception as error:
+            if client.status != "running":
+                raise gone(scheduler) from error
+            raise_if_killed(error)
+            raise
+
+
+def _backend(client: Any) -> Any:
+    """Make joblib's Dask backend; where a task has killed its workers, it waits for ever."""
+    from joblib._dask import DaskDistributedBackend  # noqa: PLC0415  part of the extra `cluster`
+
+    class Backend(DaskDistributedBackend):  # type: ignore[misc]  # joblib has no types
+        def submit(self, func: Any, callback: Any = None) -> Any:
+            """Run a batch; joblib waits for the callback, which is told of results alone."""
+
+            def tell(done: Any) -> None:
+                if (error := done.exception()) is not None:
+                    callback(error)
+
+            future = super().submit(func, callback)
+            future.add_done_callback(tell)
+            return future
+
+    return Backend(client=client)

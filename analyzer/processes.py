@@ -1,0 +1,157 @@
+"""Workers that are processes of this machine."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any, ParamSpec, TypeVar
+
+from analyzer.calls import attempt, pack_call, read_reply
+from analyzer.errors import WorkerError
+
+LIVES = 3  # workers that a task may cost
+_TIDY_SECONDS = 3.0  # to remove what is half-written
+_SERVE = [sys.executable, "-P", "-c", "from analyzer.processes import serve; serve()"]
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Processes:
+    """A number of processes, each with a thread here that gives it one task after the other.
+
+    Parameters
+    ----------
+    count : int
+    """
+
+    def __init__(self, count: int) -> None:
+        self.parallel = count
+        self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
+        self._mine = threading.local()
+        self._lock = threading.Lock()
+        self._alive: set[_Process] = set()
+        self._closed = False
+
+    def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
+        """Run a function that a module has at its top, when a process is free."""
+        return self._threads.submit(self._run, function, args)
+
+    def close(self) -> None:
+        """Give up what is not done, and end the processes."""
+        with self._lock:
+            self._closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for process in list(self._alive):
+            process.hang_up()
+        self._threads.shutdown()
+        for process in self._alive:
+            process.end()
+
+    def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
+        call = pack_call(function, args)
+        for _ in range(LIVES):
+            process = self._process()
+            try:
+                return read_reply(process.ask(call))
+            except _LostError:
+                self._drop(process)
+        raise WorkerError(f"the task lost its worker {LIVES} times: killed, or out of memory")
+
+    def _process(self) -> "_Process":
+        """Return the process of this thread; start one if there is none."""
+        found: _Process | None = getattr(self._mine, "process", None)
+        if found is None:
+            with self._lock:
+                if self._closed:
+                    raise WorkerError("given up")
+                found = self._mine.process = _Process()
+                self._alive.add(found)
+        return found
+
+    def _drop(self, process: "_Process") -> None:
+        process.end()
+        self._mine.process = None
+        with self._lock:
+            if not self._closed:
+                self._alive.discard(process)
+
+
+class _LostError(Exception):
+    """The process ended before it answered."""
+
+
+class _Process:
+    """A process that answers calls, until nobody can call any more."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(  # noqa: S603  our own module
+            _SERVE,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            env=dict.fromkeys(_THREADS, "1")
+            | os.environ
+            | {"PYTHONPATH": os.pathsep.join(sys.path)},
+            process_group=0,  # Ctrl-C is for the parent, which then hangs up
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._calls = Connection(os.dup(self._process.stdin.fileno()), readable=False)
+        self._replies = Connection(os.dup(self._process.stdout.fileno()), writable=False)
+        self._process.stdin.close()
+        self._process.stdout.close()
+
+    def ask(self, call: bytes) -> bytes:
+        """Return the reply to a call."""
+        try:
+            self._calls.send_bytes(call)
+            return self._replies.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise _LostError from error
+
+    def hang_up(self) -> None:
+        """Tell the process to end."""
+        self._calls.close()
+
+    def end(self) -> None:
+        """End the process, however sick it is."""
+        self._calls.close()
+        try:
+            self._process.wait(2 * _TIDY_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._replies.close()
+
+
+def serve() -> None:
+    """Answer calls from standard input on standard output, until the parent hangs up or dies."""
+    calls = Connection(os.dup(0), writable=False)
+    replies = Connection(os.dup(1), readable=False)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.dup2(2, 1)  # what a task prints is no reply
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can tidy up
+    waiting: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
+    while True:
+        replies.send_bytes(attempt(waiting.get()))
+
+
+def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
+    """Notice that the parent is gone while a task runs."""
+    try:
+        while True:
+            waiting.put(calls.recv_bytes())
+    except (EOFError, OSError):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_TIDY_SECONDS)
+        os._exit(1)

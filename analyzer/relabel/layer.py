@@ -1,0 +1,166 @@
+"""The layer that a relabelling makes: its name, its topics, and what it says of itself."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from analyzer.relabel.neighbours import stem
+from models.segments import Run
+from schemas import messages
+from schemas.content import METADATA
+from schemas.errors import LogError
+from schemas.files import SUFFIX
+from schemas.logfile import LogFile
+from schemas.topics import Topic, topic
+
+_TAIL = 1 << 16  # bytes
+_NO_TOPIC = re.compile("[^A-Za-z0-9_]")
+_RUN = ("label", "start", "frames", "confidence")
+
+
+class Source(NamedTuple):
+    """What a layer is made from; equal sources give equal labels and segments.
+
+    Attributes
+    ----------
+    model, model_sha256 : str
+    input_sha256 : str
+        As `digest` gives it.
+    before, behind : str
+        Stems of the logs beside it, or empty.
+    """
+
+    model: str
+    model_sha256: str
+    input_sha256: str
+    before: str
+    behind: str
+
+
+class About(NamedTuple):
+    """What a layer says of itself.
+
+    Attributes
+    ----------
+    source : Source
+    began, ended : Run or None
+        The segment that was open when the log began, and when it ended.
+    lost : str
+        What of the log could not be read.
+    """
+
+    source: Source
+    began: Run | None
+    ended: Run | None
+    lost: str
+
+
+def layer_path(log: Path, model: str) -> Path:
+    """Name the layer of a log."""
+    return log.with_name(f"{stem(log)}.relabel-{model}{SUFFIX}")
+
+
+def topics_of(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
+    """Return the topics of the labels and of the segments."""
+    name = _NO_TOPIC.sub("_", model)
+    label, segment = (topic(microphone, f"relabel/{name}/{kind}") for kind in ("label", "segment"))
+    return (
+        Topic(label, messages.LABEL, array_names={"probabilities": classes}),
+        Topic(segment, messages.SEGMENT),
+    )
+
+
+def digest(log: Path) -> str:
+    """Identify a log: the SHA-256 of its size and its last 64 KiB.
+
+    There its index is, or the end of it, and the checksum of the index: it takes no reading of a
+    whole log to see that it is still the same.
+    """
+    with LogFile(log, indexed=False) as file:
+        size = file.size
+        tail = file.read(max(size - _TAIL, 0), _TAIL)
+    return hashlib.sha256(str(size).encode() + b"\0" + tail).hexdigest()
+
+
+def read_about(layer: Path) -> About | None:
+    """Read what a layer says of itself; None if there is no layer.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, or is none.
+    """
+    if not layer.exists():
+        return None
+    found: Mapping[str, str] = {}
+    try:
+        with LogFile(layer) as file:
+            places = [place for place in file.places if place.opcode == Opcode.METADATA]
+            records = [file.record(place) for place in places]
+        for record in records:
+            if isinstance(record, Metadata) and record.name == METADATA:
+                found = record.metadata
+        return About(
+            Source(*(found[name] for name in Source._fields)),
+            _read_run(found["began"]),
+            _read_run(found["ended"]),
+            found["lost"],
+        )
+    except (KeyError, ValueError, TypeError, LogError) as error:
+        why = error if isinstance(error, LogError) else f"{layer}: is no layer of `relabel`"
+        raise LogError(f"{why}; move it away, and run again") from error
+
+
+def part_path(layer: Path) -> Path:
+    """Name the beginning of a layer, which nothing takes for a log."""
+    return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
+
+
+def delete_parts(layer: Path) -> None:
+    """Delete what this and other runs have begun of a layer."""
+    for part in layer.parent.glob(f".{layer.name}.*.part"):
+        with suppress(OSError):
+            part.unlink()
+
+
+def metadata_of(about: About, log: str, node: str, more: Mapping[str, str]) -> dict[str, str]:
+    """Make the `hearthlog` record of a layer."""
+    return {
+        "version": version("hearthlog"),
+        "node": node,
+        "log": log,
+        **more,
+        **about.source._asdict(),
+        "began": _run_text(about.began),
+        "ended": _run_text(about.ended),
+        "lost": about.lost,
+        "made": _now(),
+    }
+
+
+def _now() -> str:
+    """Return the time, or that of SOURCE_DATE_EPOCH, by which builds are made reproducible."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
+    return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _run_text(run: Run | None) -> str:
+    return "" if run is None else json.dumps(run._asdict())
+
+
+def _read_run(text: str) -> Run | None:
+    if not text:
+        return None
+    fields = json.loads(text)
+    return Run(*(int(fields[name]) for name in _RUN))

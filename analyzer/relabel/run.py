@@ -1,0 +1,284 @@
+"""A relabelling: its tasks, what becomes of them, and in which order layers are completed."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
+from analyzer.relabel.layer import About, digest, layer_path, read_about
+from analyzer.relabel.neighbours import Chain, find_chains, is_active, stem
+from analyzer.workers import Workers
+from models.modelfile import Model
+from models.segments import Run
+from schemas.errors import HearthlogError, LogError
+
+_MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Relabelled:
+    """What became of the logs.
+
+    Attributes
+    ----------
+    layers : list of Path
+        Those that were written.
+    frames : int
+        That were labelled.
+    current : list of Path
+        Layers that were there already.
+    active : list of Path
+        Logs that are still being written.
+    lost : dict of Path to str
+        What could not be read of logs that were relabelled.
+    failed : dict of Path to str
+        Logs that were not relabelled, and why.
+    """
+
+    layers: list[Path] = field(default_factory=list)
+    frames: int = 0
+    current: list[Path] = field(default_factory=list)
+    active: list[Path] = field(default_factory=list)
+    lost: dict[Path, str] = field(default_factory=dict)
+    failed: dict[Path, str] = field(default_factory=dict)
+
+    @property
+    def logs(self) -> int:
+        """How many logs are done with."""
+        return sum(map(len, (self.layers, self.current, self.active, self.failed)))
+
+
+def relabel(
+    paths: Iterable[Path],
+    model: Model,
+    model_path: Path,
+    workers: Workers,
+    progress: Progress = lambda _done, _total: None,
+) -> Relabelled:
+    """Label logs anew, in layers beside them; layers that would be the same are left alone.
+
+    The same logs and the same model give the same labels and segments, whichever of the logs
+    are asked for together, and in however many tasks at once.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs.
+    model : Model
+    model_path : Path
+        Where workers find it.
+    workers : Workers
+    progress : callable
+        Told how many logs are done with, and how many there are.
+
+    Raises
+    ------
+    LogError
+        If there is no such log.
+    """
+    chains = find_chains(paths)
+    total = sum(len(chain.asked) for chain in chains)
+    work = _Relabelling(chains, model, model_path, workers)
+    work.run(lambda done: progress(done, total))
+    return work.result
+
+
+@dataclass
+class _Item:
+    """A log, and how far it is."""
+
+    place: int  # in its chain
+    job: Job
+    about: About | None = None  # what the layer says that is there, and may be replaced
+    current: bool = False  # that layer may stay, if it continues what is before it
+    running: bool = False
+    labelled: Labelled | None = None
+
+
+class _Line:
+    """The items of one chain, completed one after the other."""
+
+    def __init__(self, chain: Chain) -> None:
+        self.chain = chain
+        self.items: deque[_Item] = deque()
+        self._known: int | None = None  # the place behind which it is known what is open
+        self.open: Run | None = None
+
+    def knows(self, item: _Item) -> bool:
+        """Tell whether it is known what is open before an item."""
+        return self._known is not None and self._known == item.place - 1
+
+    def pass_by(self, ended: Run | None) -> None:
+        """Leave the first item behind; `ended` is what is open there."""
+        self._known, self.open = self.items.popleft().place, ended
+
+
+class _Relabelling:
+    def __init__(
+        self, chains: Sequence[Chain], model: Model, model_path: Path, workers: Workers
+    ) -> None:
+        self.result = Relabelled()
+        self._chains = chains
+        self._model = model
+        self._model_path = model_path
+        self._workers = workers
+        self._running: dict[Future[Any], tuple[_Line, _Item]] = {}
+
+    def run(self, progress: Callable[[int], None]) -> None:
+        """Do all of it."""
+        tasks = self._tasks()
+        try:
+            while True:
+                while len(self._running) < self._at_once and (task := next(tasks, None)):
+                    self._submit(*task)
+                progress(self.result.logs)
+                if not self._running:
+                    return
+                for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+                    self._take(future)
+        finally:
+            for future in self._running:  # none, unless something stopped us
+                _throw_away(future)
+
+    @property
+    def _at_once(self) -> int:
+        """Tasks that are handed out: enough that no worker waits for the next one."""
+        parallel = self._workers.parallel
+        return 2 * parallel if parallel > 1 else 1
+
+    def _tasks(self) -> Iterator[tuple[_Line, _Item]]:
+        """Look at the logs of one chain after the other, and yield those that are to be done."""
+        for chain in self._chains:
+            line = _Line(chain)
+            for place in chain.asked:
+                item = self._look_at(chain, place)
+                if item is not None:
+                    line.items.append(item)
+                    if not item.current:
+                        yield line, item
+                    self._advance(line)
+
+    def _look_at(self, chain: Chain, place: int) -> _Item | None:
+        """Look what there is of a log; None if nothing is to be done."""
+        log = chain.logs[place]
+        if is_active(log):
+            self.result.active.append(log)
+            return None
+        carried = place - 1 in chain.asked
+        job = self._job(chain, place, carried=carried)
+        try:
+            about = read_about(job.layer)
+            current = about is not None and self._is_current(job, about)
+        except HearthlogError as error:
+            self.result.failed[log] = str(error)
+            return None
+        return _Item(place, job._replace(replaces=about is not None), about, current)
+
+    def _job(self, chain: Chain, place: int, *, carried: bool) -> Job:
+        log = chain.logs[place]
+        first = max(place - _MOST_BEFORE, 0) if carried else 0
+        return Job(
+            log=log,
+            layer=layer_path(log, self._model.name),
+            before=tuple(reversed(chain.logs[first:place])),
+            behind=chain.logs[place + 1] if place + 1 < len(chain.logs) else None,
+            model=self._model_path,
+            model_sha256=self._model.sha256,
+            replaces=False,
+            carried=carried,
+        )
+
+    def _is_current(self, job: Job, about: About) -> bool:
+        """Tell whether a layer is what would be made again, but for what is open before it.
+
+        Raises
+        ------
+        LogError
+            If it is of another model, or of another log.
+        """
+        source = about.source
+        if source.model_sha256 != job.model_sha256:
+            raise LogError(
+                f"{job.layer}: was made by another model of this name "
+                f"({source.model_sha256[:12]}, not {job.model_sha256[:12]}); move it away, or give "
+                "the model another name"
+            )
+        if source.input_sha256 != digest(job.log):
+            raise LogError(
+                f"{job.layer}: was made from another log of this name; move it away, and run again"
+            )
+        before = stem(job.before[0]) if job.before else ""
+        behind = "" if job.behind is None else stem(job.behind)
+        return (source.before, source.behind) == (before, behind) and not about.lost
+
+    def _submit(self, line: _Line, item: _Item) -> None:
+        item.running = True
+        self._running[self._workers.submit(label_log, item.job)] = line, item
+
+    def _take(self, future: Future[Any]) -> None:
+        """Look what became of a task."""
+        line, item = self._running.pop(future)
+        try:
+            found = future.result()
+        except HearthlogError as error:
+            self.result.failed[item.job.log] = str(error)
+            with suppress(ValueError):
+                line.items.remove(item)
+        else:
+            if isinstance(found, Labelled):
+                item.running, item.labelled = False, found
+            else:
+                self._note(item)
+        self._advance(line)
+
+    def _advance(self, line: _Line) -> None:
+        """Complete what can be completed, in the order of time."""
+        while line.items and not line.items[0].running:
+            item = line.items[0]
+            known = line.knows(item)
+            if item.labelled is not None and (known or not item.labelled.begins):
+                labelled = item.labelled.joined(line.open)
+                line.pass_by(labelled.ended)
+                item.labelled = labelled
+                self._running[self._workers.submit(complete_layer, item.job, labelled)] = line, item
+            elif item.labelled is not None:  # the layer before was not made
+                item.labelled.part.unlink(missing_ok=True)
+                job = self._job(line.chain, item.place, carried=False)
+                item.job = job._replace(replaces=item.job.replaces)
+                item.labelled = None
+                self._submit(line, item)
+            elif item.current and (not known or _continues(item, line.open)):
+                assert item.about is not None
+                self.result.current.append(item.job.layer)
+                line.pass_by(item.about.ended)
+            elif item.current:
+                item.current = False
+                self._submit(line, item)
+            else:
+                return  # it is the next to be handed out
+
+    def _note(self, item: _Item) -> None:
+        assert item.labelled is not None
+        self.result.layers.append(item.job.layer)
+        self.result.frames += item.labelled.frames
+        if item.labelled.lost:
+            self.result.lost[item.job.log] = item.labelled.lost
+
+
+def _continues(item: _Item, before: Run | None) -> bool:
+    return item.about is not None and item.about.began == before
+
+
+def _throw_away(future: Future[Any]) -> None:
+    """Delete what a task has begun, if it is done and nobody has taken it."""
+    if future.done() and not future.cancelled() and future.exception() is None:
+        found = future.result()
+        if isinstance(found, Labelled):
+            with suppress(OSError):
+                found.part.unlink()

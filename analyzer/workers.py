@@ -1,0 +1,75 @@
+"""What runs tasks: this process, several processes of this machine, or a Dask cluster."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import closing, contextmanager
+from typing import ParamSpec, Protocol, TypeVar
+
+from analyzer.cluster import Cluster, connected
+from analyzer.processes import Processes
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Workers(Protocol):
+    """What runs tasks.
+
+    A task is a function that a module has at its top, with arguments that are small and can be
+    pickled: paths, not arrays. It may run more than once, if its worker was lost.
+    """
+
+    @property
+    def parallel(self) -> int:
+        """How many tasks run at once just now; at least 1."""
+
+    def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
+        """Run a task.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            Of what the function returns or raises; WorkerError if its worker was lost three
+            times, the cluster is gone, or a worker has another version of hearthlog.
+        """
+
+
+@contextmanager
+def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Workers]:
+    """Open what runs tasks; tasks that are not done when the block ends are given up.
+
+    Parameters
+    ----------
+    count : int
+        Processes; 1 runs each task in this one, when it is submitted.
+    scheduler : str, optional
+        Address of a running Dask cluster, as `tcp://host:port`, instead.
+
+    Raises
+    ------
+    WorkerError
+        If there is no such scheduler, it has no workers, or one of another version.
+    """
+    if scheduler is not None:
+        with connected(scheduler) as client:
+            yield Cluster(client, scheduler)
+    elif count == 1:
+        yield _Here()
+    else:
+        with closing(Processes(count)) as processes:
+            yield processes
+
+
+class _Here:
+    """The process that asks."""
+
+    parallel = 1
+
+    def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Run a function."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except Exception as error:  # noqa: BLE001  raised where the result is asked for
+            future.set_exception(error)
+        return future

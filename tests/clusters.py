@@ -1,0 +1,60 @@
+"""Dask clusters on loopback, of real processes, on ports that they choose."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+
+DASK = str(Path(sys.executable).with_name("dask"))
+LONG = 60.0
+
+
+def until(true):
+    deadline = time.monotonic() + LONG
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@contextmanager
+def running(command, paths=(), stderr=subprocess.DEVNULL, **options):
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([*paths, str(Path(__file__).parent)]),
+        "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
+        "TERM": "xterm",
+        "COLUMNS": "100",
+    }
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=stderr, env=environment, **options
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                for each in [*psutil.Process(process.pid).children(recursive=True), process]:
+                    each.kill()
+
+
+# Without these a port of Dask's web server, and of a worker, is open to the network.
+PRIVATE = ["--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0", "--no-dashboard"]
+
+
+@contextmanager
+def scheduler_in(folder):
+    """Start a scheduler; it chooses its port."""
+    about = folder / "scheduler.json"
+    command = [DASK, "scheduler", "--port", "0", "--scheduler-file", str(about)]
+    with running([*command, *PRIVATE]) as process:
+        until(about.exists)
+        yield json.loads(about.read_text())["address"], process
+
+
+def worker_of(address, *options, threads=1):
+    command = [DASK, "worker", address, "--nthreads", str(threads)]
+    return running([*command, *PRIVATE, *options])

@@ -1,0 +1,62 @@
+"""Stores for the tests of logs that lie elsewhere: a server that speaks S3, and memory."""
+
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from analyzer.storage import location
+
+
+@pytest.fixture(scope="session")
+def s3_account() -> dict[str, str]:
+    """Environment in which clients find an S3 server, on a port of its own."""
+    from moto.server import ThreadedMotoServer  # noqa: PLC0415  takes half a second
+
+    server = ThreadedMotoServer("127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield account(f"http://{host}:{port}")
+    server.stop()
+
+
+def account(endpoint: str) -> dict[str, str]:
+    """Make the environment in which clients find an S3 server."""
+    return {
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": "resident",
+        "AWS_SECRET_ACCESS_KEY": "secret",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }
+
+
+@pytest.fixture
+def bucket(s3_account, monkeypatch) -> Path:
+    """A bucket of its own, empty; processes that are started find it, too."""
+    from s3fs import S3FileSystem  # noqa: PLC0415  takes half a second
+
+    for name, value in s3_account.items():
+        monkeypatch.setenv(name, value)
+    S3FileSystem.clear_instance_cache()  # the environment is no part of its key
+    name = f"homes-{uuid4()}"
+    S3FileSystem().mkdir(name)
+    yield location(f"s3://{name}")
+    S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def in_memory() -> Path:
+    """A folder in the memory of this process."""
+    folder = location(f"memory://{uuid4()}")
+    yield folder
+    if folder.exists():
+        folder.fs.rm(folder.path, recursive=True)
+
+
+def put(folder: Path, store: Path) -> Path:
+    """Copy a folder of logs to a store, file by file."""
+    for path in sorted(folder.rglob("*.mcap*")):
+        there = store.joinpath(*path.relative_to(folder).parts)
+        there.fs.pipe_file(there.path, path.read_bytes())
+    return store

@@ -1,0 +1,72 @@
+"""Tasks for workers: functions that another process can import."""
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+from schemas.errors import LogError
+
+
+class PickyError(Exception):
+    """An error that cannot be pickled."""
+
+    def __init__(self, first, second):
+        super().__init__(f"{first} and {second}")
+
+
+def own_id(*_):
+    return os.getpid()
+
+
+def add(first, second):
+    print("a task may print")  # noqa: T201  that is what is tried
+    return first + second
+
+
+def fail(path):
+    raise LogError(f"{path}: not a log")
+
+
+def fail_pickily():
+    raise PickyError("this", "that")
+
+
+def divide(number):
+    return number / 0
+
+
+def return_lock():
+    return threading.Lock()
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_once(path):
+    if not Path(path).exists():
+        Path(path).touch()
+        die()
+    return "done"
+
+
+def nap(seconds):
+    time.sleep(seconds)
+    return "done"
+
+
+def touch_and_nap(path, seconds):
+    Path(path).touch()
+    time.sleep(seconds)
+
+
+def write_slowly(folder):
+    """Hold a file, named after the process, as long as it runs."""
+    path = Path(folder, str(os.getpid()))
+    path.touch()
+    try:
+        time.sleep(100)
+    finally:
+        path.unlink()

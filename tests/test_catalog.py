@@ -1,0 +1,582 @@
+"""A catalogue says what is read of the logs, is never trusted more than they are, saves opening."""
+
+import json
+import os
+import re
+import shutil
+import struct
+from collections import Counter
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from logs import features, read
+from mcap.opcode import Opcode
+from spliced import record_logs, run
+from stores import put
+
+from analyzer.catalog import (
+    DAMAGED,
+    FINISHED,
+    LOG,
+    RELABEL,
+    REVIEW,
+    UNFINISHED,
+    load_catalog,
+    read_catalog,
+    write_catalog,
+)
+from analyzer.catalogfile import SCHEMA, sealed
+from analyzer.errors import DataError
+from analyzer.fleet import heard, homes
+from analyzer.review import Mark, write_marks
+from analyzer.selection import select
+from recorder.config import Microphone, Settings
+from recorder.service import record
+from recorder.sources.replayed import FileSource
+from schemas import messages
+from schemas.errors import LogError
+from schemas.files import CATALOG, active_path, find_logs
+from schemas.logfile import FOOTER_SIZE, time_span
+from schemas.messages import NANOSECONDS, nanoseconds
+from schemas.topics import Topic
+from schemas.writer import LogWriter, Rows
+
+SECOND = NANOSECONDS
+START = 1_772_352_000_000_000_000  # a full hour
+
+
+def fleet_of(recording: Path, folder: Path) -> Path:
+    """Make two homes: one with a recording of several logs, one with a log that is cut off."""
+    for path in find_logs(recording):
+        copy = folder / "north" / "anna" / path.relative_to(recording)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
+    path = find_logs(recording)[0]
+    copy = active_path(folder / "bert" / path.relative_to(recording))
+    copy.parent.mkdir(parents=True)
+    copy.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(day, model_file, tmp_path_factory):
+    """Logs of a minute, with gaps."""
+    return record_logs([day], tmp_path_factory.mktemp("recording"), model_file)
+
+
+@pytest.fixture
+def fleet(recording, tmp_path):
+    return fleet_of(recording, tmp_path / "fleet")
+
+
+def relabelled(log: Path, segments: list[tuple[int, str]]) -> Path:
+    """Write a relabel layer: segments, each with its seconds, one after the other."""
+    path = log.with_name(f"{log.stem}.relabel-better.1.mcap")
+    topic = "/mic/relabel/better_1/segment"
+    lengths = np.array([seconds for seconds, _ in segments]) * SECOND
+    start = (time_span(log) or (0, 0))[0]
+    fields = {
+        "header.stamp": start + np.cumsum(lengths) - lengths,
+        "header.frame_id": "mic",
+        "duration": lengths,
+        "label": [label for _, label in segments],
+        "confidence": np.ones(len(segments), np.float32),
+    }
+    about = {
+        "version": "7.8.9",
+        "node": "attic",
+        "log": log.name,
+        "model": "better.1",
+        "model_sha256": "ab" * 32,
+        "input_sha256": "cd" * 32,
+        "feature_set": "auros21",
+    }
+    writer = LogWriter(path, [Topic(topic, messages.SEGMENT)], about)
+    writer.write_columns([Rows(topic, start + np.cumsum(lengths), fields)])
+    return writer.finish()
+
+
+def with_counts(data: bytes, count: int) -> bytes:
+    """Let a log claim that each of its channels has so many messages."""
+    footer = len(data) - FOOTER_SIZE
+    (start,) = struct.unpack_from("<Q", data, footer + 9)
+    changed = bytearray(data)
+    place = start
+    while place < footer:
+        opcode, length = struct.unpack_from("<BQ", changed, place)
+        if opcode == Opcode.STATISTICS:
+            counts = place + 9 + 46  # behind numbers of fixed length, and the length of the map
+            for entry in range(counts, place + 9 + length, 10):
+                struct.pack_into("<Q", changed, entry + 2, count)
+        place += 9 + length
+    struct.pack_into("<I", changed, footer + 9 + 16, 0)  # no checksum of the summary
+    return bytes(changed)
+
+
+def rows(catalog) -> dict:
+    return {row.path: row for row in catalog.rows()}
+
+
+def garbage(path: Path) -> None:
+    """Make a file nonsense of the same size and time, which whoever reads it will notice."""
+    about = path.stat()
+    path.write_bytes(bytes(about.st_size))
+    os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
+
+
+def overwritten(path: Path) -> None:
+    """Overwrite a few bytes in the middle of a log."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
+    path.write_bytes(data)
+
+
+def seconds_of(found) -> float:
+    return nanoseconds(found.duration) / SECOND
+
+
+def test_a_row_says_of_a_log_what_is_read_of_it_message_by_message(recorded, tmp_path):
+    fleet = fleet_of(recorded, tmp_path / "fleet")
+    catalog = write_catalog(fleet)
+    assert len(catalog) == len(find_logs(fleet))
+    for path in find_logs(fleet):
+        row = catalog.current(path)
+        numbers, stamps, values = features(path)
+        segments, gaps, (info, *_) = read(path, "segment"), read(path, "gap"), read(path, "info")
+        assert row.path == path.relative_to(fleet).as_posix()
+        assert (row.kind, row.log, row.error) == (LOG, None, None)
+        assert row.span == time_span(path)
+        assert row.frames == len(values)
+        assert (row.first_frame, row.first_stamp) == (numbers[0], stamps[0])
+        assert (row.last_frame, row.last_stamp) == (numbers[-1], stamps[-1])
+        assert row.microphones == [info.header.frame_id]
+        assert (row.model, row.model_sha256) == (info.model, info.model_sha256)
+        assert row.feature_set == info.feature_set
+        assert row.gaps == len(gaps)
+        assert row.gap_seconds == pytest.approx(sum(map(seconds_of, gaps)))
+        minutes = Counter()
+        for segment in segments:
+            minutes[segment.label] += seconds_of(segment) / 60
+        assert {one["label"]: one["minutes"] for one in row.labels} == pytest.approx(minutes)
+        counts = Counter(segment.label for segment in segments)
+        assert {one["label"]: one["segments"] for one in row.labels} == counts
+
+
+def test_homes_nodes_and_states_are_told_apart(fleet):
+    found = rows(write_catalog(fleet))
+    assert {row.home for row in found.values()} == {"north/anna", "bert"}
+    assert {row.state for row in found.values() if row.home == "north/anna"} == {FINISHED}
+    (cut,) = [row for row in found.values() if row.home == "bert"]
+    assert cut.state == UNFINISHED
+    assert cut.node == Path(cut.path).name.partition("_")[0]
+
+
+def test_a_log_outside_of_folders_of_days_is_of_no_home(recording, tmp_path):
+    path = find_logs(recording)[0]
+    shutil.copy2(path, tmp_path)
+    (row,) = write_catalog(tmp_path).rows()
+    assert (row.path, row.home) == (path.name, "")
+
+
+def test_layers_have_rows_of_their_own_that_name_their_log(fleet):
+    log = find_logs(fleet / "north")[0]
+    start, _ = time_span(log)
+    write_marks(log, [Mark("mic", start, start + 30 * SECOND, "crying")])
+    relabelled(log, [(12, "speech"), (6, "music"), (18, "speech")])
+    found = rows(write_catalog(fleet))
+    name = log.relative_to(fleet).as_posix()
+    relabel = found[name.replace(".mcap", ".relabel-better.1.mcap")]
+    review = found[name.replace(".mcap", ".review.mcap")]
+    assert (relabel.kind, relabel.log, relabel.home) == (RELABEL, name, "north/anna")
+    assert (review.kind, review.log, review.microphones) == (REVIEW, name, ["mic"])
+    assert (relabel.model, relabel.model_sha256) == ("better.1", "ab" * 32)
+    assert (relabel.input_sha256, relabel.version, relabel.node) == ("cd" * 32, "7.8.9", "attic")
+    assert relabel.frames == 0
+    assert list(relabel.labels) == [
+        {"label": "music", "minutes": 0.1, "segments": 1},
+        {"label": "speech", "minutes": 0.5, "segments": 2},
+    ]
+    assert list(review.labels) == [{"label": "crying", "minutes": 0.5, "segments": 1}]
+
+
+def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_path, capfd):
+    log = find_logs(fleet / "north")[0]
+    layer = relabelled(log, [(12, "speech"), (6, "music")])
+    hall = Settings(output=tmp_path, model=model_file, microphone=[Microphone(name="hall")])
+    (other,) = record(hall, FileSource([day], START), Event()).logs
+    merged = fleet / "merged.mcap"
+    assert run(capfd, "merge", log, layer, other, "-o", merged).returncode == 0
+    catalog = write_catalog(fleet)
+    row, alone = catalog.current(merged), catalog.current(log)
+    assert (row.version, row.model, row.node) == (None, None, None)
+    assert row.feature_set == "auros21"
+    assert row.microphones == ["hall", "mic"]
+    assert row.frames > alone.frames
+    assert (row.first_frame, row.last_stamp) == (None, None)
+    live = Counter(found.label for path in (log, other) for found in read(path, "segment"))
+    assert {one["label"]: one["segments"] for one in row.labels} == live
+
+
+def test_more_labels_than_a_classifier_has_are_an_error_in_a_row(tmp_path):
+    log = tmp_path / "a.mcap"
+    LogWriter(log, [], {}).finish()
+    relabelled(log, [(1, f"label_{i}") for i in range(101)])
+    assert {row.path: row.error for row in write_catalog(tmp_path).rows()} == {
+        "a.mcap": None,
+        "a.relabel-better.1.mcap": "has more than 100 different labels; no classifier has so many",
+    }
+
+
+def test_a_log_that_is_renamed_while_others_are_read_has_no_row(fleet):
+    first, second, *others = find_logs(fleet)
+
+    def rename(done, _):
+        if done == 1:
+            second.rename(second.with_name("elsewhere"))
+
+    catalog = write_catalog(fleet, None, rename)
+    names = [path.relative_to(fleet).as_posix() for path in (first, *others)]
+    assert sorted(names) == catalog.table["path"].to_pylist()
+
+
+def test_what_a_log_claims_of_its_frames_is_not_believed_beyond_its_size(recording, tmp_path):
+    path = tmp_path / "a.mcap"
+    data = find_logs(recording)[0].read_bytes()
+    path.write_bytes(with_counts(data, (1 << 64) - 1))
+    (row,) = write_catalog(tmp_path).rows()
+    assert row.state == FINISHED
+    assert row.frames == len(data)
+
+
+def test_other_programs_read_the_same(fleet):
+    """What a test in pandas, polars or DuckDB would find: plain columns of plain types."""
+    catalog = write_catalog(fleet)
+    table = pq.read_table(fleet / CATALOG)
+    assert table.column_names == SCHEMA.names
+    assert table["start"].type == pa.timestamp("ns", "UTC")
+    assert table.num_rows == len(catalog)
+    assert table["frames"].to_pylist() == [row.frames for row in catalog.rows()]
+
+
+def test_the_queries_in_the_documentation_give_what_they_say(fleet, monkeypatch, capsys):
+    log = find_logs(fleet / "north")[0]
+    relabelled(log, [(12, "speech")])
+    text = (Path(__file__).parents[1] / "docs" / "catalog.md").read_text()
+    (code,) = [part for part in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "pq" in part]
+    fleet.rename(fleet.with_name("homes"))
+    homes_folder = fleet.with_name("homes")
+    write_catalog(homes_folder)
+    monkeypatch.chdir(fleet.parent)
+    exec(code.replace("general-1", "better.1"), {})
+    printed = capsys.readouterr().out
+    assert "gap_seconds_sum" in printed
+    assert "minutes_sum" in printed
+    left = [path.relative_to(homes_folder).as_posix() for path in find_logs(homes_folder)]
+    left = [name for name in left if "relabel" not in name and Path(name).name != log.name]
+    assert all(repr(name) in printed for name in left)
+
+
+def test_what_did_not_change_is_not_read_again(fleet):
+    first = write_catalog(fleet)
+    for path in find_logs(fleet):
+        garbage(path)
+    again = write_catalog(fleet, load_catalog(fleet))
+    assert again.table == first.table
+    assert {row.state for row in write_catalog(fleet).rows()} == {DAMAGED}
+
+
+def test_what_changed_came_or_went_is_read_as_if_there_was_no_catalogue(fleet):
+    write_catalog(fleet)
+    first, second, *_ = find_logs(fleet / "north")
+    third = first.with_name("attic_20200101T000000Z.mcap")
+    shutil.copy2(first, third)
+    relabelled(third, [(12, "speech")])
+    first.unlink()
+    overwritten(second)
+    catalog = write_catalog(fleet, load_catalog(fleet))
+    assert catalog.table == write_catalog(fleet).table
+    assert catalog.current(first) is None
+    assert catalog.current(second).state == DAMAGED
+    assert catalog.current(third).state == FINISHED
+
+
+def test_nothing_is_said_of_a_file_that_changed_since(fleet):
+    catalog = write_catalog(fleet)
+    touched, grown, gone, *_ = find_logs(fleet)
+    os.utime(touched, ns=(0, 1))
+    about = grown.stat()
+    with grown.open("ab") as stream:
+        stream.write(b"more")
+    os.utime(grown, ns=(about.st_atime_ns, about.st_mtime_ns))
+    gone.unlink()
+    assert [catalog.current(path) for path in (touched, grown, gone)] == [None] * 3
+    assert catalog.current(fleet.parent / "elsewhere.mcap") is None
+
+
+def test_a_damaged_log_is_a_row_with_its_error_and_is_looked_at_every_time(fleet):
+    path = find_logs(fleet)[1]
+    whole, about = path.read_bytes(), path.stat()
+    garbage(path)
+    row = write_catalog(fleet).current(path)
+    assert (row.state, row.span, row.frames) == (DAMAGED, None, 0)
+    assert row.error == "is no MCAP file"
+    path.write_bytes(whole)
+    os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert write_catalog(fleet, load_catalog(fleet)).current(path).state == FINISHED
+
+
+def test_damage_in_a_chunk_that_is_read_is_noticed(fleet):
+    path = find_logs(fleet / "north")[0]
+    overwritten(path)
+    row = write_catalog(fleet).current(path)
+    assert row.state == DAMAGED
+    assert row.error.startswith("damaged at byte ")
+
+
+def test_an_interrupted_catalogue_keeps_what_was_read(fleet):
+    def interrupt(done, total):
+        if done == total // 2:
+            raise KeyboardInterrupt
+
+    paths = find_logs(fleet)
+    with pytest.raises(KeyboardInterrupt):
+        write_catalog(fleet, None, interrupt)
+    known = load_catalog(fleet)
+    assert len(known) == len(paths) // 2
+    assert write_catalog(fleet, known).table == write_catalog(fleet).table
+
+
+@pytest.mark.parametrize("part", ["all", "first", "middle"])
+def test_a_selection_is_the_same_with_a_catalogue(fleet, part):
+    spans = list(map(time_span, find_logs(fleet / "north")))
+    start, end = {
+        "all": (None, None),
+        "first": (None, spans[0][1]),
+        "middle": (spans[1][0], spans[1][1] - SECOND),
+    }[part]
+    before = select([fleet], ["/*/segment"], start, end)
+    write_catalog(fleet)
+    assert select([fleet], ["/*/segment"], start, end) == before
+
+
+def test_logs_outside_of_a_span_are_not_opened_where_a_catalogue_knows_theirs(fleet):
+    first, *others = find_logs(fleet / "north")
+    _, end = time_span(first)
+    cut = find_logs(fleet / "bert")
+    before = select([fleet], (), None, end - SECOND)
+    write_catalog(fleet)
+    for path in others:
+        garbage(path)
+    assert select([fleet], (), None, end - SECOND) == before
+    assert set(before.logs) == {first, *cut}
+    with pytest.raises(LogError):
+        select([fleet / "north"], (), None, end - SECOND)  # where there is no catalogue
+
+
+def test_a_selection_asks_the_file_where_the_catalogue_is_out_of_date(fleet):
+    write_catalog(fleet)
+    first, second, *_ = find_logs(fleet / "north")
+    shutil.copyfile(second, first)
+    start, end = time_span(second)
+    assert first in select([fleet], (), start, end).logs
+
+
+def sealed_bytes(table: pa.Table, **options) -> bytes:
+    """Make a file that has the digest of a catalogue."""
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table, buffer, **{"compression": "none"} | options)
+    return b"".join(sealed(memoryview(buffer.getvalue())))
+
+
+def with_column(table: pa.Table, name: str, values: list) -> pa.Table:
+    """Put something else in a column, of its type if that can be."""
+    kind = pa.string() if isinstance(values[0], str) else table.schema.field(name).type
+    column = pa.array(values * len(table), kind)
+    return table.set_column(table.column_names.index(name), name, column)
+
+
+def flipped(data: bytes) -> bytes:
+    """Change a bit of a path, which remains a path."""
+    changed = bytearray(data)
+    changed[changed.index(b"_2026") + 3] ^= 1
+    return bytes(changed)
+
+
+def repeated(table: pa.Table, count: int, name: str, value: object) -> pa.Table:
+    """Say the same many times, which takes little room in a file."""
+    table = table.take([0] * count)
+    column = pa.array([value], table.schema.field(name).type).dictionary_encode()
+    return table.set_column(
+        table.column_names.index(name), name, column.take(pa.array([0] * count))
+    )
+
+
+def unsealed(data: bytes) -> bytes:
+    """Leave out the digest."""
+    footer = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    return data[: footer - 32] + data[footer:]
+
+
+LABEL = {"label": "speech", "minutes": 1.0, "segments": 1}
+FILES = {
+    "empty": lambda _: b"",
+    "cut": lambda data: data[: len(data) // 2],
+    "no Parquet": lambda _: b"path,home\n" * 1000,
+    "a bit of a row": flipped,
+    "a bit of the footer": lambda data: data[:-20] + bytes([data[-20] ^ 1]) + data[-19:],
+    "without a digest": unsealed,
+}
+TABLES = {
+    "another table": lambda _: pa.table({"path": ["a"]}),
+    "another version": lambda table: table.replace_schema_metadata({"hearthlog_catalog": "0"}),
+    "another type": lambda table: with_column(table, "size", ["much"]),
+    "no lists": lambda table: with_column(table, "labels", ["speech"]),
+    "a null": lambda table: with_column(table, "size", [None]),
+    "a null in a list": lambda table: with_column(table, "labels", [[LABEL | {"label": None}]]),
+    "long texts": lambda table: repeated(table, 5000, "error", "x" * 100_000),
+    "long lists": lambda table: with_column(table, "labels", [[LABEL] * 100_000]),
+}
+ENCODINGS = {
+    "compressed": {"compression": "zstd"},
+    "in pieces": {"use_dictionary": False, "column_encoding": {"path": "DELTA_BYTE_ARRAY"}},
+}
+
+
+def unusable(kind: str, data: bytes) -> bytes:
+    """Make a catalogue one that cannot be used."""
+    if kind in FILES:
+        return FILES[kind](data)
+    table = pq.read_table(pa.BufferReader(data))
+    return sealed_bytes(TABLES.get(kind, lambda same: same)(table), **ENCODINGS.get(kind, {}))
+
+
+@pytest.mark.parametrize("kind", [*FILES, *TABLES, *ENCODINGS])
+def test_a_catalogue_that_cannot_be_used_is_no_catalogue(fleet, kind):
+    before = select([fleet])
+    write_catalog(fleet)
+    path = fleet / CATALOG
+    path.write_bytes(unusable(kind, path.read_bytes()))
+    with pytest.raises(DataError, match="cannot be used as a catalogue"):
+        load_catalog(fleet)
+    assert read_catalog(fleet) is None
+    assert select([fleet]) == before
+
+
+def test_how_much_a_catalogue_holds_is_known_before_it_is_read(fleet):
+    write_catalog(fleet)
+    path = fleet / CATALOG
+    path.write_bytes(unusable("long lists", path.read_bytes()))
+    with pytest.raises(DataError, match="holds more than a file of its size can"):
+        load_catalog(fleet)
+
+
+def test_a_catalogue_in_a_store_is_like_one_of_this_machine(fleet, in_memory):
+    here = write_catalog(fleet).table.drop_columns("mtime")
+    store = put(fleet, in_memory)
+    there = write_catalog(store)
+    assert there.table.drop_columns("mtime") == here
+    again = load_catalog(store)
+    assert again.table == there.table
+    assert all(again.current(path) for path in find_logs(store))
+    (store / there.table["path"][0].as_py()).write_bytes(b"nonsense")
+    assert write_catalog(store, again).table["state"][0].as_py() == DAMAGED
+
+
+def test_the_command_makes_the_catalogue_of_a_bucket(fleet, bucket, capfd):
+    store = put(fleet, bucket)
+    assert run(capfd, "info", store, "--catalog").returncode == 3
+    assert load_catalog(store).table.column("path") == write_catalog(fleet).table.column("path")
+
+
+def test_a_selection_in_a_bucket_is_the_same_with_a_catalogue(fleet, bucket):
+    first, *_ = find_logs(fleet / "north")
+    store = put(fleet, bucket)
+    _, end = time_span(first)
+    before = select([store], (), None, end - SECOND)
+    catalog = write_catalog(store)
+    assert write_catalog(store, load_catalog(store)).table == catalog.table
+    assert select([store], (), None, end - SECOND) == before
+
+
+def test_the_homes_of_a_folder_are_summed_up(fleet):
+    log = find_logs(fleet / "north")[0]
+    relabelled(log, [(12, "speech"), (6, "music"), (18, "speech")])
+    overwritten(find_logs(fleet / "north")[-1])
+    catalog = write_catalog(fleet)
+    found = [row for row in catalog.rows() if row.home == "north/anna"]
+    logs = [row for row in found if row.kind == LOG]
+    bert, anna = homes(catalog)
+    assert (bert.home, bert.logs, bert.layers, bert.unfinished, bert.damaged) == (
+        "bert",
+        1,
+        0,
+        1,
+        0,
+    )
+    assert (anna.home, anna.logs, anna.layers) == ("north/anna", len(logs), 1)
+    assert (anna.unfinished, anna.damaged) == (0, 1)
+    assert anna.size == sum(row.size for row in found)
+    assert anna.hours == pytest.approx(sum(row.frames for row in logs) / 72_000)
+    assert (anna.gaps, anna.gap_seconds) == (
+        sum(row.gaps for row in logs),
+        pytest.approx(sum(row.gap_seconds for row in logs)),
+    )
+    assert anna.start == min(row.start for row in logs if row.start is not None)
+    assert anna.end == max(row.end for row in logs if row.end is not None)
+    relabel = [one for one in heard(catalog) if one.kind == RELABEL]
+    assert [(one.home, one.model, one.label, one.minutes, one.segments) for one in relabel] == [
+        ("north/anna", "better.1", "speech", 0.5, 2),
+        ("north/anna", "better.1", "music", 0.1, 1),
+    ]
+
+
+def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
+    done = run(capfd, "info", fleet, "--catalog")
+    assert done.returncode == 3  # a log is cut off
+    assert done.stderr == ""
+    assert "north/anna" in done.stdout
+    assert "2 homes" in done.stdout
+    (cut,) = find_logs(fleet / "bert")
+    assert f"unfinished: {cut.relative_to(fleet).as_posix()}" in done.stdout
+    cut.unlink()
+    assert run(capfd, "info", fleet, "--catalog").returncode == 0
+    assert {row.home for row in load_catalog(fleet).rows()} == {"north/anna"}
+
+
+def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
+    path = find_logs(fleet / "north")[0]
+    garbage(path)
+    done = run(capfd, "info", fleet, "--catalog", "--json")
+    assert done.returncode == 3
+    assert done.stderr == f"hearthlog: {path}: is no MCAP file\n"
+    said = json.loads(done.stdout)
+    catalog = load_catalog(fleet)
+    assert said["files"] == len(catalog)
+    assert said["damaged"] == {path.relative_to(fleet).as_posix(): "is no MCAP file"}
+    assert [home["home"] for home in said["homes"]] == ["bert", "north/anna"]
+    assert [home["hours"] for home in said["homes"]] == [home.hours for home in homes(catalog)]
+    minutes = sum(one["minutes"] for row in catalog.rows() for one in row.labels)
+    assert sum(one["minutes"] for one in said["labels"]) == pytest.approx(minutes)
+
+
+def test_the_command_says_that_a_catalogue_was_unusable_and_makes_it_anew(fleet, capfd):
+    table = write_catalog(fleet).table
+    (fleet / CATALOG).write_bytes(b"PAR1")
+    done = run(capfd, "info", fleet, "--catalog")
+    assert done.stderr.startswith(f"hearthlog: {fleet / CATALOG}: cannot be used as a catalogue")
+    assert done.stderr.endswith("; it is made anew\n")
+    assert load_catalog(fleet).table == table
+
+
+def test_a_catalogue_is_of_a_folder_with_logs(recording, tmp_path, capfd):
+    path = find_logs(recording)[0]
+    done = run(capfd, "info", path, "--catalog")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "give the folder" in done.stderr
+    done = run(capfd, "info", tmp_path, "--catalog")
+    assert (done.returncode, list(tmp_path.iterdir())) == (1, [])
+    assert "no log" in done.stderr

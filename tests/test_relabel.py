@@ -1,0 +1,418 @@
+"""Logs labelled anew: as the recorder would have, whole, in parts, and after whatever happens."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Event as Flag
+
+import pytest
+from clusters import scheduler_in, worker_of
+from conftest import HEARTHLOG
+from lossy import LossySource
+from spliced import run, small_disk
+from stores import put
+
+from analyzer.doctor import examine
+from analyzer.relabel.layer import digest, layer_path, read_about
+from analyzer.relabel.neighbours import find_chains, is_layer
+from analyzer.relabel.run import relabel
+from analyzer.workers import open_workers
+from models.modelfile import load_model, save_model
+from recorder.config import Settings
+from recorder.service import record
+from recorder.sources.replayed import FileSource
+from schemas.columns import read_columns
+from schemas.files import find_logs
+from schemas.logfile import LogFile
+
+START = 1_772_348_370_123_456_789  # half a minute after the hour
+EPOCH = {"SOURCE_DATE_EPOCH": "1772348400"}
+
+
+@pytest.fixture(autouse=True)
+def same_time(monkeypatch):
+    """Layers of one log and model differ in the time at which they were made, and nowhere else."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", EPOCH["SOURCE_DATE_EPOCH"])
+
+
+@pytest.fixture(scope="module", params=["merged", "smoothed"])
+def model(request, model_file, hmm_file):
+    return model_file if request.param == "merged" else hmm_file
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory, sounds, model):
+    """Logs of a minute with gaps, labelled by the model as they were recorded."""
+    folder = tmp_path_factory.mktemp("recorded")
+    settings = Settings(output=folder, model=model, max_bag_duration=60)
+    record(settings, LossySource(FileSource(sounds, START), {5: 7, 90: 150}), Flag())
+    return folder
+
+
+@pytest.fixture
+def logs(recording, tmp_path):
+    return Path(shutil.copytree(recording, tmp_path / "logs"))
+
+
+@pytest.fixture(scope="module")
+def layers(recording, model, tmp_path_factory):
+    """What a relabelling of the whole gives, byte for byte."""
+    folder = Path(shutil.copytree(recording, tmp_path_factory.mktemp("whole") / "logs"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", EPOCH["SOURCE_DATE_EPOCH"])
+        assert not relabelled(model, folder).failed
+    return written(folder)
+
+
+def relabelled(model, *paths, workers=1):
+    with open_workers(workers) as pool:
+        return relabel(paths, load_model(model), model, pool)
+
+
+def written(folder):
+    """Layers by name; nothing else has been left beside the logs."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert all(path.suffix == ".mcap" for path in files)
+    return {path.name: path.read_bytes() for path in files if is_layer(path)}
+
+
+def recorded_logs(folder):
+    return [path for path in find_logs(folder) if not is_layer(path)]
+
+
+def rows(columns):
+    """Make all that columns hold comparable."""
+    return [
+        columns.log_times.tolist(),
+        *(columns[path].tolist() for path in sorted(columns.fields)),
+    ]
+
+
+def test_the_model_of_the_recording_says_the_same_again(model, logs):
+    relabelled(model, logs)
+    columns = read_columns(find_logs(logs))
+    name = load_model(model).name
+    for kind in ("label", "segment"):
+        live, anew = columns[f"/mic/{kind}"], columns[f"/mic/relabel/{name}/{kind}"]
+        assert len(live) > 20
+        assert rows(anew) == rows(live)
+        assert anew.metadata.get("probabilities_names") == live.metadata.get("probabilities_names")
+
+
+def test_the_logs_are_not_touched(recording, model, logs):
+    relabelled(model, logs)
+    for log in recorded_logs(recording):
+        assert (logs / log.relative_to(recording)).read_bytes() == log.read_bytes()
+
+
+def test_any_number_of_workers_gives_the_same_bytes(model, logs, layers):
+    relabelled(model, logs, workers=3)
+    assert written(logs) == layers
+
+
+def test_logs_one_by_one_in_any_order_give_the_same_bytes(model, logs, layers):
+    for log in reversed(recorded_logs(logs)):
+        relabelled(model, log)
+    assert written(logs) == layers
+
+
+def test_what_is_there_is_left_alone(model, logs, layers):
+    relabelled(model, logs)
+    times = {path: path.stat().st_mtime_ns for path in find_logs(logs)}
+    again = relabelled(model, logs)
+    assert (again.layers, again.frames, len(again.current)) == ([], 0, len(layers))
+    assert {path: path.stat().st_mtime_ns for path in find_logs(logs)} == times
+
+
+def test_what_is_missing_is_made(model, logs, layers):
+    relabelled(model, logs)
+    gone = [path for path in find_logs(logs) if is_layer(path)][1::2]
+    for path in gone:
+        path.unlink()
+    again = relabelled(model, logs)
+    assert sorted(again.layers) == sorted(gone)
+    assert written(logs) == layers
+
+
+def test_a_log_that_comes_later_has_the_layer_before_it_made_again(model, logs, layers, tmp_path):
+    """Until then, what was open at its end had to be closed there."""
+    later = recorded_logs(logs)[1:]
+    for number, log in enumerate(later):
+        log.rename(tmp_path / str(number))
+    relabelled(model, logs)
+    for number, log in enumerate(later):
+        (tmp_path / str(number)).rename(log)
+        relabelled(model, logs)
+    assert written(logs) == layers
+
+
+def test_a_run_that_is_killed_goes_on_where_it_was(model, logs, layers):
+    command = [*HEARTHLOG, "relabel", str(logs), "--model", str(model), "--workers", "2"]
+    for _ in range(3):
+        process = subprocess.Popen(command, start_new_session=True)
+        wait_for(lambda: begun(logs) or complete(logs, layers))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    wait_for(lambda: not busy(logs))
+    found = relabelled(model, logs)
+    assert not found.failed
+    assert written(logs) == layers
+
+
+def complete(folder, layers):
+    return sum(map(is_layer, find_logs(folder))) == len(layers)
+
+
+def begun(folder):
+    return any(path.suffix == ".part" for path in folder.rglob("*"))
+
+
+def busy(folder):
+    """Tell whether a process still has a file of a folder open."""
+    fds = (fd for process in Path("/proc").glob("[0-9]*") for fd in opened(process))
+    return any(str(folder) in fd for fd in fds)
+
+
+def opened(process):
+    try:
+        return [str(fd.readlink()) for fd in (process / "fd").iterdir()]
+    except OSError:
+        return []
+
+
+def wait_for(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_two_runs_at_once_do_not_hinder_each_other(model, logs, layers):
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda _: relabelled(model, logs, workers=2), range(2)))
+    assert [one.failed for one in both] == [{}, {}]
+    assert written(logs) == layers
+
+
+def test_a_layer_says_what_made_it(model, logs):
+    relabelled(model, logs)
+    log, behind = recorded_logs(logs)[:2]
+    loaded = load_model(model)
+    about = read_about(layer_path(log, loaded.name))
+    assert about.source.model_sha256 == loaded.sha256
+    assert about.source.input_sha256 == digest(log)
+    assert (about.source.before, about.source.behind) == ("", behind.stem)
+
+
+def test_layers_are_sound(model, logs):
+    relabelled(model, logs)
+    kinds = {kind for findings in examine(logs) for kind in findings.counts}
+    assert kinds <= {("warning", "gap")}
+
+
+def test_segments_are_in_chunks_of_their_own(model, logs):
+    relabelled(model, logs)
+    for path in find_logs(logs):
+        if is_layer(path):
+            with LogFile(path) as file:
+                assert all(len(ids) == 1 for ids in file.channel_sets)
+
+
+def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, capfd):
+    log = recorded_logs(logs)[1]
+    with LogFile(log) as file:
+        chunk = file.chunks[len(file.chunks) // 2]
+    data = bytearray(log.read_bytes())
+    data[int(chunk["offset"]) + 200] ^= 255
+    log.write_bytes(data)
+
+    done = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
+
+    assert done.returncode == 3
+    assert f"partly relabelled: {log}" in done.stderr
+    assert log.read_bytes() == data
+    frames = [labelled_frames(path, model) for path in (log, recorded_logs(logs)[0])]
+    assert 0.9 * 1200 < frames[0] < 1200
+    again = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
+    assert again.returncode == 3
+
+
+def labelled_frames(log, model):
+    name = load_model(model).name
+    return len(read_columns([layer_path(log, name)])[f"/mic/relabel/{name}/label"])
+
+
+def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
+    log = recorded_logs(logs)[1]
+    data = log.read_bytes()
+    log.write_bytes(data[: len(data) * 2 // 3])
+    done = run(capfd, "relabel", log, "--model", model, "--workers", 1)
+    assert done.returncode == 3
+    assert "cut off" in done.stderr
+    assert labelled_frames(log, model) > 200
+
+
+def test_a_log_that_is_being_written_is_left_for_later(model, logs, capfd):
+    *_, last = recorded_logs(logs)
+    last.rename(last.with_name(last.name + ".active"))
+    done = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
+    assert done.returncode == 0
+    assert "1 log still being written" in done.stdout
+
+
+def test_one_that_is_no_log_costs_nothing_else(model, logs, layers, capfd):
+    bad = recorded_logs(logs)[0].with_name("note.mcap")
+    bad.write_bytes(b"this is no log" * 100)
+    done = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
+    assert done.returncode == 3
+    assert done.stderr.count("not relabelled") == 1
+    assert f"not relabelled: {bad}" in done.stderr
+    assert set(written(logs)) == set(layers)
+
+
+def test_a_layer_of_another_model_of_that_name_is_kept(model, logs, tmp_path, capfd):
+    relabelled(model, logs)
+    before = written(logs)
+    loaded = load_model(model)
+    (tmp_path / "other").mkdir()
+    other = tmp_path / "other" / model.name
+    save_model(replace(loaded, intercepts=loaded.intercepts + 1), other)
+    done = run(capfd, "relabel", logs, "--model", other, "--workers", 1)
+    assert done.returncode == 1
+    assert "was made by another model of this name" in done.stderr
+    assert written(logs) == before
+
+
+def test_a_layer_of_another_log_of_that_name_is_kept(model, logs, capfd):
+    first, second = recorded_logs(logs)[:2]
+    relabelled(model, first)
+    before = written(logs)
+    shutil.copy(second, first)
+    done = run(capfd, "relabel", first, "--model", model, "--workers", 1)
+    assert done.returncode == 1
+    assert "was made from another log of this name" in done.stderr
+    assert written(logs) == before
+
+
+def test_what_is_no_layer_is_kept(model, logs, capfd):
+    log = recorded_logs(logs)[0]
+    layer = layer_path(log, load_model(model).name)
+    shutil.copy(log, layer)
+    data = layer.read_bytes()
+    done = run(capfd, "relabel", log, "--model", model, "--workers", 1)
+    assert done.returncode == 1
+    assert f"{layer}: is no layer of `relabel`" in done.stderr
+    assert layer.read_bytes() == data
+
+
+def test_logs_without_features_are_named(model, tmp_path, recording, capfd):
+    log = recorded_logs(recording)[0]
+    done = run(capfd, "cut", log, "-o", tmp_path / "cut.mcap", "--topics", "/mic/segment")
+    assert done.returncode == 0
+    done = run(capfd, "relabel", tmp_path / "cut.mcap", "--model", model, "--workers", 1)
+    assert done.returncode == 1
+    assert "cut.mcap: has no features" in done.stderr
+    assert written(tmp_path) == {}
+
+
+def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, capfd):
+    with small_disk(tmp_path / "disk", "3m") as disk:
+        for log in recorded_logs(recording)[:3]:
+            shutil.copy(log, disk)
+        space = os.statvfs(disk).f_bavail * os.statvfs(disk).f_frsize
+        (disk / "fill").write_bytes(b"x" * (space - 20_000))
+        done = run(capfd, "relabel", disk, "--model", model, "--workers", 1)
+        assert done.returncode == 1
+        assert "No space left" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert sorted(p.name for p in disk.iterdir() if "relabel" in p.name) == []
+
+
+def test_logs_of_two_nodes_in_one_folder_are_two_sounds(model, logs, layers):
+    for log in recorded_logs(logs):
+        shutil.copy(log, log.with_name(log.name.replace("home_", "attic_")))
+    assert [len(chain.logs) for chain in find_chains([logs])] == [len(layers)] * 2
+    relabelled(model, logs)
+    found = written(logs)
+    assert {name: data for name, data in found.items() if name in layers} == layers
+
+
+def test_no_logs_are_one_line(model, tmp_path, capfd):
+    done = run(capfd, "relabel", tmp_path, "--model", model)
+    assert (done.returncode, done.stderr.count("\n")) == (1, 2)
+    assert f"{tmp_path}: no log" in done.stderr
+
+
+@pytest.mark.parametrize("store", ["bucket", "in_memory"])
+def test_logs_in_a_store_are_relabelled_where_they_are(request, recording, model, layers, store):
+    folder = put(recording, request.getfixturevalue(store))
+    found = relabelled(model, folder)
+    assert not found.failed
+    files = {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert {name: data for name, data in files.items() if ".relabel-" in name} == layers
+    assert not [name for name in files if name.startswith(".")]
+    again = relabelled(model, folder)
+    assert (len(again.current), again.failed) == (len(layers), {})
+
+
+def test_workers_find_logs_and_the_model_in_a_store(recording, model, layers, bucket, hearthlog):
+    folder = put(recording, bucket)
+    there = folder / "models" / model.name
+    there.fs.pipe_file(there.path, model.read_bytes())
+    done = hearthlog("relabel", folder, "--model", there, "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in find_logs(folder) if is_layer(p)} == set(layers)
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The address of a cluster of two workers."""
+    folder = tmp_path_factory.mktemp("dask")
+    with scheduler_in(folder) as (address, _), worker_of(address), worker_of(address):
+        yield address
+
+
+def test_a_cluster_gives_the_same_bytes(model, logs, layers, scheduler, hearthlog):
+    done = hearthlog("relabel", logs, "--model", model, "--scheduler", scheduler, env=EPOCH)
+    assert done.returncode == 0, done.stderr
+    assert drop_made(written(logs)) == drop_made(layers)
+
+
+def drop_made(layers):
+    """The workers of a cluster have a time of their own."""
+    return {
+        name: re.sub(rb"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\dZ", b"", data)
+        for name, data in layers.items()
+    }
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(model, logs, hearthlog):
+    done = hearthlog("relabel", logs, "--model", model, "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(
+        "hearthlog: no Dask scheduler at tcp://127.0.0.1:9"
+    )
+    assert written(logs) == {}
+
+
+def test_after_the_scheduler_went_away_a_run_completes_what_is_left(model, logs, layers, tmp_path):
+    with scheduler_in(tmp_path) as (address, scheduler), worker_of(address):
+        command = [*HEARTHLOG, "relabel", str(logs), "--model", str(model), "--scheduler", address]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+            wait_for(lambda: begun(logs) or complete(logs, layers))
+            scheduler.kill()
+            _, said = process.communicate(timeout=60)
+        assert process.returncode in {1, 3}
+        assert "Traceback" not in said
+        assert f"the Dask scheduler at {address} is gone" in said
+    wait_for(lambda: not busy(logs))
+    for layer in (path for path in find_logs(logs) if is_layer(path)):
+        layer.unlink()
+    assert not relabelled(model, logs).failed
+    assert written(logs) == layers

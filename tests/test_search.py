@@ -1,0 +1,202 @@
+"""Searching for cost and gamma, and learning in threads or on a Dask cluster alike."""
+
+import dataclasses
+import json
+import os
+import pty
+import sys
+
+import numpy as np
+import pytest
+import tasks
+from blobs import blobs, ignore_progress
+from clusters import running, scheduler_in, worker_of
+from joblib import delayed
+
+from analyzer.adaptation import adaptation_curve
+from analyzer.errors import DataError, WorkerError
+from analyzer.evaluation.folds import evaluate_recipe
+from analyzer.parallel import in_parallel, joblib_on
+from analyzer.recipe import RECIPES, cross_validate, prepare
+from analyzer.search import around, search
+from analyzer.train import group_folds
+from models.modelfile import load_model
+from tools.home.simulate import write_training_set
+
+PAPER = RECIPES["paper"]
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cluster")
+    # joblib does without a cluster that has a single thread.
+    with scheduler_in(folder) as (address, _), worker_of(address, "--no-nanny", threads=2):
+        yield address
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    return write_training_set(tmp_path_factory.mktemp("clips"), clips_per_class=2, seed=3)
+
+
+def test_a_search_tries_less_as_much_and_more_of_both():
+    recipes = around(PAPER)
+    assert len(set(recipes)) == 9
+    assert PAPER in recipes
+    assert {recipe._replace(cost=0.0, gamma=0.0) for recipe in recipes} == {
+        PAPER._replace(cost=0.0, gamma=0.0)
+    }
+
+
+def test_a_search_puts_first_what_tells_segments_apart_best():
+    data, _ = blobs(3, 40)
+    useless = PAPER._replace(gamma=1e4)  # so sharp that it knows nothing but what it has seen
+    tried = search(data, [useless, PAPER], "source", ignore_progress)
+    assert [one.recipe for one in tried] == [PAPER, useless]
+    assert tried[0].scores.macro_f1 > tried[1].scores.macro_f1 + 0.2
+
+
+def test_a_search_finds_the_figures_that_cross_validation_finds():
+    data, _ = blobs(3, 40)
+    steps = []
+    recipes = around(PAPER)[:2]
+    tried = search(data, recipes, "source", lambda *step: steps.append(step))
+    for recipe, scores in tried:
+        assert scores == evaluate_recipe(data, recipe, "source", ignore_progress).scores
+    assert steps == [(done, 10) for done in range(1, 11)]
+
+
+def test_a_search_over_segments_that_are_all_alike_is_refused():
+    data, _ = blobs(2, 20)
+    flat = dataclasses.replace(data, windows=np.ones_like(data.windows))
+    with pytest.raises(DataError, match="all segments are alike"):
+        search(flat, around(PAPER), "source", ignore_progress)
+
+
+def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
+    data, _ = blobs(3, 60)
+    recipes, examples = around(PAPER)[:3], prepare(PAPER, data)
+    arguments = (recipes, examples, 3, group_folds(data), ignore_progress)
+    here = cross_validate(*arguments)
+    with joblib_on(cluster):
+        there = cross_validate(*arguments)
+    assert not np.isnan(here).any()
+    np.testing.assert_array_equal(here, there)
+
+
+def test_a_cluster_adapts_as_threads_do(cluster):
+    data, _ = blobs(3, 400, spread=3.0)
+    group = np.arange(len(data)) // 4
+    data = dataclasses.replace(data, group=group, collection=group % 2, collection_names=("a", "b"))
+    here = adaptation_curve(data, PAPER, ignore_progress)
+    with joblib_on(cluster):
+        assert adaptation_curve(data, PAPER, ignore_progress) == here
+
+
+def test_a_cluster_runs_what_it_is_given(cluster):
+    def ids():
+        return set(in_parallel(delayed(tasks.own_id)() for _ in range(4)))
+
+    assert ids() == {os.getpid()}
+    with joblib_on(cluster):
+        assert os.getpid() not in ids()
+    assert ids() == {os.getpid()}
+
+
+def test_a_scheduler_that_goes_away_while_learning_is_one_line(tmp_path):
+    with (
+        scheduler_in(tmp_path) as (address, scheduler),
+        worker_of(address, "--no-nanny", threads=2),
+        pytest.raises(WorkerError) as error,
+        joblib_on(address),
+    ):
+        [scheduler.kill() for _ in in_parallel(delayed(tasks.nap)(0.2) for _ in range(40))]
+    assert str(error.value).startswith(f"the Dask scheduler at {address} is gone")
+
+
+def test_a_fit_that_kills_its_workers_is_one_line(tmp_path):
+    with (
+        scheduler_in(tmp_path) as (address, _),
+        worker_of(address, "--local-directory", str(tmp_path), threads=2),
+        pytest.raises(WorkerError, match="lost its worker 4 times"),
+        joblib_on(address),
+    ):
+        list(in_parallel(delayed(tasks.die)() for _ in range(2)))
+
+
+def test_a_model_learned_with_a_cluster_is_the_same_file(cluster, clips, tmp_path, hearthlog):
+    words = ["--data", clips, "--scenario", "bathroom", "--method", "paper", "--cost", 2]
+    for name, more in (("here", ()), ("there", ("--scheduler", cluster))):
+        done = hearthlog("train", *words, *more, "-o", tmp_path / f"{name}.safetensors")
+        assert done.returncode == 0, done.stderr
+    here, there = (load_model(tmp_path / f"{name}.safetensors") for name in ("here", "there"))
+    assert here.description.cost == 2
+    assert here.description.gamma == pytest.approx(PAPER.gamma / 42)
+    assert here.sha256 == there.sha256
+
+
+def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
+    words = ["--data", clips, "--scenario", "bathroom", "--method", "paper"]
+    printed = hearthlog("evaluate", *words, "--search").stdout
+    found = json.loads(hearthlog("evaluate", *words, "--search", "--json").stdout)["tried"]
+    assert len(found) == 9
+    assert found == sorted(found, key=lambda one: -one["macro_f1"])
+    best = found[0]
+    chosen = ["--cost", f"{best['cost']:g}", "--gamma", f"{best['gamma']:g}"]
+    assert " ".join(chosen) in printed
+    done = hearthlog("train", *words, *chosen, "-o", tmp_path / "a.safetensors", "--json")
+    assert json.loads(done.stdout)["metrics"]["macro_f1"] == pytest.approx(best["macro_f1"])
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (
+            "evaluate --data d --scenario bathroom --search --adaptation",
+            "--adaptation goes without",
+        ),
+        ("evaluate --data d --scenario bathroom --search --plot p.png", "--plot does not go with"),
+        ("evaluate --data d --search", "goes with --data and --scenario alone"),
+        ("evaluate --data d --scenario bathroom --search --folds x", "choose one of segment"),
+        ("evaluate --data d --model m --scheduler tcp://h:1", "--scheduler goes with --folds"),
+        ("train -o m.safetensors --data d --scenario bathroom --cost 0", "--cost 0: it must"),
+        ("train -o m.safetensors --data d --scenario bathroom --gamma nan", "--gamma nan: it must"),
+        ("train -o m.safetensors --base b --home h --cost 0", "nothing that is about --data"),
+    ],
+)
+def test_wrong_use_is_one_line(words, line, tmp_path, hearthlog):
+    words = words.replace("m.safetensors", str(tmp_path / "m.safetensors"))
+    done = hearthlog(*words.split())
+    assert done.returncode == 2
+    assert line in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+_STEPS = """
+import time
+from tools.cli.progress import steps_done
+with steps_done("trying") as report:
+    for done in range(1, 5):
+        time.sleep(0.3)
+        report(done, 2000)
+"""
+
+
+def test_a_terminal_shows_the_time_left():
+    shown, terminal = pty.openpty()
+    with running([sys.executable, "-c", _STEPS], stderr=terminal) as process:
+        os.close(terminal)
+        text = b""
+        while part := _read(shown):
+            text += part
+        assert process.wait() == 0
+    os.close(shown)
+    assert b"trying" in text
+    assert b"0:1" in text  # of ten minutes or so
+
+
+def _read(terminal):
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # the other side is closed
+        return b""

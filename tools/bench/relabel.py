@@ -1,0 +1,135 @@
+"""A day relabelled: read, classified, smoothed and written; ours, and with the libraries alone."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.writer import Writer
+from rosbags.highlevel import AnyReader
+
+from analyzer.dataset import Dataset
+from analyzer.hmm import viterbi
+from analyzer.train import train_model
+from models.inputs import InputStream
+from models.modelfile import Model, save_model
+from schemas.files import find_logs
+from schemas.messages import LABEL, definition, encode, header, message, nanoseconds
+from tools.bench.inference import fit_scikit_learn
+from tools.bench.table import Row, Table, Target
+from tools.bench.timing import HEARTHLOG, BenchError, hearthlog
+from tools.bench.workload import Workload
+
+_HOURS = 24
+_MIDNIGHT = "2026-03-01T00:00"
+_SUPPORT = 2000
+_SAMPLE = 4000  # frames that the peer is measured with
+_CALL = 1000  # rows
+_WORKERS = 2
+_RUN = """
+import resource, subprocess, sys
+done = subprocess.run(sys.argv[1:], capture_output=True, text=True)
+sys.stderr.write(done.stderr)
+print(done.stdout)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+sys.exit(done.returncode)
+"""
+
+
+class _Run(NamedTuple):
+    seconds: float
+    frames: int
+    megabytes: float  # of the largest process
+
+
+def measure(work: Workload) -> Table:
+    """Measure relabelling a day of hourly logs."""
+    logs = work.folder / "relabel"
+    data = _part(work)
+    model = train_model(data, work.training[1], lambda _done, _total: None)
+    path = work.folder / "day.safetensors"
+    save_model(model, path)
+    sound = [work.wav] * round(_HOURS * 3600 / work.seconds)
+    hearthlog(["record", *sound, "-o", logs, "--start", _MIDNIGHT])
+    one, two = (_ours(logs, path, workers) for workers in (1, _WORKERS))
+    peer = _peer(find_logs(logs)[0], model, data, work.folder / "peer.mcap")
+    peer *= two.frames / _SAMPLE
+    what = f"rosbags, scikit-learn, hmmlearn and mcap ({_SAMPLE} frames, scaled)"
+    rows = [
+        Row("two workers", two.seconds, "s", target=Target(20, at_most=True)),
+        Row("one worker", one.seconds, "s"),
+        Row("one worker / two", one.seconds / two.seconds, "", target=Target(1.8)),
+        Row(what, peer, "s", peer / two.seconds, Target(10)),
+        Row("peak memory of a process", two.megabytes, "MB", target=Target(500, at_most=True)),
+    ]
+    support, classes = len(model.support_vectors), len(model.classes)
+    title = f"relabel: {two.frames:,} frames, {support} support vectors, {classes} classes, elapsed"
+    return Table(title, rows)
+
+
+def _part(work: Workload) -> Dataset:
+    """Take so much of the training data that about 2,000 vectors support what it teaches."""
+    data, _ = work.training
+    share = min(_SUPPORT / len(work.model.support_vectors), 1.0)
+    rows = np.random.default_rng(0).permutation(len(data))[: round(share * len(data))]
+    rows.sort()
+    fields = ("windows", "target", "group", "collection", "weight")
+    return dataclasses.replace(data, **{name: getattr(data, name)[rows] for name in fields})
+
+
+def _ours(logs: Path, model: Path, workers: int) -> _Run:
+    for layer in logs.rglob("*.relabel-*.mcap"):
+        layer.unlink()
+    asked = ["relabel", logs, "--model", model, "--workers", workers, "--json"]
+    began = time.perf_counter()
+    done = subprocess.run(  # noqa: S603  ours
+        [sys.executable, "-c", _RUN, *HEARTHLOG, *map(str, asked)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    seconds = time.perf_counter() - began
+    if done.returncode != 0:
+        raise BenchError(f"hearthlog relabel failed: {done.stderr.strip()[-300:]}")
+    text, _, megabytes = done.stdout.rstrip().rpartition("\n")
+    return _Run(seconds, json.loads(text)["frames"], float(megabytes))
+
+
+def _peer(log: Path, model: Model, data: Dataset, output: Path) -> float:
+    """Relabel the first frames of a log message by message, and return the seconds it takes."""
+    machine = fit_scikit_learn(data)
+    classes = model.classes
+    began = time.perf_counter()
+    with AnyReader([log]) as reader:
+        chosen = [c for c in reader.connections if c.topic == "/mic/features"]
+        read = (reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen))
+        heard: list[Any] = [message for _, message in zip(range(_SAMPLE), read, strict=False)]
+    inputs = InputStream(model.description.inputs)(np.array([m.values for m in heard]))
+    rows = inputs.astype(np.float64)
+    calls = [rows[first : first + _CALL] for first in range(0, len(rows), _CALL)]
+    found = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)
+    viterbi(found, model.transitions)
+    with output.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema(LABEL, "ros2msg", definition(LABEL).encode())
+        channel = writer.register_channel("/mic/label", "cdr", schema)
+        for said, probabilities in zip(heard[-len(found) :], found, strict=True):
+            best = int(probabilities.argmax())
+            stamp = nanoseconds(said.header.stamp)
+            label = message(
+                LABEL,
+                header=header(stamp, "mic"),
+                frame=said.frame,
+                label=classes[best],
+                confidence=float(probabilities[best]),
+                novelty=float("nan"),
+                probabilities=probabilities,
+            )
+            writer.add_message(channel, stamp, encode(label), stamp)
+        writer.finish()
+    return time.perf_counter() - began

@@ -1,0 +1,31 @@
+"""How numbers, times and lists are printed."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
+_SHOWN = 10  # of a list
+
+
+def printable(text: str) -> str:
+    """Leave out what would steer the terminal: it may come from a foreign file."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def number(count: int, what: str) -> str:
+    """Say how many there are of something."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def moment(stamp: int | None) -> str | None:
+    """Write a time (ns of UTC) down to the millisecond."""
+    return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
+
+
+def first_of(what: str, lines: Sequence[str]) -> Iterator[str]:
+    """Yield the first lines of a list, and how many more there are."""
+    for line in lines[:_SHOWN]:
+        yield f"{what}: {line}"
+    if len(lines) > _SHOWN:
+        yield f"{what}: and {len(lines) - _SHOWN} more (--json lists all)"
