@@ -152,6 +152,17 @@ def test_a_log_that_comes_later_has_the_layer_before_it_made_again(model, logs, 
     assert written(logs) == layers
 
 
+def test_layers_stay_when_logs_beside_theirs_are_deleted(model, logs, layers):
+    relabelled(model, logs)
+    for log in recorded_logs(logs)[:2]:
+        log.unlink()
+        layer_path(log, load_model(model).name).unlink()
+    kept = written(logs)
+    again = relabelled(model, logs)
+    assert (again.layers, len(again.current)) == ([], len(layers) - 2)
+    assert written(logs) == kept
+
+
 def test_a_run_that_is_killed_goes_on_where_it_was(model, logs, layers):
     command = [*HEARTHLOG, "relabel", str(logs), "--model", str(model), "--workers", "2"]
     for _ in range(3):

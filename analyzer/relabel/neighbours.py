@@ -1,7 +1,7 @@
 """Which logs follow each other, by where they lie and what they are called."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -22,12 +22,12 @@ class Chain(NamedTuple):
     ----------
     logs : list of Path
         In the order of time; the last may still be being written.
-    asked : list of int
-        Places of those that were asked for.
+    asked : dict of int to Path
+        Those that were asked for, by their places.
     """
 
     logs: Sequence[Path]
-    asked: Sequence[int]
+    asked: Mapping[int, Path]
 
 
 def is_layer(path: Path) -> bool:
@@ -70,7 +70,7 @@ def find_chains(paths: Iterable[Path]) -> list[Chain]:
     found = []
     for root in homes.values():
         for logs in _nodes(root):
-            wanted = [i for i, log in enumerate(logs) if str(log) in asked]
+            wanted = {i: log for i, log in enumerate(logs) if str(log) in asked}
             if wanted:
                 found.append(Chain(logs, wanted))
     return found

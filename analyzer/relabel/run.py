@@ -15,6 +15,7 @@ from analyzer.workers import Workers
 from models.modelfile import Model
 from models.segments import Run
 from schemas.errors import HearthlogError, LogError
+from schemas.ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
 
@@ -156,25 +157,36 @@ class _Relabelling:
         """Look at the logs of one chain after the other, and yield those that are to be done."""
         for chain in self._chains:
             line = _Line(chain)
-            for place in chain.asked:
-                item = self._look_at(chain, place)
+            there = map_logs(self._look_at, list(chain.asked.values()))
+            for place, found in zip(chain.asked, there, strict=True):
+                item = self._item(chain, place, found)
                 if item is not None:
                     line.items.append(item)
                     if not item.current:
                         yield line, item
                     self._advance(line)
 
-    def _look_at(self, chain: Chain, place: int) -> _Item | None:
-        """Look what there is of a log; None if nothing is to be done."""
+    def _look_at(self, log: Path) -> tuple[About | None, str] | HearthlogError:
+        """Read what the layer of a log says of itself, and the digest of the log."""
+        try:
+            return read_about(layer_path(log, self._model.name)), digest(log)
+        except HearthlogError as error:
+            return error
+
+    def _item(
+        self, chain: Chain, place: int, found: tuple[About | None, str] | HearthlogError
+    ) -> _Item | None:
+        """Decide what is to be done with a log; None if nothing is."""
         log = chain.logs[place]
         if is_active(log):
             self.result.active.append(log)
             return None
-        carried = place - 1 in chain.asked
-        job = self._job(chain, place, carried=carried)
+        job = self._job(chain, place, carried=place - 1 in chain.asked)
         try:
-            about = read_about(job.layer)
-            current = about is not None and self._is_current(job, about)
+            if isinstance(found, HearthlogError):
+                raise found
+            about, sha256 = found
+            current = about is not None and _is_current(job, about, sha256)
         except HearthlogError as error:
             self.result.failed[log] = str(error)
             return None
@@ -193,29 +205,6 @@ class _Relabelling:
             replaces=False,
             carried=carried,
         )
-
-    def _is_current(self, job: Job, about: About) -> bool:
-        """Tell whether a layer is what would be made again, but for what is open before it.
-
-        Raises
-        ------
-        LogError
-            If it is of another model, or of another log.
-        """
-        source = about.source
-        if source.model_sha256 != job.model_sha256:
-            raise LogError(
-                f"{job.layer}: was made by another model of this name "
-                f"({source.model_sha256[:12]}, not {job.model_sha256[:12]}); move it away, or give "
-                "the model another name"
-            )
-        if source.input_sha256 != digest(job.log):
-            raise LogError(
-                f"{job.layer}: was made from another log of this name; move it away, and run again"
-            )
-        before = stem(job.before[0]) if job.before else ""
-        behind = "" if job.behind is None else stem(job.behind)
-        return (source.before, source.behind) == (before, behind) and not about.lost
 
     def _submit(self, line: _Line, item: _Item) -> None:
         item.running = True
@@ -269,6 +258,30 @@ class _Relabelling:
         self.result.frames += item.labelled.frames
         if item.labelled.lost:
             self.result.lost[item.job.log] = item.labelled.lost
+
+
+def _is_current(job: Job, about: About, sha256: str) -> bool:
+    """Tell whether a layer is what would be made again, but for what is open before it.
+
+    Raises
+    ------
+    LogError
+        If it is of another model, or of another log.
+    """
+    source = about.source
+    if source.model_sha256 != job.model_sha256:
+        raise LogError(
+            f"{job.layer}: was made by another model of this name ({source.model_sha256[:12]}, not "
+            f"{job.model_sha256[:12]}); move it away, or give the model another name"
+        )
+    if source.input_sha256 != sha256:
+        raise LogError(
+            f"{job.layer}: was made from another log of this name; move it away, and run again"
+        )
+    # Where a log beside it has been deleted since, the layer knows more than one made now would.
+    before = not job.before or stem(job.before[0]) == source.before
+    behind = job.behind is None or stem(job.behind) == source.behind
+    return before and behind and not about.lost
 
 
 def _continues(item: _Item, before: Run | None) -> bool:
