@@ -14,8 +14,8 @@ from sklearn.metrics import f1_score
 from analyzer.dataset import Dataset, Progress
 from analyzer.errors import DataError
 from analyzer.home import HOME_WEIGHT
-from analyzer.parallel import in_parallel
 from analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
+from analyzer.workers.parallel import in_parallel
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_GROUPS = 8

@@ -15,7 +15,7 @@ from sklearn.svm import SVC
 
 from analyzer.augment import augmented
 from analyzer.dataset import Dataset
-from analyzer.parallel import in_parallel
+from analyzer.workers.parallel import in_parallel
 from models.classifier import HOME_SHARPNESS, home_votes, weakest_pairs
 from models.inputs import Kind, window_inputs
 

@@ -29,9 +29,9 @@ from analyzer.catalog import (
     read_catalog,
     write_catalog,
 )
-from analyzer.catalogfile import SCHEMA, sealed
+from analyzer.catalog.file import SCHEMA, sealed
+from analyzer.catalog.fleet import heard, homes
 from analyzer.errors import DataError
-from analyzer.fleet import heard, homes
 from analyzer.review import Mark, write_marks
 from analyzer.selection import select
 from recorder.config import Microphone, Settings

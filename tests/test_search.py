@@ -16,10 +16,10 @@ from joblib import delayed
 from analyzer.adaptation import adaptation_curve
 from analyzer.errors import DataError, WorkerError
 from analyzer.evaluation.folds import evaluate_recipe
-from analyzer.parallel import in_parallel, joblib_on
 from analyzer.recipe import RECIPES, cross_validate, prepare
 from analyzer.search import around, search
 from analyzer.train import group_folds
+from analyzer.workers.parallel import in_parallel, joblib_on
 from models.modelfile import load_model
 from tools.home.simulate import write_training_set
 

@@ -14,7 +14,7 @@ import pytest
 import tasks
 from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
 
-import analyzer.cluster
+import analyzer.workers.cluster
 from analyzer.errors import WorkerError
 from analyzer.workers import open_workers
 from schemas.errors import LogError
@@ -37,7 +37,7 @@ def workers(request):
 
 @pytest.fixture
 def hurried(monkeypatch):
-    monkeypatch.setattr(analyzer.cluster, "_CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(analyzer.workers.cluster, "_CONNECT_SECONDS", 0.5)
 
 
 def test_a_task_returns_what_its_function_returns(workers):

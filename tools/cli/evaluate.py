@@ -78,7 +78,7 @@ def evaluate(
     """
     of_log, of_model = (log, reference), (model, data)
     if folds is not None or adaptation or search:
-        from analyzer.parallel import joblib_on
+        from analyzer.workers.parallel import joblib_on
 
         if not data or not scenario or any((*of_log, topic, model)):
             wrong_use("--folds, --adaptation or --search goes with --data and --scenario alone")

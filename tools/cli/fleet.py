@@ -15,7 +15,7 @@ from tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
 
 if TYPE_CHECKING:
     from analyzer.catalog import Catalog
-    from analyzer.fleet import Heard, Home
+    from analyzer.catalog.fleet import Heard, Home
 
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
@@ -25,7 +25,7 @@ _COUNTS = "logs", "layers", "unfinished", "damaged"
 def make_catalog(folder: Path, *, as_json: bool) -> None:
     """Make the catalogue of a folder, and show what is in it."""
     from analyzer.catalog import DAMAGED, UNFINISHED
-    from analyzer.fleet import heard, homes
+    from analyzer.catalog.fleet import heard, homes
 
     if folder.is_file():
         wrong_use(f"--catalog: {folder} is a file; give the folder that holds the logs or homes")

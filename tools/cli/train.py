@@ -67,7 +67,7 @@ def train(
     else:
         if not data or not scenario:
             wrong_use("give --data and --scenario, or --base and --home")
-        from analyzer.parallel import joblib_on
+        from analyzer.workers.parallel import joblib_on
 
         recipe = chosen_recipe(method, cost, gamma)
         with joblib_on(scheduler):

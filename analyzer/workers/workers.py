@@ -1,12 +1,12 @@
-"""What runs tasks: this process, several processes of this machine, or a Dask cluster."""
+"""The three kinds of workers behind one."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import closing, contextmanager
 from typing import ParamSpec, Protocol, TypeVar
 
-from analyzer.cluster import Cluster, connected
-from analyzer.processes import Processes
+from analyzer.workers.cluster import Cluster, connected
+from analyzer.workers.processes import Processes
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""A catalogue of the logs in a folder: a Parquet file with one row for each of them."""
+"""The rows of a catalogue: made from the files, and asked for them."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,8 +10,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from analyzer.catalogfile import SCHEMA, read_table, table_of, without_times, write_table
-from analyzer.contents import Contents, read_contents
+from analyzer.catalog.contents import Contents, read_contents
+from analyzer.catalog.file import SCHEMA, read_table, table_of, without_times, write_table
 from analyzer.errors import DataError
 from schemas.errors import LogError
 from schemas.files import ACTIVE_SUFFIX, CATALOG, SUFFIX, find_logs, replaced_file

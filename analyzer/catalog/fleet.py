@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from analyzer.catalog import DAMAGED, LOG, UNFINISHED, Catalog
+from analyzer.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
 from recorder.stream import FRAME_NANOSECONDS
 from schemas.messages import NANOSECONDS
 

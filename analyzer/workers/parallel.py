@@ -7,7 +7,7 @@ from typing import Any
 
 import joblib
 
-from analyzer.cluster import connected, gone, raise_if_killed
+from analyzer.workers.cluster import connected, gone, raise_if_killed
 from schemas.errors import HearthlogError
 
 _MOST_THREADS = 4
@@ -32,8 +32,7 @@ def joblib_on(scheduler: str | None) -> Iterator[None]:
     Raises
     ------
     WorkerError
-        As `analyzer.cluster.connected` does, and if the cluster goes away or a fit kills its
-        workers.
+        As `connected` does, and if the cluster goes away or a fit kills its workers.
     """
     if scheduler is None:
         yield
