@@ -80,7 +80,7 @@ class Classifier:
             rows = slice(start, start + _ROWS_AT_ONCE)
             extended = self._extended(inputs[rows])
             pairs, others, nearest = self._pairs(extended)
-            novelty[rows] = -np.expm1(nearest)
+            novelty[rows] = -np.expm1(np.minimum(nearest, 0.0))
             decision = weakest_pairs(pairs, len(self.classes))
             if self._home_blocks:
                 decision += home_votes(self._home(extended), others)
@@ -113,8 +113,11 @@ class Classifier:
         others = np.zeros((len(extended), 1))
         rows = np.arange(len(extended))
         for weights, parts in self._blocks:
-            distance = _distance(extended, weights)
-            np.maximum(nearest, distance[rows, distance.argmax(axis=1)], out=nearest)
+            distance = rowwise_matmul(extended, weights)
+            largest = distance[rows, distance.argmax(axis=1)]
+            if largest.max() > 0.0:  # by rounding
+                np.minimum(distance, 0.0, out=distance)
+            np.maximum(nearest, largest, out=nearest)
             if self._home_blocks:
                 sharp = np.exp(HOME_SHARPNESS * distance)
                 others += rowwise_matmul(sharp, np.ones((len(weights.T), 1)))
