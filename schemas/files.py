@@ -143,19 +143,33 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
     try:
         yield temporary
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
-        if new:  # from here on the name is ours: unlike a rename, never over another file
-            path.open("xb").close()
-        temporary.replace(path)
+        if new:
+            _name(temporary, path)
+        else:
+            temporary.replace(path)
         sync_folder(path.parent)
+    except FileExistsError as error:
+        raise _exists(path) from error
     except OSError as error:
         raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _name(temporary: Path, path: Path) -> None:
+    """Give a file its name, which unlike a rename never takes it from another file."""
+    try:
+        path.hardlink_to(temporary)
+    except FileExistsError:
+        raise
+    except OSError:  # an SD card without links
+        path.open("xb").close()
+        temporary.replace(path)
 
 
 @contextmanager

@@ -152,6 +152,20 @@ def test_a_log_that_comes_later_has_the_layer_before_it_made_again(model, logs, 
     assert written(logs) == layers
 
 
+def test_a_log_behind_without_a_frame_does_not_end_what_is_open(model, logs, layers):
+    """A recorder has begun the next log and not yet written into it."""
+    log, behind, *_ = recorded_logs(logs)
+    data = behind.read_bytes()
+    active = behind.with_name(behind.name + ".active")
+    behind.unlink()
+    active.write_bytes(data[:300])
+    relabelled(model, log)
+    active.unlink()
+    behind.write_bytes(data)
+    relabelled(model, logs)
+    assert written(logs) == layers
+
+
 def test_layers_stay_when_logs_beside_theirs_are_deleted(model, logs, layers):
     relabelled(model, logs)
     for log in recorded_logs(logs)[:2]:
@@ -259,6 +273,21 @@ def labelled_frames(log, model):
     return len(read_columns([layer_path(log, name)])[f"/mic/relabel/{name}/label"])
 
 
+@pytest.mark.parametrize("place", [-1, 1])
+def test_logs_behind_a_damaged_one_do_not_depend_on_how_they_are_done(model, logs, place, tmp_path):
+    log = recorded_logs(logs)[0]
+    with LogFile(log) as file:
+        chunk = file.chunks[place]
+    data = bytearray(log.read_bytes())
+    data[int(chunk["offset"]) + 100] ^= 255
+    log.write_bytes(data)
+    other = Path(shutil.copytree(logs, tmp_path / "other"))
+    relabelled(model, logs)
+    for each in reversed(recorded_logs(other)):
+        relabelled(model, each)
+    assert written(other) == written(logs)
+
+
 def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
     log = recorded_logs(logs)[1]
     data = log.read_bytes()
@@ -320,6 +349,14 @@ def test_what_is_no_layer_is_kept(model, logs, capfd):
     assert done.returncode == 1
     assert f"{layer}: is no layer of `relabel`" in done.stderr
     assert layer.read_bytes() == data
+
+
+def test_a_layer_is_no_log_to_label(model, logs, capfd):
+    relabelled(model, logs)
+    layer = layer_path(recorded_logs(logs)[0], load_model(model).name)
+    done = run(capfd, "relabel", layer, "--model", model, "--workers", 1)
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"{layer}: is a layer; name the log that it speaks of\n")
 
 
 def test_logs_without_features_are_named(model, tmp_path, recording, capfd):

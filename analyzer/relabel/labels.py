@@ -134,7 +134,10 @@ def label_log(job: Job) -> Labelled:
             return _label(job, job.log, model, classifier)
         except UnreadableError:
             copy, lost = recovered(job.log, Path(folder))
+        try:
             return _label(job, copy, model, classifier)._replace(lost=lost)
+        except UnreadableError as error:
+            raise LogError(str(error).replace(str(copy), str(job.log))) from error
 
 
 @lru_cache(2)
@@ -171,10 +174,11 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Labelle
         if isinstance(error, OSError):
             raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
         raise
-    if not is_followed(stream, origin, job.behind):
+    followed = None if job.behind is None else is_followed(stream, origin, job.behind)
+    if not followed:
         stream.close()
     before = stem(job.before[0]) if job.before else ""
-    behind = "" if job.behind is None else stem(job.behind)
+    behind = "" if job.behind is None or followed is None else stem(job.behind)
     return Labelled(
         part=part,
         content=content,

@@ -1,5 +1,6 @@
 """The layer that a relabelling makes: its name, its topics, and what it says of itself."""
 
+import glob
 import hashlib
 import json
 import os
@@ -37,7 +38,8 @@ class Source(NamedTuple):
     input_sha256 : str
         As `digest` gives it.
     before, behind : str
-        Stems of the logs beside it, or empty.
+        Stems of the logs beside it; empty where there is none, or where it could not be told yet
+        whether the sound goes on there.
     """
 
     model: str
@@ -127,8 +129,8 @@ def part_path(layer: Path) -> Path:
 
 
 def delete_parts(layer: Path) -> None:
-    """Delete what this and other runs have begun of a layer."""
-    for part in layer.parent.glob(f".{layer.name}.*.part"):
+    """Delete what this and other runs have begun of a layer, now that it is there."""
+    for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
         with suppress(OSError):
             part.unlink()
 

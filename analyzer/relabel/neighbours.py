@@ -13,6 +13,7 @@ from schemas.logfile import time_span
 _LAYER = re.compile(r"\.(relabel-.+|review)\.mcap(\.active)?")
 _NAMED = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z.*)")
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")
+_DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
 
 
 class Chain(NamedTuple):
@@ -56,14 +57,13 @@ def find_chains(paths: Iterable[Path]) -> list[Chain]:
     Raises
     ------
     LogError
-        If there is no such log.
+        If there is no such log, or it is a layer.
     """
-    asked = {
-        str(log): log
-        for path in paths
-        for log in find_logs(path)
-        if log == path or not is_layer(log)
-    }
+    asked: dict[str, Path] = {}
+    for path in paths:
+        if is_layer(path):
+            raise LogError(f"{path}: is a layer; name the log that it speaks of")
+        asked |= {str(log): log for log in find_logs(path) if not is_layer(log)}
     homes: dict[str, Path] = {}
     for log in asked.values():
         homes.setdefault(str(home(log)), home(log))
@@ -86,8 +86,8 @@ def home(log: Path) -> Path:
 def _nodes(root: Path) -> list[list[Path]]:
     """List the logs of each node of a home, in the order of time."""
     nodes: dict[str, list[tuple[str, Path]]] = {}
-    for log in find_logs(root):
-        if home(log) == root and not is_layer(log):
+    for log in (*root.glob("*"), *root.glob(_DAYS)):
+        if log.name.endswith((SUFFIX, ACTIVE_SUFFIX)) and home(log) == root and not is_layer(log):
             node, time = _node_and_time(log)
             nodes.setdefault(node, []).append((time, log))
     return [[log for _, log in sorted(logs)] for _, logs in sorted(nodes.items())]

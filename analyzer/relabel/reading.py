@@ -1,11 +1,13 @@
 """What was heard in a log and before it, where it is whole."""
 
 import shutil
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from analyzer.relabel.neighbours import is_active
 from analyzer.relabel.stream import Stream
 from analyzer.replay.origin import Origin, read_origin
 from analyzer.replay.recorded import Features, read_recorded
@@ -22,7 +24,19 @@ _LONGEST = 1000  # characters
 
 
 class UnreadableError(LogError):
-    """A log, or a part of it, is damaged."""
+    """A log, or a part of it, is damaged.
+
+    Attributes
+    ----------
+    log : Path
+    """
+
+    def __init__(self, log: Path, what: object) -> None:
+        super().__init__(str(what))
+        self.log = log
+
+    def __reduce__(self) -> tuple[type["UnreadableError"], tuple[Path, str]]:
+        return UnreadableError, (self.log, str(self))
 
 
 def origin_of(path: Path) -> Origin | None:
@@ -36,7 +50,7 @@ def origin_of(path: Path) -> Origin | None:
     try:
         return read_origin(path, "features")
     except LogError as error:
-        raise UnreadableError(str(error)) from error
+        raise UnreadableError(path, error) from error
 
 
 def heard(origin: Origin, begin: int) -> Iterator[Features | Gap]:
@@ -51,7 +65,7 @@ def heard(origin: Origin, begin: int) -> Iterator[Features | Gap]:
         for piece in read_recorded(origin, begin, _EVER, heard_only=True):
             yield from (event for event in piece.events if isinstance(event, Features | Gap))
     except LogError as error:
-        raise UnreadableError(str(error)) from error
+        raise UnreadableError(origin.path, error) from error
 
 
 def recovered(log: Path, folder: Path) -> tuple[Path, str]:
@@ -97,7 +111,6 @@ def warmed_up(
         if not stream.is_followed_by(first):
             break
         if whole or (stream.sure and (states_only or stream.settled)):
-            stream.segments.clear()
             return stream
         back *= 4
     return Stream(classifier)
@@ -107,53 +120,56 @@ def _past(
     logs: tuple[Path, ...], origin: Origin, begin: int, classifier: Classifier
 ) -> tuple[Stream, bool]:
     """Run through logs from a time on; tell also whether there is nothing before it."""
-    events: list[list[Features | Gap]] = []
+    saved: dict[Path, Path | None] = {}  # what could be saved of logs that are damaged
+    with TemporaryDirectory(prefix="hearthlog") as folder:
+        while True:
+            try:
+                return _run_through(logs, saved, origin, begin, classifier)
+            except UnreadableError as error:
+                copy = None
+                if error.log not in saved.values():
+                    with suppress(LogError):
+                        copy, _ = recovered(error.log, Path(folder))
+                saved[next(log for log in logs if log.name == error.log.name)] = copy
+
+
+def _run_through(
+    logs: tuple[Path, ...],
+    saved: Mapping[Path, Path | None],
+    origin: Origin,
+    begin: int,
+    classifier: Classifier,
+) -> tuple[Stream, bool]:
+    past: deque[Origin] = deque()
     whole = True
     for log in logs:
-        found, first = _heard_before(log, origin, begin)
-        if first is None:
+        path = saved.get(log, log)
+        other = None if path is None else origin_of(path)
+        if other is None or other.first_frame is None or _who(other) != _who(origin):
             break
-        events.insert(0, found)
-        if first < begin:
+        past.appendleft(other)
+        if other.first_frame[1] < begin:
             whole = False
             break
     stream = Stream(classifier)
-    for event in (event for found in events for event in found):
-        stream.push(event)
+    for other in past:
+        for event in heard(other, begin):
+            stream.push(event)
+        stream.segments.clear()
     return stream, whole
 
 
-def _heard_before(log: Path, origin: Origin, begin: int) -> tuple[list[Features | Gap], int | None]:
-    """Read a log from a time on; return also when it begins, None if it is of no use."""
-    with TemporaryDirectory(prefix="hearthlog") as folder, suppress(LogError):
-        for path in _whole(log, Path(folder)):
-            with suppress(UnreadableError):
-                past = origin_of(path)
-                if past is None or past.first_frame is None or _who(past) != _who(origin):
-                    break
-                return list(heard(past, begin)), past.first_frame[1]
-    return [], None
+def is_followed(stream: Stream, origin: Origin, behind: Path) -> bool | None:
+    """Tell whether the sound of a log goes on in the log behind it; None if that is not known yet.
 
-
-def _whole(log: Path, folder: Path) -> Iterator[Path]:
-    """Yield a log, and then what can be saved of it."""
-    yield log
-    yield recovered(log, folder)[0]
-
-
-def is_followed(stream: Stream, origin: Origin, behind: Path | None) -> bool:
-    """Tell whether the sound of a log goes on in the log behind it."""
-    if behind is None:
-        return False
+    It is not while the log behind is being written and has no frame.
+    """
+    other = None
     with suppress(LogError):
         other = read_origin(behind, "features")
-        return (
-            other is not None
-            and _who(other) == _who(origin)
-            and other.first_frame is not None
-            and stream.is_followed_by(other.first_frame)
-        )
-    return False
+    if other is None or other.first_frame is None:
+        return None if is_active(behind) else False
+    return _who(other) == _who(origin) and stream.is_followed_by(other.first_frame)
 
 
 def _who(origin: Origin) -> tuple[str, str]:

@@ -90,7 +90,7 @@ def relabel(
     return work.result
 
 
-@dataclass
+@dataclass(eq=False)
 class _Item:
     """A log, and how far it is."""
 
@@ -130,6 +130,7 @@ class _Relabelling:
         self._model_path = model_path
         self._workers = workers
         self._running: dict[Future[Any], tuple[_Line, _Item]] = {}
+        self._waiting: set[Path] = set()  # parts of layers that are not complete
 
     def run(self, progress: Callable[[int], None]) -> None:
         """Do all of it."""
@@ -144,8 +145,8 @@ class _Relabelling:
                 for future in wait(self._running, return_when=FIRST_COMPLETED).done:
                     self._take(future)
         finally:
-            for future in self._running:  # none, unless something stopped us
-                _throw_away(future)
+            for part in tuple(self._waiting):  # none, unless something stopped us
+                self._throw_away(part)
 
     @property
     def _at_once(self) -> int:
@@ -213,18 +214,26 @@ class _Relabelling:
     def _take(self, future: Future[Any]) -> None:
         """Look what became of a task."""
         line, item = self._running.pop(future)
-        try:
-            found = future.result()
-        except HearthlogError as error:
-            self.result.failed[item.job.log] = str(error)
-            with suppress(ValueError):
-                line.items.remove(item)
+        error = future.exception()
+        if error is not None:
+            if not isinstance(error, Exception):
+                raise error
+            self._fail(line, item, error)
+        elif isinstance(found := future.result(), Labelled):
+            item.running, item.labelled = False, found
+            self._waiting.add(found.part)
         else:
-            if isinstance(found, Labelled):
-                item.running, item.labelled = False, found
-            else:
-                self._note(item)
+            self._note(item)
         self._advance(line)
+
+    def _fail(self, line: _Line, item: _Item, error: Exception) -> None:
+        """Note that a log was not relabelled; what is wrong with it must not stop the others."""
+        what = str(error)
+        if not isinstance(error, HearthlogError):
+            what = f"{item.job.log}: {type(error).__name__}: {what.partition(chr(10))[0]}"
+        self.result.failed[item.job.log] = what
+        if item.running and item in line.items:
+            line.items.remove(item)
 
     def _advance(self, line: _Line) -> None:
         """Complete what can be completed, in the order of time."""
@@ -237,7 +246,7 @@ class _Relabelling:
                 item.labelled = labelled
                 self._running[self._workers.submit(complete_layer, item.job, labelled)] = line, item
             elif item.labelled is not None:  # the layer before was not made
-                item.labelled.part.unlink(missing_ok=True)
+                self._throw_away(item.labelled.part)
                 job = self._job(line.chain, item.place, carried=False)
                 item.job = job._replace(replaces=item.job.replaces)
                 item.labelled = None
@@ -252,8 +261,14 @@ class _Relabelling:
             else:
                 return  # it is the next to be handed out
 
+    def _throw_away(self, part: Path) -> None:
+        self._waiting.discard(part)
+        with suppress(OSError):
+            part.unlink()
+
     def _note(self, item: _Item) -> None:
         assert item.labelled is not None
+        self._waiting.discard(item.labelled.part)
         self.result.layers.append(item.job.layer)
         self.result.frames += item.labelled.frames
         if item.labelled.lost:
@@ -286,12 +301,3 @@ def _is_current(job: Job, about: About, sha256: str) -> bool:
 
 def _continues(item: _Item, before: Run | None) -> bool:
     return item.about is not None and item.about.began == before
-
-
-def _throw_away(future: Future[Any]) -> None:
-    """Delete what a task has begun, if it is done and nobody has taken it."""
-    if future.done() and not future.cancelled() and future.exception() is None:
-        found = future.result()
-        if isinstance(found, Labelled):
-            with suppress(OSError):
-                found.part.unlink()

@@ -44,7 +44,7 @@ def relabel(
     from tools.cli.progress import steps_done
 
     loaded = load_model(model)
-    count = workers or len(os.sched_getaffinity(0))
+    count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler) as pool, steps_done("labelling logs") as report:
         found = run(logs, loaded, model.resolve(), pool, report)
     if as_json:
