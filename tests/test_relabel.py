@@ -11,7 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event as Flag
 
+import numpy as np
 import pytest
+import soundfile
 from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
 from lossy import LossySource
@@ -25,11 +27,13 @@ from analyzer.relabel.run import relabel
 from analyzer.workers import open_workers
 from models.modelfile import load_model, save_model
 from recorder.config import Settings
+from recorder.features import SAMPLE_RATE
 from recorder.service import record
 from recorder.sources.replayed import FileSource
 from schemas.columns import read_columns
 from schemas.files import find_logs
 from schemas.logfile import LogFile
+from schemas.messages import NANOSECONDS
 
 START = 1_772_348_370_123_456_789  # half a minute after the hour
 EPOCH = {"SOURCE_DATE_EPOCH": "1772348400"}
@@ -120,6 +124,20 @@ def test_logs_one_by_one_in_any_order_give_the_same_bytes(model, logs, layers):
     for log in reversed(recorded_logs(logs)):
         relabelled(model, log)
     assert written(logs) == layers
+
+
+def test_a_silence_over_many_logs_is_one_segment(model, tmp_path):
+    noise = np.random.default_rng(5).standard_normal(5 * 60 * SAMPLE_RATE) / 3000
+    soundfile.write(tmp_path / "night.wav", noise, SAMPLE_RATE)
+    settings = Settings(output=tmp_path / "logs", max_bag_duration=60)
+    record(settings, FileSource([tmp_path / "night.wav"], START), Flag())
+    other = Path(shutil.copytree(tmp_path / "logs", tmp_path / "other"))
+    relabelled(model, tmp_path / "logs", workers=2)
+    for log in reversed(recorded_logs(other)):
+        relabelled(model, log)
+    assert written(other) == written(tmp_path / "logs")
+    segments = read_columns(find_logs(other))[f"/mic/relabel/{load_model(model).name}/segment"]
+    assert segments["duration"].max() > 4 * 60 * NANOSECONDS
 
 
 def test_what_is_there_is_left_alone(model, logs, layers):
