@@ -16,6 +16,7 @@ import pytest
 import soundfile
 from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
+from logs import features
 from lossy import LossySource
 from spliced import run, small_disk
 from stores import put
@@ -28,6 +29,7 @@ from analyzer.workers import open_workers
 from models.modelfile import load_model, save_model
 from recorder.config import Settings
 from recorder.features import SAMPLE_RATE
+from recorder.recovery import recover_log
 from recorder.service import record
 from recorder.sources.replayed import FileSource
 from schemas.columns import read_columns
@@ -126,18 +128,36 @@ def test_logs_one_by_one_in_any_order_give_the_same_bytes(model, logs, layers):
     assert written(logs) == layers
 
 
-def test_a_silence_over_many_logs_is_one_segment(model, tmp_path):
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    """Five minutes of next to nothing, in logs of a minute."""
+    folder = tmp_path_factory.mktemp("night")
     noise = np.random.default_rng(5).standard_normal(5 * 60 * SAMPLE_RATE) / 3000
-    soundfile.write(tmp_path / "night.wav", noise, SAMPLE_RATE)
-    settings = Settings(output=tmp_path / "logs", max_bag_duration=60)
-    record(settings, FileSource([tmp_path / "night.wav"], START), Flag())
-    other = Path(shutil.copytree(tmp_path / "logs", tmp_path / "other"))
-    relabelled(model, tmp_path / "logs", workers=2)
-    for log in reversed(recorded_logs(other)):
+    soundfile.write(folder / "night.wav", noise, SAMPLE_RATE)
+    settings = Settings(output=folder / "logs", max_bag_duration=60)
+    record(settings, FileSource([folder / "night.wav"], START), Flag())
+    return folder / "logs"
+
+
+def test_a_silence_over_many_logs_is_one_segment(model, night, tmp_path):
+    together, alone = (Path(shutil.copytree(night, tmp_path / name)) for name in "ab")
+    relabelled(model, together, workers=2)
+    for log in reversed(recorded_logs(alone)):
         relabelled(model, log)
-    assert written(other) == written(tmp_path / "logs")
-    segments = read_columns(find_logs(other))[f"/mic/relabel/{load_model(model).name}/segment"]
+    assert written(alone) == written(together)
+    segments = read_columns(find_logs(alone))[f"/mic/relabel/{load_model(model).name}/segment"]
     assert segments["duration"].max() > 4 * 60 * NANOSECONDS
+
+
+def test_logs_that_come_late_change_what_was_open_in_all_behind_them(model, night, tmp_path):
+    whole, late = (Path(shutil.copytree(night, tmp_path / name)) for name in "ab")
+    relabelled(model, whole)
+    first = recorded_logs(late)[0]
+    first.rename(tmp_path / "first")
+    relabelled(model, late)
+    (tmp_path / "first").rename(first)
+    relabelled(model, late)
+    assert written(late) == written(whole)
 
 
 def test_what_is_there_is_left_alone(model, logs, layers):
@@ -267,7 +287,7 @@ def test_segments_are_in_chunks_of_their_own(model, logs):
                 assert all(len(ids) == 1 for ids in file.channel_sets)
 
 
-def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, capfd):
+def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capfd):
     log = recorded_logs(logs)[1]
     with LogFile(log) as file:
         chunk = file.chunks[len(file.chunks) // 2]
@@ -280,15 +300,21 @@ def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, capfd):
     assert done.returncode == 3
     assert f"partly relabelled: {log}" in done.stderr
     assert log.read_bytes() == data
-    frames = [labelled_frames(path, model) for path in (log, recorded_logs(logs)[0])]
-    assert 0.9 * 1200 < frames[0] < 1200
+    (tmp_path / "saved").mkdir()
+    recover_log(log, tmp_path / "saved" / log.name, log.name)
+    heard = np.concatenate([features(recorded_logs(logs)[0])[0], features(tmp_path / "saved")[0]])
+    whole = heard[19:][heard[19:] - heard[:-19] == 19]  # of frames with a second behind them
+    frames = labelled_frames(log, model)
+    assert frames.tolist() == whole[-len(frames) :].tolist()
+    assert 200 < len(frames) < 1200 - 19
     again = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
     assert again.returncode == 3
 
 
 def labelled_frames(log, model):
     name = load_model(model).name
-    return len(read_columns([layer_path(log, name)])[f"/mic/relabel/{name}/label"])
+    columns = read_columns([layer_path(log, name)])[f"/mic/relabel/{name}/label"]
+    return columns["frame"].astype(np.int64)
 
 
 @pytest.mark.parametrize("place", [-1, 1])
@@ -313,7 +339,7 @@ def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
     done = run(capfd, "relabel", log, "--model", model, "--workers", 1)
     assert done.returncode == 3
     assert "cut off" in done.stderr
-    assert labelled_frames(log, model) > 200
+    assert len(labelled_frames(log, model)) > 200
 
 
 def test_a_log_that_is_being_written_is_left_for_later(model, logs, capfd):
@@ -375,6 +401,43 @@ def test_a_layer_is_no_log_to_label(model, logs, capfd):
     done = run(capfd, "relabel", layer, "--model", model, "--workers", 1)
     assert done.returncode == 1
     assert done.stderr.endswith(f"{layer}: is a layer; name the log that it speaks of\n")
+
+
+def test_where_a_layer_cannot_be_made_those_behind_it_are_as_ever(model, logs, night):
+    name = load_model(model).name
+    for folder in (logs, Path(shutil.copytree(night, logs.parent / "night"))):
+        whole = Path(shutil.copytree(folder, folder.parent / f"{folder.name}-whole"))
+        relabelled(model, whole)
+        bad = layer_path(recorded_logs(folder)[1], name)
+        bad.write_bytes(b"no layer")
+        found = relabelled(model, folder, workers=2)
+        assert len(found.failed) == 1
+        assert written(folder) == written(whole) | {bad.name: b"no layer"}
+
+
+def test_logs_follow_each_other_by_name_or_else_by_time(recording, tmp_path):
+    first, second = recorded_logs(recording)[:2]
+    shutil.copy(first, tmp_path / "b.mcap")
+    shutil.copy(second, tmp_path / "a.mcap")
+    (chain,) = find_chains([tmp_path / "a.mcap"])
+    assert ([path.name for path in chain.logs], list(chain.asked)) == (["b.mcap", "a.mcap"], [1])
+
+
+def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, tmp_path):
+    log = recorded_logs(recording)[0]
+    places = ["anna/2026/03/01", "anna/2026/03/02", "berta/2026/03/01", "20/3/1", "anna"]
+    for place in places:
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        shutil.copy(log, tmp_path / place)
+    folders = [
+        sorted(path.relative_to(tmp_path).parent.as_posix() for path in chain.logs)
+        for chain in find_chains([tmp_path])
+    ]
+    assert sorted(folders) == [
+        ["20/3/1"],
+        ["anna", "anna/2026/03/01", "anna/2026/03/02"],
+        ["berta/2026/03/01"],
+    ]
 
 
 def test_logs_without_features_are_named(model, tmp_path, recording, capfd):

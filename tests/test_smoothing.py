@@ -204,6 +204,26 @@ def test_a_single_cough_survives_and_a_flicker_does_not():
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
+def test_once_states_are_sure_the_segments_that_begin_later_are_those_of_the_whole(lag):
+    smoothing, transitions = Smoothing(method="hmm", lag_seconds=lag), default_transitions(CLASSES)
+    earlier = 0
+    for seed in range(8):
+        probabilities = made_up(seed, 1200)
+        stamps = START + np.arange(1200) * FRAME_NANOSECONDS
+        whole = Segmenter(smoothing, transitions, FRAME_SECONDS).push(probabilities, stamps)
+        for begin in range(100, 900, 100):
+            part = Segmenter(smoothing, transitions, FRAME_SECONDS)
+            frame = begin
+            while not part.sure and frame < 1200:
+                part.push(probabilities[frame : frame + 1], stamps[frame : frame + 1])
+                frame += 1
+            earlier += not part.settled
+            later = part.push(probabilities[frame:], stamps[frame:])
+            assert later[1:] == [one for one in whole if one.known >= stamps[frame]][1:]
+    assert earlier > 10  # than the segments are
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
 def test_segments_of_a_part_are_those_of_the_whole_once_settled(lag):
     smoothing, transitions = (
         Smoothing(method="hmm", lag_seconds=lag),

@@ -232,7 +232,7 @@ class _Relabelling:
         if not isinstance(error, HearthlogError):
             what = f"{item.job.log}: {type(error).__name__}: {what.partition(chr(10))[0]}"
         self.result.failed[item.job.log] = what
-        if item.running and item in line.items:
+        if item in line.items:  # it is not, once its layer was to be completed
             line.items.remove(item)
 
     def _advance(self, line: _Line) -> None:
