@@ -425,7 +425,7 @@ def test_logs_follow_each_other_by_name_or_else_by_time(recording, tmp_path):
 
 def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, tmp_path):
     log = recorded_logs(recording)[0]
-    places = ["anna/2026/03/01", "anna/2026/03/02", "berta/2026/03/01", "20/3/1", "anna"]
+    places = ["anna/2026/03/01", "anna/2026/03/02", "berta/2026/03/01", "anna/20/3/1", "anna"]
     for place in places:
         (tmp_path / place).mkdir(parents=True, exist_ok=True)
         shutil.copy(log, tmp_path / place)
@@ -434,8 +434,8 @@ def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, 
         for chain in find_chains([tmp_path])
     ]
     assert sorted(folders) == [
-        ["20/3/1"],
         ["anna", "anna/2026/03/01", "anna/2026/03/02"],
+        ["anna/20/3/1"],
         ["berta/2026/03/01"],
     ]
 
@@ -448,6 +448,18 @@ def test_logs_without_features_are_named(model, tmp_path, recording, capfd):
     assert done.returncode == 1
     assert "cut.mcap: has no features" in done.stderr
     assert written(tmp_path) == {}
+
+
+def test_a_log_that_cannot_be_labelled_costs_nothing_but_its_own_layer(
+    model, logs, layers, tmp_path, capfd
+):
+    log = recorded_logs(logs)[1]
+    run(capfd, "cut", log, "-o", tmp_path / "cut.mcap", "--topics", "/mic/label")
+    (tmp_path / "cut.mcap").replace(log)
+    done = run(capfd, "relabel", logs, "--model", model, "--workers", 2)
+    assert done.returncode == 3
+    assert f"{log}: has no features" in done.stderr
+    assert set(written(logs)) == set(layers) - {layer_path(log, load_model(model).name).name}
 
 
 def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, capfd):
