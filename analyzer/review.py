@@ -18,7 +18,7 @@ from models.modelfile import CLASS_NAME
 from schemas import messages
 from schemas.columns import Columns
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, replaced_file
+from schemas.files import SUFFIX, replaced_file, stem
 from schemas.topics import Topic, check_microphone_name, topic
 from schemas.writer import LogWriter, Rows
 
@@ -39,8 +39,7 @@ class Mark(NamedTuple):
 
 def review_path(log: Path) -> Path:
     """Name the review layer of a log, finished or not."""
-    stem = log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
-    return log.with_name(f"{stem}.review{SUFFIX}")
+    return log.with_name(f"{stem(log)}.review{SUFFIX}")
 
 
 def read_marks(log: Path) -> list[Mark]:
@@ -98,7 +97,7 @@ def write_marks(log: Path, marks: Iterable[Mark]) -> Path:
     about = {
         "version": version("hearthlog"),
         "node": next((found.get("node", "") for found in select([log]).metadata), ""),
-        "log": log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX) + SUFFIX,
+        "log": stem(log) + SUFFIX,
     }
     path = review_path(log)
     with replaced_file(path) as temporary:

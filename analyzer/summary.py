@@ -1,6 +1,5 @@
 """What is in a log, or in a folder of logs."""
 
-import re
 import struct
 from collections import Counter
 from collections.abc import Iterable
@@ -17,6 +16,7 @@ from schemas import messages
 from schemas.chunks import read_chunks
 from schemas.columns import Columns
 from schemas.errors import LogError
+from schemas.files import is_layer
 from schemas.logfile import LogFile, Place
 from schemas.messages import NANOSECONDS
 from schemas.records import HEAD
@@ -38,7 +38,6 @@ _FIELDS = {
 }
 _FRAME_SECONDS = 0.05  # where a layer does not say it
 _BATCH = 2 << 20  # bytes, before compression, that are read at once
-_LAYER = re.compile(r"\.(relabel-.+|review)\.mcap")
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
 _TIMES = 16  # bytes of an attachment before its name
@@ -236,7 +235,7 @@ def _about(file: LogFile) -> Summary:
     summary = Summary(
         files=[file.path],
         unfinished=[] if file.complete else [file.path],
-        layers=[file.path] if _LAYER.search(file.path.name) else [],
+        layers=[file.path] if is_layer(file.path) else [],
         size=file.size,
         chunks=len(chunks),
         chunk_bytes=int(chunks["length"].sum()),

@@ -17,7 +17,7 @@ from schemas.chunks import read_chunks
 from schemas.chunkwriter import ChunkWriter
 from schemas.damage import Damage
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, sync_folder
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, stem, sync_folder
 from schemas.intact import FoundAttachment, FoundChunk
 from schemas.logfile import LogFile
 from schemas.salvage import Definition, Piece, Salvage
@@ -131,7 +131,7 @@ def recover_in_place(
     LogError
         As `recover_log`, or if the log is being written, or there is a file of a name needed here.
     """
-    path = log.with_name(log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX) + SUFFIX)
+    path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")
     copy = path.with_name(f".{path.name}.{os.getpid()}.recovering")
     check_new(kept)

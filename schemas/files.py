@@ -15,6 +15,7 @@ from schemas.ranges import is_local, store_errors
 
 SUFFIX = ".mcap"
 ACTIVE_SUFFIX = SUFFIX + ".active"
+_LAYER = re.compile(r"\.(relabel-.+|review)\.mcap(\.active)?")
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
 
 
@@ -37,6 +38,16 @@ def log_path(root: Path, node: str, start: int) -> Path:
 def active_path(path: Path) -> Path:
     """Name a log while it is being written."""
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
+
+
+def stem(log: Path) -> str:
+    """Name a log without its suffix, finished or not."""
+    return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+
+
+def is_layer(path: Path) -> bool:
+    """Tell by its name whether a log is a layer, which speaks of another log."""
+    return _LAYER.search(path.name) is not None
 
 
 def find_logs(path: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from schemas.chunks import RawMessages, read_chunks
 from schemas.columns import Columns, decode
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, stem
 from schemas.logfile import LogFile
 from schemas.series import iterate_messages
 
@@ -125,8 +125,7 @@ class _Growing:
 
 def _names(path: Path) -> tuple[Path, Path]:
     """Return the name of a log while it is written, and when it is finished."""
-    stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
-    return path.with_name(stem + ACTIVE_SUFFIX), path.with_name(stem + SUFFIX)
+    return path.with_name(stem(path) + ACTIVE_SUFFIX), path.with_name(stem(path) + SUFFIX)
 
 
 def _open(path: Path) -> Iterator[_Growing]:
@@ -176,8 +175,8 @@ class _Folder:
                         self._listed[path] = -1
                         todo.append(path)
                 elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)):
-                    stem = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
-                    if stem not in self._known:
-                        found[stem] = path
+                    name = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+                    if name not in self._known:
+                        found[name] = path
         self._known |= found.keys()
         return [found[stem] for stem in sorted(found)]

@@ -23,7 +23,7 @@ from stores import put
 
 from analyzer.doctor import examine
 from analyzer.relabel.layer import digest, layer_path, read_about
-from analyzer.relabel.neighbours import find_chains, is_layer
+from analyzer.relabel.neighbours import find_chains
 from analyzer.relabel.run import relabel
 from analyzer.workers import open_workers
 from models.modelfile import load_model, save_model
@@ -33,7 +33,7 @@ from recorder.recovery import recover_log
 from recorder.service import record
 from recorder.sources.replayed import FileSource
 from schemas.columns import read_columns
-from schemas.files import find_logs
+from schemas.files import find_logs, is_layer
 from schemas.logfile import LogFile
 from schemas.messages import NANOSECONDS
 

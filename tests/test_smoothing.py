@@ -203,10 +203,9 @@ def test_a_single_cough_survives_and_a_flicker_does_not():
     assert (last.end, last.known) == (400 * FRAME_NANOSECONDS, 400 * FRAME_NANOSECONDS)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
-def test_once_states_are_sure_the_segments_that_begin_later_are_those_of_the_whole(lag):
+def parts(lag, ready):
+    """Begin in the middle; yield the part once it is ready, what it then says, and the whole."""
     smoothing, transitions = Smoothing(method="hmm", lag_seconds=lag), default_transitions(CLASSES)
-    earlier = 0
     for seed in range(8):
         probabilities = made_up(seed, 1200)
         stamps = START + np.arange(1200) * FRAME_NANOSECONDS
@@ -214,35 +213,30 @@ def test_once_states_are_sure_the_segments_that_begin_later_are_those_of_the_who
         for begin in range(100, 900, 100):
             part = Segmenter(smoothing, transitions, FRAME_SECONDS)
             frame = begin
-            while not part.sure and frame < 1200:
+            while not ready(part) and frame < 1200:
                 part.push(probabilities[frame : frame + 1], stamps[frame : frame + 1])
                 frame += 1
-            earlier += not part.settled
+            settled = part.settled
             later = part.push(probabilities[frame:], stamps[frame:])
-            assert later[1:] == [one for one in whole if one.known >= stamps[frame]][1:]
+            expected = [segment for segment in whole if segment.known >= stamps[frame]]
+            yield frame - begin, settled, later, expected
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
+def test_once_states_are_sure_the_segments_that_begin_later_are_those_of_the_whole(lag):
+    earlier = 0
+    for _, settled, later, expected in parts(lag, lambda part: part.sure):
+        earlier += not settled
+        assert later[1:] == expected[1:]
     assert earlier > 10  # than the segments are
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
 def test_segments_of_a_part_are_those_of_the_whole_once_settled(lag):
-    smoothing, transitions = (
-        Smoothing(method="hmm", lag_seconds=lag),
-        default_transitions(CLASSES),
-    )
     settled_after = []
-    for seed in range(8):
-        probabilities = made_up(seed, 1200)
-        stamps = START + np.arange(1200) * FRAME_NANOSECONDS
-        whole = Segmenter(smoothing, transitions, FRAME_SECONDS).push(probabilities, stamps)
-        for begin in range(100, 900, 100):
-            part = Segmenter(smoothing, transitions, FRAME_SECONDS)
-            frame = begin
-            while not part.settled and frame < 1200:
-                part.push(probabilities[frame : frame + 1], stamps[frame : frame + 1])
-                frame += 1
-            settled_after.append(frame - begin)
-            later = part.push(probabilities[frame:], stamps[frame:])
-            assert later == [segment for segment in whole if segment.known >= stamps[frame]]
+    for frames, _, later, expected in parts(lag, lambda part: part.settled):
+        settled_after.append(frames)
+        assert later == expected
     assert np.median(settled_after) < 400
 
 

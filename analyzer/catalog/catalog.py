@@ -14,7 +14,7 @@ from analyzer.catalog.contents import Contents, read_contents
 from analyzer.catalog.file import SCHEMA, read_table, table_of, without_times, write_table
 from analyzer.errors import DataError
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, CATALOG, SUFFIX, find_logs, replaced_file
+from schemas.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
 from schemas.messages import NANOSECONDS
 from schemas.ranges import map_logs, store_errors
 
@@ -219,7 +219,7 @@ def _divided(logs: Sequence[Path], known: Catalog | None) -> tuple[list[int], li
 
 def _read_row(folder: Path, path: Path) -> list[Row]:
     """Make the row of a file; none if the file has gone."""
-    name = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX) + SUFFIX
+    name = stem(path) + SUFFIX
     layer = _LAYER.fullmatch(name)
     kind = LOG if layer is None else layer[2] or layer[3]
     node = _NODE.match(name)

@@ -17,7 +17,7 @@ from analyzer.selection import Selection, select
 from schemas import messages
 from schemas.columns import Columns, read_columns
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs
+from schemas.files import SUFFIX, find_logs, stem
 
 REVIEW = "review"
 FIELDS = {"header.stamp", "duration", "label"}
@@ -150,9 +150,8 @@ def with_layers(path: Path) -> list[Path]:
     """List a log and the layers beside it."""
     if not path.is_file():
         return [path]
-    stem = path.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
     beside = (other for other in path.parent.iterdir() if other.name.endswith(SUFFIX))
-    return [path, *sorted(other for other in beside if other.name.startswith(f"{stem}."))]
+    return [path, *sorted(other for other in beside if other.name.startswith(f"{stem(path)}."))]
 
 
 def _segment_topic(selection: Selection, wanted: str | None) -> str:

@@ -20,7 +20,6 @@ from analyzer.relabel.layer import (
     read_about,
     topics_of,
 )
-from analyzer.relabel.neighbours import stem
 from analyzer.relabel.reading import (
     UnreadableError,
     heard,
@@ -36,7 +35,7 @@ from models.modelfile import Model, load_model
 from models.segments import Run, Segment
 from schemas.content import METADATA, LogContent, Rows
 from schemas.errors import LogError
-from schemas.files import new_file, replaced_file
+from schemas.files import new_file, replaced_file, stem
 from schemas.rows import Column
 
 

@@ -15,12 +15,11 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from analyzer.relabel.neighbours import stem
 from models.segments import Run
 from schemas import messages
 from schemas.content import METADATA
 from schemas.errors import LogError
-from schemas.files import SUFFIX
+from schemas.files import SUFFIX, stem
 from schemas.logfile import LogFile
 from schemas.topics import Topic, topic
 

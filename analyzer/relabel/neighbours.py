@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs, is_layer, stem
 from schemas.logfile import time_span
 
-_LAYER = re.compile(r"\.(relabel-.+|review)\.mcap(\.active)?")
 _NAMED = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z.*)")
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")
 _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
@@ -31,19 +30,9 @@ class Chain(NamedTuple):
     asked: Mapping[int, Path]
 
 
-def is_layer(path: Path) -> bool:
-    """Tell by its name whether a log is a layer."""
-    return _LAYER.search(path.name) is not None
-
-
 def is_active(path: Path) -> bool:
     """Tell by its name whether a log is still being written."""
     return path.name.endswith(ACTIVE_SUFFIX)
-
-
-def stem(log: Path) -> str:
-    """Name a log without suffix, finished or not."""
-    return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
 
 
 def find_chains(paths: Iterable[Path]) -> list[Chain]:

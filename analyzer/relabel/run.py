@@ -10,11 +10,12 @@ from typing import Any
 
 from analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
 from analyzer.relabel.layer import About, digest, layer_path, read_about
-from analyzer.relabel.neighbours import Chain, find_chains, is_active, stem
+from analyzer.relabel.neighbours import Chain, find_chains, is_active
 from analyzer.workers import Workers
 from models.modelfile import Model
 from models.segments import Run
 from schemas.errors import HearthlogError, LogError
+from schemas.files import stem
 from schemas.ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them

@@ -57,14 +57,13 @@ def recover(
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
     from recorder.recovery import recover_in_place, recover_log
-    from schemas.files import ACTIVE_SUFFIX, SUFFIX, new_file
+    from schemas.files import SUFFIX, new_file, stem
     from tools.cli.progress import share_done
 
     with share_done(f"recovering {log.name}") as progress:
         if in_place:
             return recover_in_place(log, progress)
-        stem = log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
-        path = output or log.with_name(f"{stem}.recovered{SUFFIX}")
+        path = output or log.with_name(f"{stem(log)}.recovered{SUFFIX}")
         with new_file(path) as temporary:
             return path, recover_log(log, temporary, path.name, progress)
 
