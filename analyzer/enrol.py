@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from analyzer.errors import DataError
 from analyzer.export.names import names_of
 from analyzer.heard import find_heard
-from analyzer.review import Mark, write_marks
+from analyzer.marks import Mark, write_marks
 from analyzer.selection import select
 from analyzer.splice import splice
 from models.modelfile import CLASS_NAME

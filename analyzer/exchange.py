@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from analyzer.errors import DataError
 from analyzer.heard import Heard
-from analyzer.review import Mark
+from analyzer.marks import Mark
 from analyzer.textfile import csv_records, read_text
 from models.modelfile import CLASS_NAME
 from schemas.files import new_file

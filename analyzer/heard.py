@@ -7,7 +7,7 @@ from pathlib import Path
 
 from analyzer.errors import DataError
 from analyzer.known import is_of_type
-from analyzer.review import ROUNDING
+from analyzer.marks import ROUNDING
 from analyzer.selection import select
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analyzer.dataset import Recording
-from analyzer.review import Mark, read_marks
+from analyzer.marks import Mark, read_marks
 from models.inputs import WINDOW_FRAMES
 from recorder.stream import FRAME_NANOSECONDS
 from schemas.columns import Columns, read_columns

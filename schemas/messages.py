@@ -13,12 +13,13 @@ FEATURES = f"{PACKAGE}/msg/AudioFeatures"
 STATISTICS = f"{PACKAGE}/msg/AudioStatistics"
 LABEL = f"{PACKAGE}/msg/AudioLabel"
 SEGMENT = f"{PACKAGE}/msg/AudioSegment"
+MARK = f"{PACKAGE}/msg/AudioMark"
 GAP = f"{PACKAGE}/msg/AudioGap"
 RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
 
-_DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, GAP, RAW_AUDIO)
+_DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, MARK, GAP, RAW_AUDIO)
 NANOSECONDS = 1_000_000_000
 
 

@@ -22,7 +22,7 @@ from analyzer.recipe import (
     prepare,
     softmax,
 )
-from analyzer.review import Mark, write_marks
+from analyzer.marks import Mark, write_marks
 from analyzer.scenario import Scenario
 from analyzer.train import adapt_model, train_model
 from models.classifier import HOME_VOTE, Classifier, home_votes

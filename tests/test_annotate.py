@@ -16,7 +16,7 @@ from spliced import run, small_disk, write_log
 from analyzer.errors import DataError
 from analyzer.exchange import SUFFIXES, read_labels, write_labels
 from analyzer.heard import Heard, find_heard
-from analyzer.review import ROUNDING, Mark, read_marks, review_path, write_marks
+from analyzer.marks import ROUNDING, Mark, read_marks, review_path, write_marks
 from schemas.errors import LogError
 from schemas.files import find_logs
 from schemas.logfile import LogFile

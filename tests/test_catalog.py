@@ -32,7 +32,7 @@ from analyzer.catalog import (
 from analyzer.catalog.file import SCHEMA, sealed
 from analyzer.catalog.fleet import heard, homes
 from analyzer.errors import DataError
-from analyzer.review import Mark, write_marks
+from analyzer.marks import Mark, write_marks
 from analyzer.selection import select
 from recorder.config import Microphone, Settings
 from recorder.service import record

@@ -15,7 +15,7 @@ from analyzer.errors import DataError
 from analyzer.evaluation.clips import scenario_of
 from analyzer.home import home_recordings
 from analyzer.manifest import read_manifest
-from analyzer.review import Mark, write_marks
+from analyzer.marks import Mark, write_marks
 from analyzer.scenario import load_scenario
 from analyzer.train import adapt_model
 from models.modelfile import load_model, save_model

@@ -24,7 +24,7 @@ from analyzer.errors import DataError
 from analyzer.evaluation.events import Events
 from analyzer.evaluation.reference import Labelling
 from analyzer.export.names import names_of
-from analyzer.review import Mark, read_marks, write_marks
+from analyzer.marks import Mark, read_marks, write_marks
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages
 from schemas.columns import read_columns

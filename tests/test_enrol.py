@@ -14,7 +14,7 @@ from spliced import run
 
 from analyzer.enrol import enrol_file
 from analyzer.heard import find_heard
-from analyzer.review import read_marks
+from analyzer.marks import read_marks
 from recorder.features import FRAME_SAMPLES, FeatureExtractor
 from recorder.sources.files import read_audio
 from schemas.columns import read_columns

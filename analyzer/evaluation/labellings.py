@@ -12,7 +12,7 @@ from analyzer.exchange import read_lines
 from analyzer.export.names import names_of
 from analyzer.heard import find_heard
 from analyzer.known import is_of_type
-from analyzer.review import read_marks
+from analyzer.marks import read_marks
 from analyzer.selection import Selection, select
 from schemas import messages
 from schemas.columns import Columns, read_columns

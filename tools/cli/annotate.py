@@ -10,7 +10,7 @@ import typer
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.review import Mark
+    from analyzer.marks import Mark
 
 annotate = typer.Typer(
     no_args_is_help=True,
@@ -33,7 +33,7 @@ def import_labels(
     """
     from analyzer.exchange import read_labels
     from analyzer.heard import find_heard
-    from analyzer.review import write_marks
+    from analyzer.marks import write_marks
 
     _check_suffix(labels)
     by_log = read_labels(labels, find_heard(log), microphone)
@@ -53,7 +53,7 @@ def export_labels(
     from analyzer.errors import DataError
     from analyzer.exchange import write_labels
     from analyzer.heard import find_heard
-    from analyzer.review import read_marks
+    from analyzer.marks import read_marks
     from schemas.files import check_new
 
     _check_suffix(output)

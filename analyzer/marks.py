@@ -1,13 +1,16 @@
 """Marks: what a reviewer says that was heard, in a layer beside the log it speaks about."""
 
+import fcntl
+import os
 import re
 import tempfile
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,18 +26,41 @@ from schemas.topics import Topic, check_microphone_name, topic
 from schemas.writer import LogWriter, Rows
 
 ROUNDING = 1_000  # ns; times that passed through a label file are off by up to this
-_KIND = "review/segment"
-_TOPIC = re.compile(rf"/[^/]+/{_KIND}")
-_FIELDS = {messages.SEGMENT: ("header.stamp", "duration", "label")}
+_KINDS = {messages.SEGMENT: "review/segment", messages.MARK: "review/mark"}
+_SPAN = ("header.stamp", "duration", "label")
+_SAYS = ("reviewer", "made", "corrects")
+_FIELDS = {messages.SEGMENT: _SPAN, messages.MARK: (*_SPAN, *_SAYS)}
+_NAME = re.compile(r"[^\x00-\x1f\x7f]{0,200}")
 
 
 class Mark(NamedTuple):
-    """What was heard from `start` on, before `end`, in nanoseconds of UTC."""
+    """What was heard from `start` on, before `end`, in nanoseconds of UTC, and who says so.
+
+    Attributes
+    ----------
+    reviewer : str
+        Empty if nobody knows, as of what is below.
+    made : int
+        When the mark was made, in nanoseconds of UTC; 0 if nobody knows.
+    corrects : str
+        The labelling that it corrects: `live`, or the name of a model.
+    """
 
     microphone: str
     start: int
     end: int
     label: str
+    reviewer: str = ""
+    made: int = 0
+    corrects: str = ""
+
+
+class Span(NamedTuple):
+    """A span of time that a microphone heard, in nanoseconds of UTC."""
+
+    microphone: str
+    start: int
+    end: int
 
 
 def review_path(log: Path) -> Path:
@@ -62,28 +88,41 @@ def read_marks(log: Path) -> list[Mark]:
     if selection.unfinished:
         raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
     for name, same in selection.channels.items():
-        if not _TOPIC.fullmatch(name) or not all(is_of_type(*d, messages.SEGMENT) for d in same):
+        kind = next((kind for kind in _KINDS if all(is_of_type(*d, kind) for d in same)), "")
+        if not kind or not re.fullmatch(rf"/[^/]+/{_KINDS[kind]}", name):
             raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
     selection.verify()
-    marks: list[Mark] = []
+    spans: list[Mark] = []
+    said: dict[tuple[Any, ...], Mark] = {}
     for batch in selection.messages():
         for columns in decode_known(path, batch, _FIELDS):
-            marks += _marks(columns)
+            if columns.type == messages.SEGMENT:
+                spans += _marks(columns)
+            else:
+                said |= {mark[:4]: mark for mark in _marks(columns)}
     try:
-        return _checked(marks)
+        return _checked(said.get(mark[:4], mark) for mark in spans)
     except (DataError, LogError) as error:
         raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
 
 
-def write_marks(log: Path, marks: Iterable[Mark]) -> Path:
+def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) -> Path:
     """Add marks to the review layer of a log; where they overlap older marks, they win.
 
-    The layer is replaced in one step: whatever happens, the old or the new one is there.
+    The layer is replaced in one step: whatever happens, the old or the new one is there. One
+    process waits for another that does the same.
+
+    Parameters
+    ----------
+    log : Path
+    marks : iterable of Mark
+    deleted : iterable of Span
+        Where older marks are deleted, or cut off.
 
     Returns
     -------
     Path
-        The layer.
+        The layer; with no marks left it is not there any more.
 
     Raises
     ------
@@ -93,23 +132,45 @@ def write_marks(log: Path, marks: Iterable[Mark]) -> Path:
         If there is no such log, if its layer is damaged, or if it cannot be written.
     """
     new = _checked(marks)
-    old = read_marks(log)
-    about = {
-        "version": version("hearthlog"),
-        "node": next((found.get("node", "") for found in select([log]).metadata), ""),
-        "log": stem(log) + SUFFIX,
-    }
     path = review_path(log)
-    with replaced_file(path) as temporary:
-        temporary.write_bytes(_layer(path.name, _checked([*_left(old, new), *new]), about))
+    with _alone(path):
+        left = read_marks(log)
+        for span in deleted:
+            left = list(_left(left, [span]))
+        left = _checked([*_left(left, new), *new])
+        if not left:
+            path.unlink(missing_ok=True)
+            return path
+        about = {
+            "version": version("hearthlog"),
+            "node": next((found.get("node", "") for found in select([log]).metadata), ""),
+            "log": stem(log) + SUFFIX,
+        }
+        with replaced_file(path) as temporary:
+            temporary.write_bytes(_layer(path.name, left, about))
     return path
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Keep other writers of review layers out of a folder."""
+    try:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror})") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
 
 
 def _marks(columns: Columns) -> Iterator[Mark]:
     microphone = columns.topic.split("/")[1]
     starts = columns["header.stamp"]
     ends = starts + columns["duration"]
-    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), strict=True):
+    says = [columns[name].tolist() for name in _SAYS if columns.type == messages.MARK]
+    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *says, strict=True):
         yield Mark(microphone, *row)
 
 
@@ -121,6 +182,8 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
             raise DataError(f"a mark from {mark.start} to {mark.end} ns is no span of time")
         if not CLASS_NAME.fullmatch(mark.label):
             raise DataError(f"{mark.label[:64]!r} cannot be the name of a class")
+        if mark.made < 0 or not (_NAME.fullmatch(mark.reviewer) and _NAME.fullmatch(mark.corrects)):
+            raise DataError(f"a mark cannot be made by {mark.reviewer[:64]!r} at {mark.made} ns")
     for microphone in {mark.microphone for mark in ordered}:
         check_microphone_name(microphone)
     for one, other in pairwise(ordered):
@@ -129,8 +192,8 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
     return ordered
 
 
-def _left(old: Sequence[Mark], new: Sequence[Mark]) -> Iterator[Mark]:
-    """Yield what the new marks leave of the old ones."""
+def _left(old: Sequence[Mark], new: Sequence[Mark | Span]) -> Iterator[Mark]:
+    """Yield what new marks leave of the old ones."""
     for microphone in {mark.microphone for mark in old}:
         own = [mark for mark in new if mark.microphone == microphone]
         starts, ends = [mark.start for mark in own], [mark.end for mark in own]
@@ -156,14 +219,15 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
 def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
     """Make the file; elsewhere, for there it must not be taken for a log being written."""
     microphones = sorted({mark.microphone for mark in marks})
-    topics = [Topic(topic(microphone, _KIND), messages.SEGMENT) for microphone in microphones]
+    topics = [Topic(topic(m, kind), type_) for type_, kind in _KINDS.items() for m in microphones]
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         writer = LogWriter(Path(folder) / name, topics, about)
-        writer.write_columns([_rows(microphone, marks) for microphone in microphones])
+        writer.write_columns([_rows(t.name, t.type, marks) for t in topics])
         return writer.finish().read_bytes()
 
 
-def _rows(microphone: str, marks: Sequence[Mark]) -> Rows:
+def _rows(name: str, kind: str, marks: Sequence[Mark]) -> Rows:
+    microphone = name.split("/")[1]
     own = [mark for mark in marks if mark.microphone == microphone]
     starts = np.array([mark.start for mark in own])
     ends = np.array([mark.end for mark in own])
@@ -172,6 +236,12 @@ def _rows(microphone: str, marks: Sequence[Mark]) -> Rows:
         "header.frame_id": microphone,
         "duration": ends - starts,
         "label": [mark.label for mark in own],
-        "confidence": np.ones(len(own), np.float32),
     }
-    return Rows(topic(microphone, _KIND), ends, fields)
+    if kind == messages.SEGMENT:
+        return Rows(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
+    says = {
+        "reviewer": [mark.reviewer for mark in own],
+        "made": np.array([mark.made for mark in own]),
+        "corrects": [mark.corrects for mark in own],
+    }
+    return Rows(name, ends, fields | says)
