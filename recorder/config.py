@@ -8,7 +8,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_settings import BaseSettings, InitSettingsSource, SettingsConfigDict
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
+from recorder.clips import Keep
 from recorder.errors import ConfigurationError
+from recorder.zone import check_time_zone, machine_zone
 from schemas.errors import HearthlogError
 from schemas.files import check_node_name
 from schemas.topics import check_microphone_name
@@ -47,6 +49,13 @@ class Settings(BaseSettings):
     flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
     sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut
     statistics_every: int = Field(default=1, ge=1)  # frames
+    timezone: Annotated[str, _checked(check_time_zone)] = Field(default_factory=machine_zone)
+    keep_audio: Keep = "off"
+    never_keep: list[str] = ["speech"]  # classes
+    clip_pre_roll_seconds: float = Field(default=2.0, ge=0.0, le=30.0)
+    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500)
+    clip_retention_days: int = Field(default=30, ge=1, le=3650)
+    clip_min_free_space: int = Field(default=500, ge=0)  # MB: with less, only the log goes on
     microphone: list[Microphone] = Field(default=[Microphone()], min_length=1, max_length=1)
 
     @classmethod

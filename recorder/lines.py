@@ -38,8 +38,8 @@ def of_health(microphone: str, health: Health) -> bytes:
     return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
 
 
-def of_model(microphone: str, stamp: int, level: int, text: str) -> bytes:
-    """Say which model speaks, or which was refused; the level is one of `diagnostic_msgs`."""
+def of_report(microphone: str, stamp: int, level: int, text: str) -> bytes:
+    """Say which model speaks, or why no clip is kept; the level is one of `diagnostic_msgs`."""
     return _line(stamp, microphone, _LEVELS[level], text)
 
 

@@ -1,6 +1,7 @@
 """The log that is being recorded: one file after another, aligned to the clock."""
 
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from schemas.writer import Attachment, LogWriter
 
 # What may lie between a sound and its being written: a block of frames, and the capture's delay.
 _DELAY_SECONDS = 0.9
+_FILES = 256  # that are remembered: of a second each, more than what clips are held back
+_NEVER = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class RollingLog:
         self._last = self._until = 0  # no time lies between: the first record opens a file
         self._flush_at: int | None = None
         self._synced = time.monotonic()
+        self._begun: deque[tuple[int, Path]] = deque(maxlen=_FILES)
 
     def write(self, records: Sequence[Record]) -> None:
         """Append records, in the order of their log times.
@@ -120,6 +124,18 @@ class RollingLog:
         path = log_path(self._description.root, self._description.node, stamp)
         return not (path.exists() or active_path(path).exists())
 
+    def file_at(self, stamp: int) -> tuple[Path, int]:
+        """Return which of the last files has a time that was written, and the end of that file.
+
+        Where the clock was set back and files speak of the same time, it is the later one.
+        """
+        until = _NEVER
+        for start, path in reversed(self._begun):
+            if start <= stamp:
+                return path, until
+            until = start
+        return self._begun[0][1], until
+
     def begin_anew(self, description: LogDescription, records: Sequence[Record]) -> None:
         """Complete the file as `finish` does; the next record begins one of other content."""
         self.finish(records)
@@ -157,6 +173,7 @@ class RollingLog:
         about = self._description
         path = log_path(about.root, about.node, stamp)
         self._writer = LogWriter(path, about.topics, about.metadata, about.attachments, stamp)
+        self._begun.append((stamp, path))
         self._last = stamp
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
         about.info.header = header(stamp, about.microphone)

@@ -12,6 +12,7 @@ from models.inputs import WINDOW_FRAMES, InputStream
 from models.modelfile import Model
 from models.segments import Segment, Segmenter
 from recorder import features, lines
+from recorder.clips import Labelled
 from recorder.features import FeatureExtractor
 from recorder.statistics import RollingStatistics
 from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
@@ -81,6 +82,8 @@ class Pipeline:
     ----------
     settled : bool
         Whether sound before the first frame would have left no trace in the segments to come.
+    labelled : Labelled or None
+        What was said of the last frames that were pushed last; None where they had no label.
     """
 
     def __init__(
@@ -88,6 +91,7 @@ class Pipeline:
     ) -> None:
         self.microphone = microphone
         self.settled = False
+        self.labelled: Labelled | None = None
         self._use(classifier)
         self._statistics_every = statistics_every
         self._features = FeatureExtractor()
@@ -114,6 +118,7 @@ class Pipeline:
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
         """
+        self.labelled = None
         mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))
         shown = np.flatnonzero(frames % self._statistics_every == 0)
@@ -158,13 +163,13 @@ class Pipeline:
         if self._inputs is not None and self._statistics.recent is not None:
             self._inputs(self._statistics.recent)
         who = "no model" if model is None else f"model {model.name} ({model.sha256[:12]})"
-        return closing, self.report_model(stamp, 0, f"{who} from frame {frame} on")
+        return closing, self.report("model", stamp, 0, f"{who} from frame {frame} on")
 
-    def report_model(self, stamp: int, level: int, text: str) -> list[Record]:
-        """Say something about the model; the level is one of `diagnostic_msgs`."""
+    def report(self, what: str, stamp: int, level: int, text: str) -> list[Record]:
+        """Say something about the model or the clips; the level is one of `diagnostic_msgs`."""
         return [
-            self._diagnostics(stamp, level, f"hearthlog: {self.microphone} model", text, {}),
-            Record(stamp, ROSOUT, lines.of_model(self.microphone, stamp, level, text)),
+            self._diagnostics(stamp, level, f"hearthlog: {self.microphone} {what}", text, {}),
+            Record(stamp, ROSOUT, lines.of_report(self.microphone, stamp, level, text)),
         ]
 
     def _use(self, classifier: Classifier | None) -> None:
@@ -198,6 +203,7 @@ class Pipeline:
         if classifier is None or segmenter is None or not len(inputs):
             return []
         probabilities, novelty = classifier.classify(inputs)
+        self.labelled = Labelled(classifier.classes, probabilities, novelty)
         best = probabilities.argmax(axis=1)
         confidence = probabilities[np.arange(len(best)), best]
         closed = segmenter.push(probabilities, stamps)

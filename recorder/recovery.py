@@ -17,7 +17,7 @@ from schemas.chunks import read_chunks
 from schemas.chunkwriter import ChunkWriter
 from schemas.damage import Damage
 from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, stem, sync_folder
+from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, is_layer, stem, sync_folder
 from schemas.intact import FoundAttachment, FoundChunk
 from schemas.logfile import LogFile
 from schemas.salvage import Definition, Piece, Salvage
@@ -329,25 +329,52 @@ class Recovered:
         End of its last frame, in nanoseconds of UTC; 0 if it has none.
     damage : str
         What is wrong with the file, and was lost; empty if it only ended early.
+    completed : bool
+        False for clips of which nothing is left, or that cannot be completed now.
     """
 
     path: Path
     end: int
     damage: str
+    completed: bool = True
 
 
 def recover_active(root: Path, node: str) -> list[Recovered]:
     """Complete all logs of a node that nobody writes any more.
 
     What is whole is copied to the final name, read again and counted; only then is the original
-    removed. One that is damaged, or holds no message, is kept beside it as `*.damaged`.
+    removed. One that is damaged, or holds no message, is kept beside it as `*.damaged`; but no
+    layer of sound, which is to be forgotten some day, and which keeps nobody from recording.
     """
     found = []
     for active in sorted(root.rglob(f"{node}_*{ACTIVE_SUFFIX}")):
         with _abandoned(active) as is_abandoned:
             if is_abandoned:
-                found += _recover(active)
+                found += _recover_clips(active) if is_layer(active) else _recover(active)
     return found
+
+
+def _recover_clips(active: Path) -> list[Recovered]:
+    path = active.with_name(active.name.removesuffix(ACTIVE_SUFFIX) + SUFFIX)
+    copy = active.with_name(path.name + ".recovering")
+    try:
+        recovery = recover_log(active, copy, path.name)
+        if recovery.messages:
+            _put_in_place(copy, path, recovery)
+        active.unlink()
+        sync_folder(path.parent)
+    except NothingWholeError:
+        active.unlink()
+        return []
+    except (LogError, OSError) as error:
+        what = error if isinstance(error, LogError) else error.strerror or error
+        text = f"{active}: cannot be completed ({what}); it is left as it is"
+        return [Recovered(path, 0, text, completed=False)]
+    finally:
+        copy.unlink(missing_ok=True)
+    damages = [damage for damage in recovery.damages if not damage.cut]
+    damage = f"{active}: {damages[0]}; this sound is deleted" if damages else ""
+    return [Recovered(path, 0, damage)] if recovery.messages else []
 
 
 def _recover(active: Path) -> list[Recovered]:
@@ -379,7 +406,8 @@ def _recover(active: Path) -> list[Recovered]:
         if t.type == messages.FEATURES and t.messages
     ]
     more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
-    damage = f"{active}: {damages[0]}{more}" if damages else ""
+    kept = "; the original is kept as *.damaged"
+    damage = f"{active}: {damages[0]}{more}{kept}" if damages else ""
     return [Recovered(path, max(ends, default=0), damage)]
 
 

@@ -13,9 +13,10 @@ from typing import Protocol
 from models.modelfile import Model
 from recorder import features
 from recorder.config import Settings
+from recorder.keeper import ClipKeeper, time_of
 from recorder.log import LogDescription, RollingLog
 from recorder.modelwatch import ModelWatch
-from recorder.pipeline import Pipeline, stream_info
+from recorder.pipeline import Pipeline, Record, stream_info
 from recorder.recovery import Recovered, recover_active
 from recorder.sources.microphone import MicrophoneSource
 from recorder.sources.replayed import FileSource
@@ -142,7 +143,10 @@ def record(
             settings.flush_seconds,
             settings.sync_seconds,
         )
+        classes = None if first is None else first.classifier.classes
+        clips = ClipKeeper(settings, classes, log.file_at)
         recording = Recording(log.finished, recovered)
+        now = 0
         try:
             for event in source.events(stop):
                 if isinstance(event, Gap):
@@ -150,10 +154,19 @@ def record(
                     recording.frames_lost += event.frames_lost
                 if isinstance(event, Frames) and watch is not None:
                     recording.models_refused += _attend(watch, event, pipeline, log, describe)
+                said = clips.before(event)
                 log.write(pipeline.push(event))
+                said += clips.after(event, pipeline.labelled)
+                now = time_of(event)
+                log.write(_reports(pipeline, now, said))
         finally:
-            log.finish(pipeline.finish())
+            said = clips.finish()
+            log.finish([*pipeline.finish(), *_reports(pipeline, now, said)])
     return recording
+
+
+def _reports(pipeline: Pipeline, now: int, said: Sequence[tuple[int, str]]) -> list[Record]:
+    return [record for level, text in said for record in pipeline.report("clips", now, level, text)]
 
 
 def _attend(
@@ -171,7 +184,7 @@ def _attend(
     stamp = int(coming.stamps[0])
     refused = list(watch.refusals())
     for text in refused:
-        log.write(pipeline.report_model(stamp, 1, text))
+        log.write(pipeline.report("model", stamp, 1, text))
     if watch.ready is not None and log.may_begin(stamp):
         model, classifier = watch.ready
         watch.ready = None
@@ -196,6 +209,7 @@ def _describe(settings: Settings, source: Source, model: Model | None) -> LogDes
         "feature_set": features.NAME,
         "model": info.model,
         "model_sha256": info.model_sha256,
+        "timezone": settings.timezone,
     }
     return LogDescription(
         root=settings.output,

@@ -15,7 +15,8 @@ from schemas.ranges import is_local, store_errors
 
 SUFFIX = ".mcap"
 ACTIVE_SUFFIX = SUFFIX + ".active"
-_LAYER = re.compile(r"\.(relabel-.+|review)\.mcap(\.active)?")
+AUDIO_SUFFIX = ".audio" + SUFFIX
+_LAYER = re.compile(r"\.(relabel-.+|review|audio)\.mcap(\.active)?")
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
 
 
@@ -38,6 +39,11 @@ def log_path(root: Path, node: str, start: int) -> Path:
 def active_path(path: Path) -> Path:
     """Name a log while it is being written."""
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
+
+
+def audio_path(log: Path) -> Path:
+    """Name the layer of a log that has its clips of sound."""
+    return log.with_name(stem(log) + AUDIO_SUFFIX)
 
 
 def stem(log: Path) -> str:

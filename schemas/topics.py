@@ -81,3 +81,8 @@ def topics_of(
         found.append(Topic(topic(microphone, "label"), messages.LABEL, array_names=names))
         found.append(Topic(topic(microphone, "segment"), messages.SEGMENT))
     return found
+
+
+def audio_topic(microphone: str) -> Topic:
+    """Return the one topic of a layer of sound."""
+    return Topic(topic(microphone, "audio"), messages.RAW_AUDIO)

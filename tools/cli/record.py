@@ -5,11 +5,14 @@ import sys
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tools.cli.times import parse_time
+
+if TYPE_CHECKING:
+    from recorder.service import Recording
 
 
 def record(
@@ -50,6 +53,13 @@ def record(
         int | None,
         typer.Option("--max-bag-duration", "-d", help="Seconds a file.  [default: 3600]"),
     ] = None,
+    keep_audio: Annotated[
+        str | None,
+        typer.Option(
+            help="Keep sound beside the log: off, events, unsure (of what it is) or always; but "
+            "never speech.  [default: off]"
+        ),
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="Configuration, a TOML file.")] = None,
 ) -> None:
     """Record sound to a labelled log, from a microphone or from files.
@@ -67,6 +77,7 @@ def record(
         "model": model,
         "node": node,
         "max_bag_duration": max_bag_duration,
+        "keep_audio": keep_audio,
     }
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
     stop = Flag()
@@ -84,13 +95,19 @@ def record(
         if sys.stderr.isatty():
             typer.echo("hearthlog: listening; Ctrl-C completes the log", err=True)
         recording = record_microphone(settings, stop, asked)
+    _say(recording)
+
+
+def _say(recording: "Recording") -> None:
+    """Print what was recorded, and end with status 3 if something was lost or refused."""
     for log in recording.logs:
         print(log)
     damaged = [old for old in recording.recovered if old.damage]
     for old in recording.recovered:
-        typer.echo(f"hearthlog: completed {old.path}, which was left unfinished", err=True)
+        if old.completed:
+            typer.echo(f"hearthlog: completed {old.path}, which was left unfinished", err=True)
     for old in damaged:
-        typer.echo(f"hearthlog: {old.damage}; the original is kept as *.damaged", err=True)
+        typer.echo(f"hearthlog: {old.damage}", err=True)
     if recording.gaps:
         typer.echo(
             f"hearthlog: {recording.gaps} gaps, {recording.frames_lost} frames not heard", err=True

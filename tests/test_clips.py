@@ -1,0 +1,674 @@
+"""Sound is kept only where it was asked for, never of what is private, and not for ever."""
+
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import time
+import wave
+from dataclasses import replace
+from queue import SimpleQueue
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kept import put_by_hand
+from logs import read
+from lossy import LossySource
+from spliced import raw_messages, small_disk
+
+from analyzer.dataset import build_dataset
+from analyzer.manifest import read_manifest
+from analyzer.scenario import load_scenario
+from analyzer.train import train_model
+from models.inputs import WINDOW_FRAMES
+from models.modelfile import Description, load_model, save_model
+from recorder.cliplog import ClipLog
+from recorder.clips import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
+from recorder.config import Settings, load_settings
+from recorder.errors import ConfigurationError
+from recorder.features import FRAME_SAMPLES
+from recorder.retention import Retention
+from recorder.service import record, record_files
+from recorder.sources.files import read_audio
+from recorder.sources.replayed import FileSource
+from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from schemas.files import audio_path, find_logs, is_layer
+from schemas.messages import nanoseconds
+from schemas.reader import LogReader
+
+SECOND = 1_000_000_000
+HOUR, DAY = 3600 * SECOND, 86_400 * SECOND
+START = 1_772_348_400 * SECOND  # 2026-03-01T07:00:00Z
+CLASSES = ("silence", "speech", "music")
+
+
+# Which frames are kept: sound whose samples are the numbers of their frames
+
+
+def push(finder, first, private, unlabelled=0, blocks=(7, 20, 1)):
+    """Push frames, one for each probability of speech, and return the numbers of those kept."""
+    kept = []
+    sizes = itertools.cycle(blocks)
+    start = 0
+    while start < len(private):
+        numbers = np.arange(start, min(start + next(sizes), len(private)))
+        samples = np.repeat((first + numbers[:, np.newaxis]) / 32768, FRAME_SAMPLES, axis=1)
+        stamps = START + (first + numbers) * FRAME_NANOSECONDS
+        said = np.asarray(private, np.float32)[numbers[numbers >= unlabelled]]
+        rest = 1 - said
+        probabilities = np.stack([rest / 4, said, rest * 3 / 4], axis=1)
+        labelled = Labelled(CLASSES, probabilities, np.zeros(len(said), np.float32))
+        frames = Frames(first + start, samples.astype(np.float32), stamps)
+        kept += finder.push(frames, labelled if len(said) else None)
+        start = int(numbers[-1]) + 1
+    return numbers_of(kept)
+
+
+def numbers_of(sounds):
+    for sound in sounds:
+        assert (sound.samples == sound.samples[:, :1]).all()
+        np.testing.assert_array_equal(
+            sound.stamps, START + sound.samples[:, 0].astype(np.int64) * FRAME_NANOSECONDS
+        )
+    return [number for sound in sounds for number in sound.samples[:, 0].tolist()]
+
+
+probabilities = st.lists(
+    st.sampled_from([0.0, 0.019, 0.0199, float(np.float32(PRIVATE_LIMIT)), 0.021, 0.5, np.nan])
+    | st.floats(0, 1),
+    max_size=120,
+)
+sparse = st.builds(
+    lambda count, loud, likely: [likely if number in loud else 0.0 for number in range(count)],
+    st.integers(0, 160),
+    st.sets(st.integers(0, 159), max_size=3),
+    st.sampled_from([0.5, float(np.float32(PRIVATE_LIMIT))]),
+)
+
+
+@given(
+    runs=st.lists(probabilities | sparse, min_size=1, max_size=3),
+    keep=st.sampled_from(["events", "unsure", "always"]),
+    pre_roll=st.integers(0, 50),
+    blocks=st.lists(st.integers(1, 40), min_size=1, max_size=4),
+)
+@settings(max_examples=300, deadline=None)
+def test_no_frame_is_kept_that_any_window_hears_as_private(runs, keep, pre_roll, blocks):
+    finder = ClipFinder(keep, ["speech"], pre_roll)
+    kept, allowed = [], []
+    first = 0
+    for run in runs:
+        private = np.asarray(run, np.float32)
+        kept += push(finder, first, private, WINDOW_FRAMES - 1, blocks)
+        kept += numbers_of(finder.close())
+        allowed += [
+            first + frame
+            for frame in range(WINDOW_FRAMES - 1, len(run) - WINDOW_FRAMES + 1)
+            if all(private[frame : frame + WINDOW_FRAMES] < PRIVATE_LIMIT)
+        ]
+        first += len(run) + 5
+    assert set(kept) <= set(allowed)
+    assert kept == sorted(set(kept))
+    if keep == "always":
+        assert kept == allowed
+
+
+def test_frames_before_lost_ones_are_not_of_the_windows_behind():
+    finder = ClipFinder("always", ["speech"], 0)
+    kept = push(finder, 0, [0.0] * 60, 19)
+    kept += push(finder, 61, [0.0] * 60)
+    assert kept == [*range(19, 41), *range(61, 102)]
+
+
+def test_with_nothing_private_every_frame_is_kept_with_or_without_labels():
+    for unlabelled in (0, 19, 100):
+        finder = ClipFinder("always", [], 0)
+        kept = push(finder, 0, [0.9] * 100, unlabelled)
+        assert kept + numbers_of(finder.close()) == list(range(100))
+
+
+def loud(count, start, end):
+    """Return labels of silence, but music from one frame to another."""
+    probabilities = np.zeros((count, 3), np.float32)
+    probabilities[:, 0] = 1
+    probabilities[start:end] = [0, 0, 1]
+    return probabilities
+
+
+def kept_of(finder, probabilities, novelty):
+    count = len(novelty)
+    samples = np.repeat(np.arange(count)[:, np.newaxis] / 32768, FRAME_SAMPLES, axis=1)
+    stamps = START + np.arange(count) * FRAME_NANOSECONDS
+    frames = Frames(0, samples.astype(np.float32), stamps)
+    kept = finder.push(frames, Labelled(CLASSES, probabilities, novelty))
+    return numbers_of([*kept, *finder.close()])
+
+
+def test_events_are_kept_with_the_second_that_was_labelled_what_is_before_and_what_is_behind():
+    finder = ClipFinder("events", ["speech"], 30)
+    kept = kept_of(finder, loud(300, 150, 160), np.zeros(300, np.float32))
+    assert kept == list(range(150 - 19 - 30, 160 + 20))
+
+
+def test_what_the_model_is_unsure_of_or_has_not_learned_is_kept():
+    for confidence, novelty, count in ((0.49, 0.1, 1), (0.51, 0.1, 0), (0.9, 0.71, 1)):
+        probabilities = loud(200, 0, 0)
+        probabilities[100] = [confidence, 0, 1 - confidence]
+        probabilities[100, 2] /= 2 if confidence < 0.5 else 1
+        unlike = np.zeros(200, np.float32)
+        unlike[100] = novelty
+        kept = kept_of(ClipFinder("unsure", ["speech"], 0), probabilities, unlike)
+        assert kept == list(range(81, 121)) * count
+
+
+# What is written
+
+
+def asked(folder, model=None, **others):
+    return Settings(output=folder, model=model, timezone="UTC", **others)
+
+
+def keep(paths, about, start=START):
+    """Record files as the settings want it; return the layers of sound."""
+    result = record(about, FileSource(paths, start), Flag())
+    return [path for path in map(audio_path, result.logs) if path.exists()]
+
+
+def clips(layer):
+    """Read the times and samples of the messages of a layer."""
+    found = []
+    for item in LogReader(layer).messages():
+        audio = item.decode()
+        assert (item.topic, item.type) == ("/mic/audio", "foxglove_msgs/msg/RawAudio")
+        assert item.log_time == nanoseconds(audio.timestamp)
+        assert (audio.format, audio.sample_rate, audio.number_of_channels) == ("pcm-s16", 16_000, 1)
+        samples = np.frombuffer(bytes(audio.data), "<i2").reshape(-1, FRAME_SAMPLES)
+        assert 0 < len(samples) <= 20
+        found.append((item.log_time, samples))
+    return found
+
+
+def frames_of(layers):
+    """Return the samples of the frames in some layers, by their times."""
+    return {
+        start + number * FRAME_NANOSECONDS: frame
+        for layer in layers
+        for start, samples in clips(layer)
+        for number, frame in enumerate(samples)
+    }
+
+
+@pytest.fixture
+def noise(tmp_path):
+    """Write seconds of noise."""
+
+    def write(seconds):
+        path = tmp_path / f"noise{seconds}.wav"
+        samples = np.random.default_rng(0).integers(-3000, 3000, seconds * 16_000)
+        soundfile.write(path, samples.astype(np.int16), 16_000)
+        return path
+
+    return write
+
+
+def said(logs, about="clips"):
+    lines = (line for item in read(logs, "rosout") for line in [item.msg] if about in line)
+    return list(lines)
+
+
+@pytest.mark.parametrize("mode", ["events", "unsure", "always"])
+def test_what_is_kept_is_the_sound_itself_and_no_window_of_it_is_like_speech(
+    sounds, model_file, tmp_path, mode
+):
+    about = asked(tmp_path, model_file, keep_audio=mode, max_bag_duration=60)
+    source = LossySource(FileSource(sounds, START), {3: 7})
+    logs = record(about, source, Flag()).logs
+    layers = [path for path in map(audio_path, logs) if path.exists()]
+    samples = np.concatenate([block for path in sounds for block in read_audio(path)])
+    heard = np.rint(samples[: len(samples) // 800 * 800].reshape(-1, 800) * 32768)
+    stamps = [nanoseconds(m.header.stamp) for m in read(tmp_path, "features")]
+    original = dict(zip(stamps, heard, strict=True))
+    speech = load_model(model_file).classes.index("speech")
+    labels = {nanoseconds(m.header.stamp): m.probabilities[speech] for m in read(tmp_path, "label")}
+    kept = frames_of(layers)
+    assert 100 < len(kept) < len(stamps)
+    for stamp, frame in kept.items():
+        np.testing.assert_array_equal(frame, np.clip(original[stamp], -32768, 32767))
+        windows = [labels[stamp + later * FRAME_NANOSECONDS] for later in range(WINDOW_FRAMES)]
+        assert max(windows) < PRIVATE_LIMIT
+    for layer in layers:
+        time_of_log = min(nanoseconds(m.header.stamp) for m in read(_log(layer), "features"))
+        assert all(0 <= t - time_of_log < 60 * SECOND for t in frames_of([layer]))
+
+
+def _log(layer):
+    return layer.with_name(layer.name.replace(".audio", ""))
+
+
+def test_speech_of_people_not_learned_from_is_not_kept_but_their_yelling_is(household, tmp_path):
+    scenario = load_scenario("general")
+    clips = read_manifest(household / "manifest.csv", scenario.labels)
+    unseen = "devi-harikaa/scream-detector-project"
+    data = build_dataset([c for c in clips if c.source != unseen], scenario, lambda *_: None)
+    model = tmp_path / "model.safetensors"
+    save_model(train_model(data, scenario, lambda *_: None), model)
+    share = {}
+    for label in ("speech", "yelling"):
+        paths = [c.path for c in clips if (c.source, c.label) == (unseen, label)]
+        layers = keep(paths, asked(tmp_path / label, model, keep_audio="always"))
+        share[label] = len(frames_of(layers)) / len(read(tmp_path / label, "features"))
+    assert share["speech"] < 0.005
+    assert share["yelling"] > 0.1
+
+
+def test_no_sound_is_kept_unless_it_is_asked_for_and_the_log_is_the_same_either_way(
+    day, model_file, tmp_path
+):
+    assert keep([day], asked(tmp_path / "off", model_file)) == []
+    assert len(list((tmp_path / "off").rglob("*.mcap*"))) == 1
+    (layer,) = keep([day], asked(tmp_path / "on", model_file, keep_audio="always"))
+    assert is_layer(layer)
+    off, on = (
+        raw_messages(next(log for log in find_logs(tmp_path / x) if not is_layer(log)))
+        for x in ("off", "on")
+    )
+    assert off == on
+
+
+def test_a_layer_says_what_it_is_and_is_only_made_when_there_is_sound(noise, model_file, tmp_path):
+    (layer,) = keep([noise(3)], asked(tmp_path / "a", keep_audio="always", never_keep=[]))
+    about = LogReader(layer).metadata["hearthlog"]
+    assert about["log"] == "home_20260301T070000Z.mcap"
+    assert layer.name == "home_20260301T070000Z.audio.mcap"
+    assert (about["node"], about["keep_audio"]) == ("home", "always")
+    assert (json.loads(about["never_keep"]), float(about["limit"])) == ([], PRIVATE_LIMIT)
+    assert "version" in about
+    never = list(load_model(model_file).classes)  # one of them is always likely
+    about = asked(tmp_path / "b", model_file, keep_audio="always", never_keep=never)
+    assert keep([noise(3)], about) == []
+    assert len(list((tmp_path / "b").rglob("*.mcap*"))) == 1
+
+
+def test_layers_roll_with_their_logs(noise, tmp_path):
+    about = asked(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=3)
+    layers = keep([noise(10)], about, START + SECOND // 2)
+    assert [len(frames_of([layer])) for layer in layers] == [50, 60, 60, 30]
+    for layer in layers:
+        start = min(frames_of([layer]))
+        assert start == read(_log(layer), "info")[0].header.stamp.sec * SECOND + start % SECOND
+
+
+def test_a_layer_is_complete_soon_after_its_log_though_no_sound_follows(tmp_path):
+    names = [tmp_path / f"home_20260301T07000{second}Z.mcap" for second in (0, 5)]
+    rolls = START + 5 * SECOND
+    log = ClipLog(
+        asked(tmp_path, keep_audio="always"),
+        lambda stamp: (names[0], rolls) if stamp < rolls else (names[1], rolls + DAY),
+    )
+    log.write([Sound(START + np.arange(9) * FRAME_NANOSECONDS, np.zeros((9, 800), np.int16))])
+    layer = audio_path(names[0])
+    for after in (4, 6, 60):
+        log.attend(START + after * SECOND)
+        assert not layer.exists()  # sound of it may still be held back
+    log.attend(START + 67 * SECOND)
+    assert len(frames_of([layer])) == 9
+
+
+def test_when_the_clock_is_set_back_sound_stays_beside_its_own_log(noise, tmp_path):
+    class SetBack:
+        device = "test"
+
+        def events(self, stop):
+            del stop
+            samples = next(read_audio(noise(5)))[: 80 * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+            stamps = START + np.arange(80) * FRAME_NANOSECONDS
+            yield Frames(0, samples, stamps)
+            yield Gap(int(stamps[-1]), START - HOUR, "the clock was set", 1)
+            yield Frames(81, samples, stamps - HOUR)
+
+    about = asked(tmp_path, keep_audio="always", never_keep=[])
+    logs = record(about, SetBack(), Flag()).logs
+    kept = [frames_of([audio_path(log)]) for log in logs]
+    assert [len(frames) for frames in kept] == [80, 80]
+    assert min(kept[0]) == START
+    assert min(kept[1]) == START - HOUR
+
+
+def test_clips_become_wav_files_and_doctor_finds_no_fault(noise, tmp_path, hearthlog):
+    keep([noise(5)], asked(tmp_path / "logs", keep_audio="always", never_keep=[]))
+    result = hearthlog("doctor", tmp_path / "logs")
+    assert (result.returncode, result.stderr) == (0, "2 files: 0 errors, 0 warnings\n")
+    result = hearthlog("export", tmp_path / "logs", "--format", "wav", "-o", tmp_path / "wav")
+    assert result.returncode == 0, result
+    (file,) = (tmp_path / "wav").iterdir()
+    with wave.open(str(file)) as sound:
+        data = sound.readframes(sound.getnframes())
+    np.testing.assert_array_equal(
+        np.frombuffer(data, "<i2"), soundfile.read(noise(5), dtype="int16")[0]
+    )
+
+
+def test_relabelling_passes_over_clips(noise, model_file, tmp_path, hearthlog):
+    (layer,) = keep([noise(5)], asked(tmp_path / "logs", keep_audio="always", never_keep=[]))
+    result = hearthlog("relabel", tmp_path / "logs", "--model", model_file)
+    assert result.returncode == 0, result
+    assert len(list(layer.parent.iterdir())) == 3
+    result = hearthlog("relabel", layer, "--model", model_file)
+    assert (result.returncode, "is a layer" in result.stderr) == (1, True)
+
+
+# Limits
+
+
+def test_only_so_many_minutes_are_kept_a_day_also_when_the_recorder_starts_again(noise, tmp_path):
+    about = asked(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
+    (layer,) = keep([noise(50)], about)
+    assert len(frames_of([layer])) == 1000
+    (layer,) = keep([noise(50)], about, START + HOUR)
+    kept = len(frames_of([layer]))
+    assert 160 < kept <= 200  # what frames a message takes place, too
+    assert keep([noise(50)], about, START + 2 * HOUR) == []
+    assert said(tmp_path) == ["no clips: 1 minutes of this day are kept already"] * 2
+    (layer,) = keep([noise(50)], about, START + DAY)
+    assert len(frames_of([layer])) == 1000
+
+
+def test_the_day_is_the_homes(noise, tmp_path):
+    midnight = START - 7 * HOUR + 10 * HOUR  # in Honolulu
+    about = asked(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
+    about = about.model_copy(update={"timezone": "Pacific/Honolulu"})
+    kept = frames_of(keep([noise(190)], about, midnight - 90 * SECOND))
+    assert 1180 < sum(time < midnight for time in kept) <= 1200
+    assert 1180 < sum(time >= midnight for time in kept) <= 1200
+    texts = said(tmp_path)
+    assert texts[1] == "clips are kept again"
+    assert len(texts) == 3
+
+
+@pytest.fixture
+def old(noise, tmp_path):
+    """Record a log with clips, and put others beside it which are not to be touched."""
+    about = asked(tmp_path / "logs", keep_audio="always", never_keep=[])
+    (layer,) = keep([noise(3)], about)
+    others = [
+        layer.with_name("home_2_20260301T070000Z.audio.mcap"),
+        layer.with_name("other_20260301T070000Z.audio.mcap"),
+        layer.with_name("home_20260301T070000Z.relabel-x.audio.mcap"),
+        layer.with_name("home_20260301T070000Z.review.mcap"),
+        layer.with_name("home_20269901T070000Z.audio.mcap"),
+        tmp_path / "elsewhere" / "2026" / layer.name,
+    ]
+    others[-1].parent.mkdir(parents=True)
+    for path in others:
+        shutil.copy(layer, path)
+    (tmp_path / "logs" / "2025").symlink_to(others[-1].parent)
+    return layer, [_log(layer), *others]
+
+
+@pytest.mark.parametrize("mode", ["off", "always"])
+def test_old_clips_are_deleted_and_nothing_else(old, noise, tmp_path, mode):
+    layer, others = old
+    about = asked(tmp_path / "logs", keep_audio=mode, never_keep=[], clip_retention_days=30)
+    keep([noise(3)], about, START + 30 * DAY - HOUR)
+    assert layer.exists()
+    keep([noise(4)], about, START + 30 * DAY + HOUR)
+    assert not layer.exists()
+    assert all(path.exists() for path in others)
+    assert said(tmp_path / "logs") == ["clips of 1 logs deleted: they were 30 days old"]
+
+
+def test_old_clips_are_looked_for_every_hour(old, tmp_path):
+    layer, _ = old
+    retention = Retention(tmp_path / "logs", "home", 1)
+    assert retention.attend(START + DAY - 60 * SECOND) == []
+    assert retention.attend(START + DAY + 3000 * SECOND) == []
+    assert layer.exists()
+    assert len(retention.attend(START + DAY + 3600 * SECOND)) == 1
+    assert not layer.exists()
+
+
+def test_what_recovery_kept_of_damaged_clips_is_deleted_too(old, tmp_path):
+    layer, _ = old
+    damaged = layer.with_name(layer.name + ".damaged")
+    layer.rename(damaged)
+    assert len(Retention(tmp_path / "logs", "home", 1).attend(START + 2 * DAY)) == 1
+    assert not damaged.exists()
+
+
+def test_clips_that_cannot_be_deleted_are_said_and_the_others_go(old, tmp_path):
+    layer, _ = old
+    folder = tmp_path / "logs" / "2026" / "01"
+    folder.mkdir()
+    with small_disk(folder / "01", "1M") as disk:
+        stuck = [disk / f"home_20260101T0{hour}0000Z.audio.mcap" for hour in range(2)]
+        for path in stuck:
+            path.write_bytes(b"sound")
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        (deleted, failed) = Retention(tmp_path / "logs", "home", 1).attend(START + 9 * DAY)
+        assert all(path.exists() for path in stuck)
+    assert not layer.exists()
+    assert deleted == (0, "clips of 1 logs deleted: they were 1 days old")
+    level, text = failed
+    assert level == 1
+    assert text.startswith(f"clips cannot be looked through or deleted: {stuck[0].parent}/home_")
+    assert text.endswith(": Read-only file system, and 1 more")
+
+
+def test_where_space_runs_out_clips_stop_and_the_log_goes_on(noise, tmp_path):
+    with small_disk(tmp_path / "disk", "6M") as disk:
+        about = asked(disk, keep_audio="always", never_keep=[], clip_min_free_space=4)
+        (layer,) = keep([noise(190)], about)
+        assert 300 < len(frames_of([layer])) < 2000
+        assert len(read(_log(layer), "features")) == 3800
+        assert said(_log(layer)) == ["no clips: less than 4 MB are free on the disk"]
+
+
+def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(tmp_path):
+    rng = np.random.default_rng(0)
+    stamps = START + np.arange(1200) * FRAME_NANOSECONDS
+    sound = Sound(stamps, rng.integers(-3000, 3000, (1200, FRAME_SAMPLES)).astype(np.int16))
+    with small_disk(tmp_path / "disk", "300k") as disk:
+        full, good = disk / "home_20260301T070000Z.mcap", tmp_path / "home_20260301T070030Z.mcap"
+        rolls = START + 30 * SECOND
+        log = ClipLog(
+            asked(tmp_path, keep_audio="always"),
+            lambda stamp: (full, rolls) if stamp < rolls else (good, rolls + DAY),
+        )
+        refused, again = log.write([sound])
+        log.finish()
+        assert 0 < len(frames_of(disk.iterdir())) < 300
+    expected = f"no clips: {audio_path(full)} cannot be written (No space left on device)"
+    assert (refused, again) == ((1, expected), (0, "clips are kept again"))
+    assert len(frames_of([audio_path(good)])) == 600
+
+
+def test_a_name_that_is_taken_stops_the_clips_of_one_log(noise, tmp_path):
+    about = asked(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=5)
+    taken = audio_path(tmp_path / "2026/03/01/home_20260301T070000Z.mcap")
+    taken.mkdir(parents=True)
+    layers = keep([noise(12)], about)
+    assert [layer.name[14:20] for layer in layers] == ["070000", "070005", "070010"]
+    assert sum(len(frames_of([layer])) for layer in layers[1:]) == 140
+    first, again = said(_log(layers[1]))
+    assert (first.startswith(f"no clips: {taken}"), again) == (True, "clips are kept again")
+
+
+# A recorder that is killed
+
+
+def test_a_killed_recorder_leaves_clips_that_the_next_one_completes(noise, tmp_path):
+    logs = tmp_path / "logs"
+    environment = {"HEARTHLOG_NEVER_KEEP": "[]", "HEARTHLOG_KEEP_AUDIO": "always"}
+    command = [*HEARTHLOG, "record", str(noise(60)), "-o", str(logs), "--realtime"]
+    process = subprocess.Popen(
+        [*command, "--start", "2026-03-01T07:00:00"], env={**os.environ, **environment}
+    )
+    deadline = time.monotonic() + 30
+    while not _heard(logs, 60):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    (active,) = logs.rglob("*.audio.mcap.active")
+    heard, kept = len(read(_log(active), "features")), frames_of([active])
+    assert heard - 20 - 19 <= len(kept)
+    record_files(asked(logs), FileSource([noise(3)], START + HOUR), Flag())
+    assert not active.exists()
+    whole = active.with_name(active.name.removesuffix(".active"))
+    assert LogReader(whole).complete
+    assert frames_of([whole]).keys() == kept.keys()
+
+
+def _heard(logs, count):
+    found = [p for p in logs.rglob("*.active") if "audio" not in p.name] if logs.exists() else []
+    return bool(found) and len(read(found[0], "features")) > count
+
+
+def _leave(noise, folder, change):
+    """Leave a layer of sound as a recorder that was killed does, and start the next one."""
+    (layer,) = keep([noise(5)], asked(folder, keep_audio="always", never_keep=[]))
+    active = layer.with_name(layer.name + ".active")
+    active.write_bytes(change(bytearray(layer.read_bytes())))
+    layer.unlink()
+    result = record_files(asked(folder), FileSource([noise(3)], START + HOUR), Flag())
+    return layer, active, result.recovered
+
+
+def _damaged(data):
+    data[len(data) // 2] ^= 0xFF
+    return bytes(data)
+
+
+def test_of_damaged_clips_what_is_whole_is_left_and_nothing_besides(noise, tmp_path):
+    layer, active, [recovered] = _leave(noise, tmp_path, _damaged)
+    assert 0 < len(frames_of([layer])) < 100
+    assert recovered.completed
+    assert "damaged" in recovered.damage
+    assert recovered.damage.endswith("this sound is deleted")
+    assert sorted(path.name for path in layer.parent.glob("*T070000Z*")) == sorted(
+        [layer.name, _log(layer).name]
+    )
+    assert not active.exists()
+
+
+@pytest.mark.parametrize("size", [0, 100])
+def test_clips_of_which_nothing_is_whole_are_deleted(noise, tmp_path, size):
+    layer, active, recovered = _leave(noise, tmp_path, lambda data: bytes(data[:size]))
+    assert recovered == []
+    assert not active.exists()
+    assert not layer.exists()
+
+
+# Models
+
+
+def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, model_file, tmp_path):
+    about = asked(tmp_path / "logs", keep_audio="events")
+    for reason, others in {
+        "keep_audio = \"always\" needs a model that knows 'speech', which is never kept (there is "
+        "none); take one that does, or set never_keep = [] to keep that too": {
+            "keep_audio": "always"
+        },
+        'keep_audio = "events" needs a model, which says what to keep; give one, or keep it '
+        "always": {"keep_audio": "events", "never_keep": []},
+    }.items():
+        about = asked(tmp_path / "logs", **others)
+        with pytest.raises(ConfigurationError) as error:
+            keep([noise(3)], about)
+        assert str(error.value) == reason
+    about = asked(tmp_path / "logs", model_file, keep_audio="unsure", never_keep=["speach"])
+    with pytest.raises(ConfigurationError, match=r"that knows 'speach'.*this one tells apart"):
+        keep([noise(3)], about)
+    assert not (tmp_path / "logs").exists()
+
+
+class Swapped:
+    """A day's sound, over and over, with another model put in place before each."""
+
+    device = "test"
+
+    def __init__(self, folder, logs, names, asked, path):
+        samples = np.concatenate(list(read_audio(path)))
+        self._blocks = samples[: len(samples) // 16_000 * 16_000].reshape(-1, 20, FRAME_SAMPLES)
+        self._folder, self._logs, self._names, self._asked = folder, logs, names, asked
+        self._first = 0
+        self.unfinished = []  # layers at the end of each day
+
+    def events(self, stop):
+        del stop
+        yield from self._day()
+        for count, name in enumerate(self._names, 2):
+            put_by_hand(self._folder, name)
+            self._asked.put(None)
+            deadline = time.monotonic() + 30
+            while len([p for p in self._logs.rglob("*.mcap*") if not is_layer(p)]) < count:
+                assert time.monotonic() < deadline
+                yield self._block(0)
+                time.sleep(0.02)
+            yield from self._day()
+
+    def _day(self):
+        yield from map(self._block, range(len(self._blocks)))
+        self.unfinished.append(len(list(self._logs.rglob("*.audio.mcap.active"))))
+
+    def _block(self, number):
+        stamps = START + np.arange(self._first, self._first + 20) * FRAME_NANOSECONDS
+        found = Frames(self._first, self._blocks[number], stamps)
+        self._first += 20
+        return found
+
+
+def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
+    day, model_file, tmp_path
+):
+    folder, logs = tmp_path / "models", tmp_path / "logs"
+    folder.mkdir()
+    one = load_model(model_file)
+    about = one.description.model_dump_json().replace('"speech"', '"talk"')
+    other = replace(one, description=Description.model_validate_json(about))
+    save_model(one, folder / "one.safetensors")
+    save_model(other, folder / "other.safetensors")
+    (folder / "champion.safetensors").symlink_to("one.safetensors")
+    question = SimpleQueue()
+    names = ["other.safetensors", "one.safetensors"]
+    source = Swapped(folder, logs, names, question, day)
+    about = asked(
+        logs, folder / "champion.safetensors", keep_audio="always", max_bag_duration=86_400
+    )
+    paths = record(about, source, Flag(), asked=question).logs
+    assert [audio_path(path).exists() for path in paths] == [True, False, True]
+    assert source.unfinished == [1, 0, 1]
+    assert said(paths[0]) == []
+    (text,) = said(paths[1])
+    assert text.startswith("no clips: keep_audio = \"always\" needs a model that knows 'speech'")
+    assert said(paths[2]) == ["clips are kept again"]
+
+
+# Settings
+
+
+def test_the_settings_of_clips_are_in_the_file_or_the_environment(tmp_path, monkeypatch):
+    assert load_settings(None, {}, {}).keep_audio == "off"
+    file = tmp_path / "hearthlog.toml"
+    file.write_text('keep_audio = "unsure"\nnever_keep = ["speech", "crying"]\n')
+    monkeypatch.setenv("HEARTHLOG_CLIP_RETENTION_DAYS", "7")
+    found = load_settings(file, {}, {})
+    assert (found.keep_audio, found.never_keep) == ("unsure", ["speech", "crying"])
+    assert (found.clip_retention_days, found.clip_minutes_a_day) == (7, 30)
+    assert load_settings(file, {"keep_audio": "events"}, {}).keep_audio == "events"
+    with pytest.raises(ConfigurationError, match="keep_audio: Input should be 'off', 'events'"):
+        load_settings(file, {"keep_audio": "yes"}, {})
+
+
+def test_the_option_of_record_keeps_sound(day, model_file, tmp_path, hearthlog):
+    options = ["--model", model_file, "--keep-audio", "always", "-o", tmp_path]
+    result = hearthlog("record", day, *options)
+    assert result.returncode == 0, result
+    assert len(list(tmp_path.rglob("*.audio.mcap"))) == 1
+    assert ".audio" not in result.stdout
