@@ -22,15 +22,17 @@ from schemas import messages
 from schemas.columns import Columns
 from schemas.errors import LogError
 from schemas.files import SUFFIX, replaced_file, stem
+from schemas.messages import NANOSECONDS
 from schemas.topics import Topic, check_microphone_name, topic
 from schemas.writer import LogWriter, Rows
 
-ROUNDING = 1_000  # ns; times that passed through a label file are off by up to this
+ROUNDING = 1_000_000  # ns; times that passed through a label file are off by up to this
+LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
+NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
 _KINDS = {messages.SEGMENT: "review/segment", messages.MARK: "review/mark"}
 _SPAN = ("header.stamp", "duration", "label")
 _SAYS = ("reviewer", "made", "corrects")
 _FIELDS = {messages.SEGMENT: _SPAN, messages.MARK: (*_SPAN, *_SAYS)}
-_NAME = re.compile(r"[^\x00-\x1f\x7f]{0,200}")
 
 
 class Mark(NamedTuple):
@@ -178,11 +180,12 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
     """Sort marks, and raise DataError if one cannot be."""
     ordered = sorted(marks)
     for mark in ordered:
-        if not 0 <= mark.start < mark.end:
+        if not 0 <= mark.start < mark.end <= LATEST:
             raise DataError(f"a mark from {mark.start} to {mark.end} ns is no span of time")
         if not CLASS_NAME.fullmatch(mark.label):
             raise DataError(f"{mark.label[:64]!r} cannot be the name of a class")
-        if mark.made < 0 or not (_NAME.fullmatch(mark.reviewer) and _NAME.fullmatch(mark.corrects)):
+        names = NAME.fullmatch(mark.reviewer) and NAME.fullmatch(mark.corrects)
+        if not (0 <= mark.made <= LATEST and names):
             raise DataError(f"a mark cannot be made by {mark.reviewer[:64]!r} at {mark.made} ns")
     for microphone in {mark.microphone for mark in ordered}:
         check_microphone_name(microphone)

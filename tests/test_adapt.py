@@ -14,6 +14,7 @@ from analyzer.dataset import Recording, cut_recordings
 from analyzer.errors import DataError
 from analyzer.evaluation.folds import KINDS, evaluate_recipe
 from analyzer.home import home_recordings, home_sequences
+from analyzer.marks import Mark, write_marks
 from analyzer.recipe import (
     RECIPES,
     decide_with_home,
@@ -22,7 +23,6 @@ from analyzer.recipe import (
     prepare,
     softmax,
 )
-from analyzer.marks import Mark, write_marks
 from analyzer.scenario import Scenario
 from analyzer.train import adapt_model, train_model
 from models.classifier import HOME_VOTE, Classifier, home_votes

@@ -25,7 +25,7 @@ def evaluate(
     *,
     reference: Annotated[
         str | None,
-        typer.Option(help="Label file, *.txt (Audacity) or *.csv; or review, for review layers."),
+        typer.Option(help="Label file, as `annotate` reads it; or review, for review layers."),
     ] = None,
     topic: Annotated[
         str | None,

@@ -1,0 +1,21 @@
+"""Who makes marks: the name that `--reviewer` gives, or the login name."""
+
+import getpass
+
+from tools.cli.selection import wrong_use
+
+
+def reviewer_name(given: str | None) -> str:
+    """Name the reviewer; empty if nobody is named, and the login has no name."""
+    from analyzer.marks import NAME
+
+    if given is not None:
+        name = given.strip()
+        if not name or not NAME.fullmatch(name):
+            wrong_use(f"--reviewer {given[:64]!r}: a name has 1 to 200 characters, in one line")
+        return name
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):
+        return ""
+    return name if NAME.fullmatch(name) else ""
