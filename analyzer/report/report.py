@@ -1,0 +1,132 @@
+"""A report: from the logs of a home to a page and the picture beside it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date, timedelta, tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+from analyzer.hometime import day_span, midnight
+from analyzer.report.account import Account
+from analyzer.report.baseline import DAYS
+from analyzer.report.figures import HOUR, day_of, whole_home
+from analyzer.report.interrai import DAYS as ASSESSED
+from analyzer.report.page import day_page, week_page
+from analyzer.report.picture import save_day, save_week
+from analyzer.report.reading import LIVE, Heard, read_heard
+from analyzer.report.shelf import Shelf, check_day
+from analyzer.report.spans import common, one
+from analyzer.report.trouble import Trouble
+from schemas.errors import LogError
+from schemas.files import check_new, new_file
+
+WEEK = 7
+Progress = Callable[[float], None]
+
+
+class Period(NamedTuple):
+    """A number of days, 1 or 7, as the clock of the home has them."""
+
+    first: date
+    days: int
+    zone: tzinfo
+
+
+@dataclass(frozen=True)
+class Made:
+    """A page that was written, and what could not be read for it."""
+
+    page: Path
+    picture: Path
+    losses: Sequence[str]
+
+
+def make_report(
+    shelf: Shelf,
+    period: Period,
+    page: Path,
+    labelling: str = LIVE,
+    progress: Progress = lambda _: None,
+) -> Made:
+    """Write the report of a day, or of a week.
+
+    Parameters
+    ----------
+    shelf : Shelf
+    period : Period
+    page : Path
+        Of the HTML file; the picture is beside it, with the suffix `.png`.
+    labelling : str, optional
+        `live`, or the model of relabel layers.
+    progress : callable, optional
+        Is called with the share that is done.
+
+    Raises
+    ------
+    DataError
+        If there are no logs of these days, no labels in them, or no such labelling.
+    LogError
+        If segments cannot be, or a file cannot be written or exists already.
+    """
+    picture = page.with_suffix(".png")
+    if picture == page:
+        raise LogError(f"{page}: that is the name of the picture; name the page *.html")
+    for path in (page, picture):
+        check_new(path)
+    first, count, zone = period
+    days = [first + timedelta(days=number) for number in range(count)]
+    check_day(shelf, days[0], days[-1], zone)
+    close = day_span(days[0], zone)[0], day_span(days[-1], zone)[1]
+    earlier = [first - timedelta(days=number) for number in range(DAYS, 0, -1)]
+    since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
+    heard = read_heard(shelf, labelling, since, close, progress)
+    account = _account(heard, days, earlier, zone, labelling)
+    with new_file(page) as html, new_file(picture) as png:
+        if count == 1:
+            save_day(png, account.days[0], account.earlier)
+            text = day_page(account, png.read_bytes())
+        else:
+            save_week(png, account.days)
+            text = week_page(account, png.read_bytes())
+        html.write_text(text, "utf-8")
+    return Made(page, picture, heard.losses)
+
+
+def _account(
+    heard: Heard, days: Sequence[date], earlier: Sequence[date], zone: tzinfo, labelling: str
+) -> Account:
+    home = whole_home(heard)
+    past = {day: day_of(home, day, zone) for day in earlier}
+    shown = [day_of(home, day, zone) for day in days]
+    span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
+    return Account(
+        nodes=heard.nodes,
+        microphones=sorted({microphone for _, microphone in heard.segments}),
+        labelling=labelling,
+        zone=zone,
+        days=shown,
+        before=[past[day] for day in earlier[-(ASSESSED - 1) :]],
+        earlier=[day for day in past.values() if any(map(day.comparable, home.classes))],
+        unheard=_unheard(heard, *span),
+        gaps=_within(heard.gaps, span),
+        troubles=_within(heard.troubles, span),
+        precisions=heard.precisions,
+        unread=len(heard.losses),
+    )
+
+
+def _unheard(heard: Heard, start: int, end: int) -> dict[str, float]:
+    """Measure for how many hours each microphone heard nothing."""
+    whole = end - start
+    found: dict[str, float] = {}
+    for (_, microphone), segments in heard.segments.items():
+        own = common(segments.spans, one(start, end)).length
+        found[microphone] = max(found.get(microphone, 0.0), (whole - own) / HOUR)
+    return found
+
+
+def _within(troubles: Sequence[Trouble], span: tuple[int, int]) -> list[Trouble]:
+    """Cut what was not well to the days that are reported."""
+    start, end = span
+    cut = [t._replace(start=max(t.start, start), end=min(t.end, end)) for t in troubles]
+    return [trouble for trouble in cut if trouble.start <= trouble.end]

@@ -1,0 +1,115 @@
+"""The tables of a report: figures of a day with a name, put together by what they are about."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from analyzer.report import words
+from analyzer.report.figures import Day
+from analyzer.report.values import Value
+
+BATHROOM = (words.FLUSH, words.SHOWER, words.TAP)
+
+
+class Figure(NamedTuple):
+    """One figure of a day.
+
+    Attributes
+    ----------
+    title : str
+        In a table of one day.
+    short : str
+        As the head of a column.
+    value : callable
+        Finds it; None where it cannot be known.
+    name : str
+        The class that it is about, if it is about one.
+    sums : bool
+        Whether a total over days means something.
+    """
+
+    title: str
+    short: str
+    value: Callable[[Day], Value | None]
+    name: str = ""
+    sums: bool = True
+
+
+class Section(NamedTuple):
+    """Figures that belong together; `missing` says why there are none."""
+
+    title: str
+    figures: Sequence[Figure]
+    note: str
+    missing: str = ""
+
+
+def sections(classes: Sequence[str]) -> list[Section]:
+    """Return the tables, for the classes that the model of a home knows."""
+    return [
+        Section("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)),
+        Section("Night", list(_night(classes)), _NIGHT_NOTE),
+        Section("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
+    ]
+
+
+def minutes_of(name: str) -> Figure:
+    """Return for how long a class was heard."""
+    title = words.in_words(name)
+    return Figure(title, title, lambda day: day.minutes(name), name)
+
+
+def events_of(name: str, title: str = "") -> Figure:
+    """Return how often a class was heard."""
+    title = title or words.in_words(name)
+    return Figure(title, title, lambda day: day.count(name), name)
+
+
+def _at_night(name: str, title: str, short: str = "") -> Figure:
+    return Figure(title, short or title, lambda day: day.night_count(name), name)
+
+
+def _bathroom(classes: Sequence[str]) -> Iterator[Figure]:
+    if words.FLUSH in classes:
+        yield events_of(words.FLUSH, "Toilet flushes")
+        yield _at_night(words.FLUSH, "Toilet flushes at night", "at night")
+    if words.SHOWER in classes:
+        yield events_of(words.SHOWER, "Showers")
+        yield minutes_of(words.SHOWER)._replace(title="Time in the shower", short="Shower time")
+    if words.TAP in classes:
+        yield events_of(words.TAP, "Water taps")
+        yield _at_night(words.TAP, "Water taps at night", "at night")
+
+
+def _night(classes: Sequence[str]) -> Iterator[Figure]:
+    if words.COUGH in classes:
+        yield _at_night(words.COUGH, "Bouts of coughing", "Coughing")
+    if words.CRY in classes:
+        yield _at_night(words.CRY, "Times of crying", "Crying")
+    yield Figure("Times with sound", "Times with sound", lambda day: day.night_stretches)
+    yield Figure("Time with sound", "Time with sound", lambda day: day.night_sound)
+
+
+_ACTIVITY = (
+    Figure("Time with sound", "Time with sound", lambda day: day.sound),
+    Figure("First lively time", "First lively time", lambda day: day.first, sums=False),
+    Figure("Last lively time", "Last lively time", lambda day: day.last, sums=False),
+    Figure(
+        "Longest quiet stretch, 07:00 to 22:00", "Longest quiet", lambda day: day.quiet, sums=False
+    ),
+)
+_BATHROOM_NOTE = "Night is 22:00 to 07:00. A person, not the report, knows who used the bathroom."
+_NIGHT_NOTE = (
+    "22:00 to 07:00, counted to the day on which the night ends. A “time with sound” has at least "
+    "half a minute of sound, and ten quiet minutes before the next one."
+)
+_ACTIVITY_NOTE = (
+    "Lively: ten minutes with at least one minute of sound, from 04:00 on. Quiet can mean rest, "
+    "reading, a nap, or nobody at home."
+)
+
+
+def _missing(classes: Sequence[str], wanted: Sequence[str]) -> str:
+    if any(name in classes for name in wanted):
+        return ""
+    names = words.listed([words.in_words(name).lower() for name in wanted])
+    return f"Cannot be told: the model of this home does not know these sounds ({names})."

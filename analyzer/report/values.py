@@ -1,0 +1,157 @@
+"""What a report counts: a number of events, minutes, a time of day; and how they are said."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+_MIN = " min"
+_WIDTH = 1.645  # standard deviations: nine times in ten the number is within
+
+
+@dataclass(frozen=True)
+class Count:
+    """A number of events, each of which may have been none.
+
+    Attributes
+    ----------
+    expected, variance : float
+        Of a Poisson binomial distribution: the sums of p and of p (1 - p).
+    certain, marked : int
+        How many a person has confirmed, and how many there are if all were right.
+    """
+
+    expected: float = 0.0
+    variance: float = 0.0
+    certain: int = 0
+    marked: int = 0
+
+    def __add__(self, other: "Count") -> "Count":
+        return Count(
+            self.expected + other.expected,
+            self.variance + other.variance,
+            self.certain + other.certain,
+            self.marked + other.marked,
+        )
+
+    @property
+    def middle(self) -> float:
+        """The likeliest number."""
+        return self.expected
+
+    @property
+    def low(self) -> float:
+        """In nine cases of ten there were at least so many."""
+        return max(self.certain, self.expected - _WIDTH * math.sqrt(self.variance))
+
+    @property
+    def high(self) -> float:
+        """In nine cases of ten there were at most so many."""
+        return min(self.marked, self.expected + _WIDTH * math.sqrt(self.variance))
+
+    @property
+    def text(self) -> str:
+        """In words: `about 5 (4 to 6)`."""
+        low, middle, high = (self.show(x) for x in (self.low, self.middle, self.high))
+        return middle if low == high else f"about {middle} ({low} to {high})"
+
+    @staticmethod
+    def show(number: float) -> str:
+        """Write a number of events."""
+        return f"{whole(number)}"
+
+    def spread(self, median: float, lowest: float, highest: float) -> str:
+        """Write what is usual: `4 (3 to 6)`."""
+        return _spread(self.show(median), self.show(lowest), self.show(highest))
+
+
+def exactly(number: int) -> Count:
+    """Return a number that is what it is."""
+    return Count(number, 0.0, number, number)
+
+
+class _Plain:
+    """What has no interval."""
+
+    @property
+    def low(self) -> float:
+        """The same."""
+        return self.middle
+
+    high = low
+
+    @property
+    def middle(self) -> float:
+        """The number."""
+        raise NotImplementedError
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return self.show(self.middle)
+
+    @staticmethod
+    def show(number: float) -> str:
+        """Write a number."""
+        raise NotImplementedError
+
+    def spread(self, median: float, lowest: float, highest: float) -> str:
+        """Write what is usual."""
+        return _spread(self.show(median), self.show(lowest), self.show(highest))
+
+
+@dataclass(frozen=True)
+class Minutes(_Plain):
+    """A length of time."""
+
+    minutes: float = 0.0
+
+    def __add__(self, other: Self) -> "Minutes":
+        return Minutes(self.minutes + other.minutes)
+
+    @property
+    def middle(self) -> float:
+        """Minutes."""
+        return self.minutes
+
+    @staticmethod
+    def show(number: float) -> str:
+        """Write a length of time: `2 h 05 min`."""
+        hours, minutes = divmod(whole(number), 60)
+        if hours:
+            return f"{hours} h {minutes:02} min"
+        return "under 1 min" if not minutes and number > 0 else f"{minutes} min"
+
+
+@dataclass(frozen=True)
+class Clock(_Plain):
+    """A time of day, in minutes from midnight on."""
+
+    minutes: float
+
+    @property
+    def middle(self) -> float:
+        """Minutes."""
+        return self.minutes
+
+    @staticmethod
+    def show(number: float) -> str:
+        """Write a time of day: `07:05`."""
+        hours, minutes = divmod(int(number), 60)
+        return f"{hours:02}:{minutes:02}"
+
+
+Value = Count | Minutes | Clock
+
+
+def _spread(middle: str, low: str, high: str) -> str:
+    """Put median and range together; where both are minutes alone, that is said once."""
+    if low == high:
+        return middle
+    if high.endswith(_MIN) and low.endswith(_MIN) and " h " not in low + high:
+        low = low.removesuffix(_MIN)
+    return f"{middle} ({low} to {high})"
+
+
+def whole(number: float) -> int:
+    """Round as people do: 2.5 is 3."""
+    return math.floor(number + 0.5)

@@ -1,0 +1,189 @@
+"""Days of a home as logs, written without sound: only what a report reads of them."""
+
+from collections.abc import Iterable
+from datetime import UTC, date, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recorder.features import FEATURE_NAMES
+from schemas import messages
+from schemas.content import Attachment, Rows
+from schemas.files import log_path
+from schemas.messages import NANOSECONDS, duration_message, encode, header, message
+from schemas.topics import DIAGNOSTICS, topics_of
+from schemas.writer import LogWriter
+
+GENERAL = [
+    "silence",
+    "speech",
+    "music",
+    "phone_ring",
+    "coughing",
+    "crying",
+    "yelling",
+    "laughing",
+    "objects_activity",
+]
+BATHROOM = ["silence", "flushing_water", "shower", "tap_water", "other"]
+HOUR = 3600
+CARD = "| coughing | coughing | 7 | 290 | 0.860 | 0.971 | 0.912 |\n"
+
+Event = tuple[float, float, str, float]  # second of the day (UTC), seconds, label, confidence
+
+
+def at(text: str) -> float:
+    """Read a time of day, `07:30` or `07:30:15`, in seconds."""
+    hours, minutes, *seconds = map(int, text.split(":"))
+    return hours * HOUR + 60 * minutes + sum(seconds)
+
+
+def midnight(day: date) -> int:
+    """Return the nanoseconds at which a day of UTC begins."""
+    return int(datetime(day.year, day.month, day.day, tzinfo=UTC).timestamp()) * NANOSECONDS
+
+
+def write_day(  # noqa: PLR0913
+    root: Path,
+    day: date,
+    events: Iterable[Event] = (),
+    *,
+    node: str = "home",
+    microphone: str = "mic",
+    classes: Iterable[str] = GENERAL,
+    hours: Iterable[int] = range(24),
+    gaps: Iterable[tuple[float, float, str]] = (),
+    health: Iterable[tuple[float, int, str]] = (),
+    timezone: str | None = None,
+    file_hours: int = 1,
+) -> list[Path]:
+    """Write the logs of a day: events, and silence where there is no gap, both in UTC."""
+    begin, gaps, hours, step = midnight(day), list(gaps), list(hours), file_hours
+    rows = list(_tiled(sorted(events), gaps, hours))
+    return [
+        _write_hour(
+            log_path(root, node, begin + hour * HOUR * NANOSECONDS),
+            microphone,
+            list(classes),
+            begin,
+            [row for row in rows if hour * HOUR < row[0] + row[1] <= (hour + step) * HOUR],
+            [gap for gap in gaps if hour * HOUR < gap[0] + gap[1] <= (hour + step) * HOUR],
+            [said for said in health if hour * HOUR <= said[0] < (hour + step) * HOUR],
+            {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
+        )
+        for hour in hours[::step]
+    ]
+
+
+def write_life(root: Path, first: date, count: int, seed: int = 1, **about: Any) -> None:
+    """Write plausible days of a flat with microphones in two rooms."""
+    rng = np.random.default_rng(seed)
+    about = {"file_hours": 6, **about}
+    for number in range(count):
+        day = first + timedelta(days=number)
+        write_day(root, day, _living_room(rng), node="flat", microphone="living_room", **about)
+        bathroom = {"node": "bathroom", "microphone": "bathroom", "classes": BATHROOM}
+        write_day(root, day, _bathroom(rng), **bathroom, **about)
+
+
+def _living_room(rng: np.random.Generator) -> list[Event]:
+    found: list[Event] = []
+    plan = [
+        ("coughing", 0, 7, 3, (0.5, 3)),
+        ("objects_activity", 7, 9, 30, (10, 60)),
+        ("speech", 8, 21, 12, (30, 400)),
+        ("objects_activity", 11.5, 13, 25, (10, 60)),
+        ("coughing", 8, 22, 6, (0.5, 3)),
+        ("phone_ring", 9, 20, 2, (4, 12)),
+        ("music", 15, 17, 6, (300, 900)),
+        ("laughing", 15, 21, 3, (2, 7)),
+        ("objects_activity", 18, 19.5, 25, (10, 60)),
+        ("speech", 19.5, 21.5, 9, (200, 500)),
+    ]
+    for label, start, end, mean, (short, long) in plan:
+        for second in rng.uniform(start * HOUR, end * HOUR, rng.poisson(mean)):
+            how_sure = rng.uniform(0.5, 0.99)
+            found.append((second, rng.uniform(short, long), label, how_sure))
+    return found
+
+
+def _bathroom(rng: np.random.Generator) -> list[Event]:
+    found: list[Event] = []
+    for hour in [*rng.uniform(1, 6, rng.poisson(1.5)), 7, 10, 13, 16, 19, 21.8]:
+        second = (hour + rng.uniform(0, 0.4)) * HOUR
+        found.append((second, 12.0, "flushing_water", rng.uniform(0.8, 0.99)))
+        found.append((second + 20, rng.uniform(5, 20), "tap_water", rng.uniform(0.6, 0.99)))
+    if rng.random() < 0.6:
+        found.append((7.5 * HOUR, rng.uniform(240, 600), "shower", 0.97))
+    return found
+
+
+def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: list[int]):
+    """Cut events so that they do not overlap, and put silence between them, hour by hour."""
+    blocks = [(start, start + seconds) for start, seconds, _ in gaps]
+    cuts = [hour * HOUR for hour in hours] + [(hour + 1) * HOUR for hour in hours]
+    now = 0.0
+    spans: list[Event] = []
+    for start, seconds, label, confidence in events:
+        begin, end = max(start, now), min(start + seconds, 24 * HOUR)
+        if end > begin:
+            spans.append((begin, end - begin, label, confidence))
+            now = end
+    edges = sorted({*cuts, *(t for s in spans for t in (s[0], s[0] + s[1])), *sum(blocks, ())})
+    index = 0
+    for a, b in pairwise(edges):
+        middle = (a + b) / 2
+        while index < len(spans) and spans[index][0] + spans[index][1] <= middle:
+            index += 1
+        if int(middle // HOUR) not in hours or any(x <= middle < y for x, y in blocks):
+            continue
+        inside = index < len(spans) and spans[index][0] <= middle
+        label, confidence = spans[index][2:] if inside else ("silence", 0.99)
+        yield a, b - a, label, confidence
+
+
+def _write_hour(  # noqa: PLR0913, PLR0917
+    path, microphone, classes, begin, rows, gaps, health, about
+) -> Path:
+    card = Attachment("model_card.md", "text/markdown", CARD.encode())
+    writer = LogWriter(path, topics_of(microphone, FEATURE_NAMES, classes), about, [card])
+    written = []
+    starts = begin + np.array([round(row[0] * 1000) for row in rows], np.int64) * 1_000_000
+    ends = begin + np.array([round((r[0] + r[1]) * 1000) for r in rows], np.int64) * 1_000_000
+    if rows:
+        fields = {
+            "header.stamp": starts,
+            "header.frame_id": microphone,
+            "duration": ends - starts,
+            "label": [row[2] for row in rows],
+            "confidence": np.array([row[3] for row in rows], np.float32),
+        }
+        writer.write_columns([Rows(f"/{microphone}/segment", ends, fields)])
+    for start, seconds, reason in gaps:
+        stamp = begin + round(start * NANOSECONDS)
+        length = round(seconds * NANOSECONDS)
+        gap = message(
+            messages.GAP,
+            header=header(stamp, microphone),
+            duration=duration_message(length),
+            reason=reason,
+            frames_lost=round(seconds * 20),
+        )
+        written.append((stamp + length, f"/{microphone}/gap", encode(gap)))
+    for second, level, text in health:
+        stamp = begin + round(second * NANOSECONDS)
+        status = message(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=f"hearthlog: {microphone}",
+            message=text,
+            hardware_id=microphone,
+            values=[],
+        )
+        said = message(messages.DIAGNOSTICS, header=header(stamp, microphone), status=[status])
+        written.append((stamp, DIAGNOSTICS, encode(said)))
+    for time, topic, data in sorted(written):
+        writer.write(topic, time, data)
+    return writer.finish()

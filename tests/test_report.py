@@ -1,0 +1,501 @@
+"""The report for a carer: what its figures are, what the page says, what it refuses."""
+
+import re
+from datetime import date, timedelta
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import BATHROOM, GENERAL, HOUR, at, midnight, write_day, write_life
+from hypothesis import given
+from hypothesis import strategies as st
+from logs import read
+from PIL import Image
+
+from analyzer.colours import colour
+from analyzer.errors import DataError
+from analyzer.hometime import day_span, home_zone, local_time
+from analyzer.marks import Mark, write_marks
+from analyzer.relabel.layer import topics_of as layer_topics
+from analyzer.report.baseline import FEWEST, compared, usual
+from analyzer.report.figures import day_of, whole_home
+from analyzer.report.markup import paragraph
+from analyzer.report.reading import read_heard
+from analyzer.report.report import Period, make_report
+from analyzer.report.shelf import find_shelf
+from analyzer.report.spans import Spans, common, cut, joined, lengths, without
+from analyzer.report.values import Clock, Count, Minutes, exactly
+from schemas.content import Rows
+from schemas.messages import NANOSECONDS, nanoseconds
+from schemas.writer import LogWriter
+
+DAY = date(2026, 3, 1)
+UTC = ZoneInfo("UTC")
+
+
+def look(root, day=DAY, zone=UTC, labelling="live"):
+    heard = read_heard(find_shelf([root]), labelling, 0, day_span(day, zone))
+    return day_of(whole_home(heard), day, zone)
+
+
+def page_of(root, tmp_path, first=DAY, days=1) -> str:
+    output = tmp_path / f"page-{first}-{days}.html"
+    make_report(find_shelf([root]), Period(first, days, UTC), output)
+    return output.read_text()
+
+
+def text_of(page: str) -> str:
+    """The words of a page, as they are read."""
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page.partition("<body>")[2]))
+
+
+# Spans
+
+spans = st.lists(st.tuples(st.integers(0, 60), st.integers(1, 9)), max_size=8).map(
+    lambda pairs: joined(
+        np.array([start for start, _ in pairs], np.int64),
+        np.array([start + length for start, length in pairs], np.int64),
+    )
+)
+
+
+def ticks(some: Spans) -> set[int]:
+    pairs = zip(some.starts.tolist(), some.ends.tolist(), strict=True)
+    return {tick for start, end in pairs for tick in range(start, end)}
+
+
+@given(spans, spans)
+def test_spans_are_joined_taken_from_each_other_and_measured_as_sets_are(a, b):
+    assert ticks(common(a, b)) == ticks(a) & ticks(b)
+    assert ticks(without(a, b)) == ticks(a) - ticks(b)
+    assert ticks(cut(a, 10, 30)) == ticks(a) & set(range(10, 30))
+    edges = np.array([0, 7, 20, 21, 80])
+    between = [len(ticks(a) & set(range(x, y))) for x, y in pairwise(edges)]
+    assert lengths(a, edges).tolist() == between
+
+
+# Counting
+
+
+def test_sounds_of_a_class_within_ten_seconds_are_one_event_that_counts_as_its_surest(tmp_path):
+    events = [
+        (at("10:00:00"), 2, "coughing", 0.5),
+        (at("10:00:11"), 2, "coughing", 0.9),  # 9 s later: the same
+        (at("10:00:24"), 2, "coughing", 0.6),  # 11 s later: another one
+    ]
+    write_day(tmp_path, DAY, events)
+    count = look(tmp_path).count("coughing")
+    assert (count.marked, count.certain) == (2, 0)
+    assert count.expected == pytest.approx(0.9 + 0.6)
+    assert count.variance == pytest.approx(0.9 * 0.1 + 0.6 * 0.4)
+    assert look(tmp_path).minutes("coughing").minutes == pytest.approx(0.1)
+
+
+def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
+    write_day(tmp_path, DAY, [(at("10:00"), 60, "speech", 0.8)], microphone="kitchen", node="a")
+    write_day(tmp_path, DAY, [(at("10:00:30"), 60, "speech", 0.6)], microphone="hall", node="b")
+    day = look(tmp_path)
+    assert day.count("speech").marked == 1
+    assert day.minutes("speech").minutes == pytest.approx(1.5)
+    assert day.sound.minutes == pytest.approx(1.5)
+    assert day.minutes("silence").minutes == pytest.approx(24 * 60 - 1.5)
+    assert day.share == 1
+
+
+def test_a_count_is_said_with_its_uncertainty():
+    assert Count(5.2, 0.6, 0, 7).text == "about 5 (4 to 6)"
+    assert exactly(3).text == "3"
+    assert Count(0.4, 0.24, 0, 1).text == "about 0 (0 to 1)"
+    assert Count(2.6, 0.48, 2, 5).text == "about 3 (2 to 4)", "no less than what is certain"
+    assert (exactly(2) + Count(0.5, 0.25, 0, 1)).text == "about 3 (2 to 3)"
+    assert [Minutes(m).text for m in (0, 0.2, 59.4, 125)] == [
+        "0 min",
+        "under 1 min",
+        "59 min",
+        "2 h 05 min",
+    ]
+    assert Clock(425).text == "07:05"
+
+
+def test_what_is_usual_needs_a_week_and_a_difference_must_be_sure():
+    days = [exactly(n) for n in (3, 4, 4, 5, 6, 3, 4)]
+    assert usual(days[: FEWEST - 1]) is None
+    known = usual(days)
+    assert known == (4, 3, 6)
+    assert exactly(0).spread(*known) == "4 (3 to 6)"
+    assert compared(exactly(7), known) == 1
+    assert compared(Count(8, 4, 0, 12), known) == 0, "it may have been 5"
+    assert compared(exactly(2), known) == -1
+
+
+# The home's time
+
+
+def test_a_day_begins_at_the_midnight_of_the_home_and_may_have_23_or_25_hours(tmp_path):
+    vienna = ZoneInfo("Europe/Vienna")
+    for day, hours in ((date(2026, 3, 29), 23), (date(2026, 10, 25), 25), (DAY, 24)):
+        start, end = day_span(day, vienna)
+        assert (end - start) // NANOSECONDS == hours * HOUR
+    changed = date(2026, 3, 29)
+    write_day(tmp_path, changed - timedelta(days=1), [(at("23:30"), 60, "speech", 1.0)])
+    write_day(
+        tmp_path, changed, [(at("21:59"), 30, "speech", 1.0), (at("22:10"), 60, "music", 1.0)]
+    )
+    day = look(tmp_path, changed, vienna)
+    assert day.span.length == 23 * HOUR * NANOSECONDS
+    assert day.count("speech").marked == 2
+    assert day.count("music").marked == 0, "that is of the next day"
+    assert len(day.sound_by_hour) == 23
+    assert day.sound_by_hour[0] == pytest.approx(1.0)
+    assert day.share == 1
+
+
+def test_the_zone_is_that_of_the_option_or_the_logs_or_utc(tmp_path):
+    assert str(home_zone(None)) == "UTC"
+    assert str(home_zone(None, [{}, {"timezone": "Asia/Kolkata"}])) == "Asia/Kolkata"
+    assert str(home_zone("Europe/Vienna", [{"timezone": "Asia/Kolkata"}])) == "Europe/Vienna"
+    for name in ("Mars/Olympus", "../../etc/passwd", "", "Europe", "x" * 5000, "a\0b"):
+        with pytest.raises(DataError, match="is no time zone"):
+            home_zone(name)
+    write_day(tmp_path, DAY, hours=[20], timezone="Asia/Kolkata")
+    shelf = find_shelf([tmp_path])
+    zone = home_zone(None, shelf.records())
+    assert shelf.days(zone) == [DAY + timedelta(days=1)], "20:00 UTC is 01:30 there"
+
+
+# What a recorder writes
+
+
+def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(recorded, tmp_path):
+    said = read(recorded, "segment")
+    first = nanoseconds(said[0].header.stamp)
+    start = local_time(first, UTC).date()
+    day = look(recorded, start)
+    for name in day.home.classes:
+        own = [segment for segment in said if segment.label == name]
+        length = sum(nanoseconds(segment.duration) for segment in own)
+        assert day.minutes(name).minutes == pytest.approx(length / (60 * NANOSECONDS))
+        if name != "silence":
+            assert day.count(name).marked <= len(own)
+            assert bool(day.count(name).marked) == bool(own)
+    text = text_of(page_of(recorded, tmp_path, start))
+    assert "Not heard:" in text
+
+
+# Nights, quiet, hours
+
+
+def test_the_night_is_that_which_ends_on_the_day(tmp_path):
+    coughs = [(at("22:30"), 2, "coughing", 1.0), (at("21:30"), 2, "coughing", 1.0)]
+    write_day(tmp_path, DAY - timedelta(days=1), coughs)
+    write_day(tmp_path, DAY, [*coughs, *((at(t), 2, "coughing", 1.0) for t in ("06:59", "07:01"))])
+    day = look(tmp_path)
+    assert day.night_count("coughing").marked == 2
+    assert day.count("coughing").marked == 4
+    assert day.night_hours == 9
+
+
+def test_the_longest_quiet_stretch_is_sought_while_the_clock_shows_day(tmp_path):
+    events = [
+        (at("06:00"), 120, "objects_activity", 1.0),
+        (at("09:00"), 600, "speech", 1.0),
+        (at("13:00"), 60, "speech", 1.0),
+        (at("17:00"), 60, "speech", 1.0),
+        (at("23:15"), 120, "music", 1.0),
+    ]
+    write_day(tmp_path, DAY, events, gaps=[(at("18:00"), 4 * HOUR, "the recorder was not running")])
+    day = look(tmp_path)
+    assert day.quiet.minutes == pytest.approx(239)  # 13:01 to 17:00; the gap is no quiet
+    assert (day.first.text, day.last.text) == ("06:00", "23:19")
+    assert day.sound_by_hour[9] == pytest.approx(10)
+    assert day.share == pytest.approx(20 / 24)
+
+
+def test_a_silence_that_ends_late_still_belongs_to_the_evening_it_began_in(tmp_path):
+    write_day(tmp_path, DAY, hours=range(22))
+    path = tmp_path / "2026/03/02/home_20260302T000000Z.mcap"
+    path.parent.mkdir(parents=True)
+    one_segment(path, "/mic/segment", midnight(DAY) + 22 * HOUR * NANOSECONDS, 8 * HOUR, "silence")
+    assert look(tmp_path).share == 1
+
+
+def one_segment(path, topic, start, seconds, label):
+    """Write a log with a single segment."""
+    name = topic.split("/")[1]
+    topics = layer_topics(name, "x", GENERAL)
+    topics = [type(t)(topic, t.type) if t.name.endswith("/segment") else t for t in topics]
+    writer = LogWriter(path, topics, {"version": "0", "node": "home"})
+    length = seconds * NANOSECONDS
+    fields = {
+        "header.stamp": np.array([start]),
+        "header.frame_id": name,
+        "duration": np.array([length]),
+        "label": [label],
+        "confidence": np.ones(1, np.float32),
+    }
+    writer.write_columns([Rows(topic, np.array([start + length]), fields)])
+    return writer.finish()
+
+
+# What people say
+
+
+def test_what_a_reviewer_says_replaces_what_the_model_said_and_is_certain(tmp_path):
+    logs = write_day(tmp_path, DAY, [(at("10:00"), 60, "crying", 0.6)], hours=[10])
+    start = midnight(DAY) + 10 * HOUR * NANOSECONDS
+    write_marks(logs[0], [Mark("mic", start + 10**9, start + 61 * 10**9, "laughing")])
+    day = look(tmp_path)
+    assert day.count("laughing") == exactly(1)
+    assert day.minutes("laughing").minutes == 1
+    assert day.minutes("crying").minutes == pytest.approx(1 / 60)
+    assert day.count("crying").expected == pytest.approx(0.6)
+
+
+def test_a_relabelling_is_read_in_place_of_what_the_recorder_said(tmp_path):
+    log, *_ = write_day(tmp_path, DAY, [(at("10:00"), 60, "crying", 0.6)], hours=[10])
+    layer = log.with_name(f"{log.stem}.relabel-new-2.mcap")
+    start = midnight(DAY) + 10 * HOUR * NANOSECONDS
+    one_segment(layer, "/mic/relabel/new_2/segment", start, 30, "laughing")
+    day = look(tmp_path, labelling="new-2")
+    assert day.minutes("laughing").minutes == 0.5
+    assert day.count("crying") is None
+    with pytest.raises(DataError, match=r"no labelling 'new-3' .*; there is live, new-2"):
+        look(tmp_path, labelling="new-3")
+
+
+def test_the_last_whole_day_is_that_which_the_logs_reach_to_the_end_of(tmp_path):
+    for day in (DAY, DAY + timedelta(days=1)):
+        write_day(tmp_path, day, hours=[0, 12])
+    last = tmp_path / "2026/03/02/home_20260302T230000Z.mcap"
+    start = midnight(DAY) + 47 * HOUR * NANOSECONDS
+    one_segment(last, "/mic/segment", start, 1800, "speech")
+    assert find_shelf([tmp_path]).last_whole_day(UTC) == DAY
+    last.unlink()
+    one_segment(last, "/mic/segment", start, 3570, "speech")
+    assert find_shelf([tmp_path]).last_whole_day(UTC) == DAY + timedelta(days=1)
+
+
+# The page
+
+
+class Outline(HTMLParser):
+    """Tags that are opened and closed, and what a page would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stack, self.fetched, self.scripts, self.headings = [], [], 0, []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in {"meta", "img"}:
+            self.stack.append(tag)
+        self.scripts += tag == "script"
+        wanted = [value for name, value in attrs if name in {"src", "href"}]
+        self.fetched += [value for value in wanted if not value.startswith("data:")]
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        if self.stack[-1:] == ["h2"]:
+            self.headings.append(data)
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory) -> Path:
+    """Nine days of a flat with two microphones; the last has a bad night and a broken one."""
+    root = tmp_path_factory.mktemp("flat")
+    write_life(root, DAY - timedelta(days=9), 9)
+    coughs = [(at("01:00") + 300 * n, 2.0, "coughing", 0.9) for n in range(40)]
+    write_day(
+        root,
+        DAY,
+        [*coughs, (at("12:00"), 900, "speech", 0.9)],
+        node="flat",
+        microphone="living_room",
+        gaps=[(at("14:10"), 3000, "the microphone went silent")],
+        health=[(at("14:10"), 2, "the model is gone"), (at("14:40"), 0, "listening")],
+    )
+    about = {"node": "bathroom", "microphone": "bathroom", "classes": BATHROOM}
+    flush = [(at("02:00"), 12, "flushing_water", 0.9), (at("07:30"), 300, "shower", 1.0)]
+    write_day(root, DAY, flush, hours=range(14), **about)
+    return root
+
+
+@pytest.fixture(scope="module")
+def flat_page(flat, tmp_path_factory) -> str:
+    return page_of(flat, tmp_path_factory.mktemp("page"))
+
+
+def test_a_page_needs_nothing_but_itself(flat_page):
+    outline = Outline()
+    outline.feed(flat_page)
+    assert outline.stack == []
+    assert outline.scripts == 0
+    assert outline.fetched == []
+    assert "url(" not in flat_page
+    assert "@import" not in flat_page
+    assert outline.headings == [
+        "What was heard",
+        "Bathroom",
+        "Night",
+        "Quiet and activity",
+        "For the interRAI Home Care assessment",
+        "How to read this",
+    ]
+
+
+def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
+    text = text_of(flat_page)
+    assert "Sunday, 1 March 2026" in text
+    assert "Heard: 23 h 10 min of the day (97 %)" in text
+    assert re.search(r"bouts of coughing in the night more often, about 36 \(33 to 39\)", text)
+    assert "Not heard: 50 min (3 %)" in text
+    assert "The microphone went silent: 50 min, once (14:10 to 15:00)" in text
+    assert "The microphone bathroom heard nothing for 10 h 00 min" in text
+    assert "Nothing was recorded" not in text, "the gap says why"
+    assert "living room: the model is gone: 30 min, once (14:10 to 14:40)" in text
+    assert "Toilet flushes at 02:00." in text
+    assert "Showers at 07:30." in text
+    assert "diagnosis" in text
+
+
+def test_a_class_is_only_compared_on_days_on_which_it_would_have_been_heard(flat, flat_page):
+    shelf = find_shelf([flat])
+    heard = read_heard(shelf, "live", 0, day_span(DAY, UTC))
+    day = day_of(whole_home(heard), DAY, UTC)
+    assert day.comparable("coughing")
+    assert not day.comparable("shower"), "the bathroom was heard for 14 hours"
+    assert "water taps less often" not in text_of(flat_page)
+    assert "These sounds could be heard for 58 % of the day only." in text_of(flat_page)
+
+
+def test_without_a_week_to_compare_with_the_page_says_so(tmp_path):
+    write_day(tmp_path / "logs", DAY - timedelta(days=1))
+    write_day(tmp_path / "logs", DAY)
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "Not compared with other days: of the 28 days before, only 1 day could be used" in page
+    assert "Usually" not in page
+    assert "Cannot be told: the model of this home does not know these sounds" in page
+    assert "It was quiet." in page
+
+
+def test_a_week_has_its_seven_days_and_their_total(flat, tmp_path):
+    page = page_of(flat, tmp_path, DAY - timedelta(days=6), 7)
+    text = text_of(page)
+    assert "Week 9, 23 February 2026 to 1 March 2026" in text
+    assert page.count('<th scope="row">Wed 25 Feb</th>') == 5
+    assert page.count('<tr class="sum">') == 5
+    heard = read_heard(find_shelf([flat]), "live", 0, day_span(DAY, UTC))
+    home = whole_home(heard)
+    days = [day_of(home, DAY - timedelta(days=n), UTC) for n in range(7)]
+    total = sum((day.count("shower") for day in days), Count())
+    row = re.search(r'<tr class="sum"><th scope="row">All days</th>(.*?)</tr>', page)[1]
+    assert "min" in row
+    assert f"<td>{total.show(total.middle)}" in page
+
+
+def test_the_same_logs_give_the_same_bytes(flat, flat_page, tmp_path):
+    assert page_of(flat, tmp_path) == flat_page  # the picture is in it
+
+
+def test_names_from_a_log_cannot_become_markup(tmp_path):
+    gap = [(at("10:00"), 600, '<script>alert("x")</script> & more')]
+    health = [(at("11:00"), 2, "<img src=http://x.example/y>"), (at("11:05"), 0, "")]
+    write_day(tmp_path / "logs", DAY, gaps=gap, health=health)
+    page = page_of(tmp_path / "logs", tmp_path)
+    outline = Outline()
+    outline.feed(page)
+    assert (outline.scripts, outline.fetched) == (0, [])
+    assert "&lt;script&gt;" in page
+    assert paragraph("<b> & c") == "<p>&lt;b&gt; &amp; c</p>"
+
+
+def test_the_picture_has_the_colours_of_the_classes_where_they_were_heard(tmp_path):
+    events = [(at("06:00"), HOUR, "music", 1.0), (at("18:00"), HOUR, "crying", 1.0)]
+    write_day(tmp_path / "logs", DAY, events, gaps=[(at("12:00"), HOUR, "gone")])
+    page_of(tmp_path / "logs", tmp_path)
+    with Image.open(next(tmp_path.glob("*.png"))) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    places = {}
+    for name in ("music", "crying"):
+        rows, columns = np.nonzero((abs(pixels - colour(name)) <= 3).all(axis=2))
+        assert len(rows) > 500
+        places[name] = np.median(rows), np.median(columns)
+    assert places["music"][0] < places["crying"][0], "a line for each, in the order of the model"
+    hour = (places["crying"][1] - places["music"][1]) / 12
+    assert 45 < hour < 65, "twelve hours of a day that is as wide as the page"
+
+
+# The command
+
+
+def test_the_command_makes_a_page_of_the_last_whole_day(hearthlog, tmp_path):
+    write_day(tmp_path / "logs", DAY - timedelta(days=1), timezone="Europe/Vienna")
+    write_day(tmp_path / "logs", DAY, timezone="Europe/Vienna")
+    done = hearthlog("report", tmp_path / "logs", "-o", tmp_path / "day.html")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == [str(tmp_path / "day.html"), str(tmp_path / "day.png")]
+    page = (tmp_path / "day.html").read_text()
+    assert "Sunday, 1 March 2026" in page
+    assert "Europe/Vienna" in page
+    again = hearthlog("report", tmp_path / "logs", "-o", tmp_path / "day.html")
+    assert again.returncode == 1
+    assert "exists already" in again.stderr
+    assert (tmp_path / "day.html").read_text() == page
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["day.html", "day.png", "logs"]
+
+
+def test_a_damaged_log_is_not_heard_and_the_command_says_so(hearthlog, tmp_path):
+    logs = write_day(tmp_path / "logs", DAY)
+    logs[10].write_bytes(logs[10].read_bytes()[:40] + b"\xff" * 900)
+    done = hearthlog("report", tmp_path / "logs", "--day", DAY, "-o", tmp_path / "day.html")
+    assert done.returncode == 3
+    assert logs[10].name in done.stderr
+    text = text_of((tmp_path / "day.html").read_text())
+    assert "Heard: 23 h 00 min" in text
+    assert "Nothing was recorded for 1 h 00 min: the recorder was off" in text
+    assert "1 log could not be read, or only in part." in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "line"),
+    [
+        (["--day", "2026-04-01"], 1, "no logs of 2026-04-01 .* there are 2026-03-01$"),
+        (["--week", "2026-W20"], 1, "no logs of 2026-05-11 to 2026-05-17"),
+        (["--day", "yesterday"], 2, "--day yesterday: not a day such as 2026-03-01"),
+        (["--week", "9999-W52"], 2, "--week 9999-W52: not a week"),
+        (["--day", "2026-03-01", "--week", "2026-W09"], 2, "exclude each other"),
+        (["--labels", "pub-7"], 1, "no labelling 'pub-7' beside these logs; there is live"),
+        (["--timezone", "Nowhere"], 1, "'Nowhere' is no time zone: use a name such as"),
+        (["-o", "day.pdf"], 2, "a page is named"),
+    ],
+)
+def test_a_wrong_wish_gets_one_line(hearthlog, tmp_path, arguments, status, line):
+    write_day(tmp_path / "logs", DAY, hours=[9])
+    done = hearthlog("report", tmp_path / "logs", *arguments)
+    assert done.returncode == status
+    assert re.search(line, done.stderr.strip())
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+
+
+def test_logs_without_labels_or_without_anything_say_what_to_do(hearthlog, tmp_path):
+    write_day(tmp_path / "mute", DAY, hours=[9], gaps=[(at("09:00"), HOUR, "gone")])
+    done = hearthlog("report", tmp_path / "mute")
+    assert done.returncode == 1
+    assert "no labels of live in the logs of that time: `hearthlog relabel" in done.stderr
+    (tmp_path / "empty").mkdir()
+    done = hearthlog("report", tmp_path / "empty")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "no log (*.mcap) in this folder" in done.stderr
+
+
+def test_a_log_that_is_there_twice_is_refused(tmp_path):
+    log, *_ = write_day(tmp_path / "a", DAY, hours=[9])
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / log.name).write_bytes(log.read_bytes())
+    with pytest.raises(Exception, match="overlap; is a log there twice"):
+        look(tmp_path)

@@ -1,0 +1,89 @@
+"""`hearthlog report`: a day or a week of a home, for a carer."""
+
+from datetime import date, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tools.cli.progress import share_done
+from tools.cli.selection import Logs, wrong_use
+
+if TYPE_CHECKING:
+    from analyzer.report.shelf import Shelf
+
+_YEARS = range(1970, 2200)
+
+
+def report(
+    logs: Logs,
+    *,
+    day: Annotated[
+        str | None,
+        typer.Option(help="As 2026-03-01; without --week the last whole day in the logs."),
+    ] = None,
+    week: Annotated[
+        str | None, typer.Option(help="As 2026-W09, or a day in it: Monday to Sunday.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="The page, *.html (NODE_DAY.html here); a picture is beside it."
+        ),
+    ] = None,
+    labels: Annotated[
+        str, typer.Option(help="Which labelling: live, or the model of a relabel layer.")
+    ] = "live",
+    timezone: Annotated[
+        str | None,
+        typer.Option(help="Of the home, as Europe/Vienna; by default what the logs say, or UTC."),
+    ] = None,
+) -> None:
+    """Write a page and a picture of a day or a week, for a carer.
+
+    Exit status 3: a log is damaged or unfinished; the page says that it was not heard.
+    """
+    if day is not None and week is not None:
+        wrong_use("--day and --week exclude each other")
+    if output is not None and output.suffix != ".html":
+        wrong_use(f"--output {output}: a page is named *.html")
+    first = None if day is None and week is None else _first_day(day, week)
+
+    from analyzer.hometime import home_zone
+    from analyzer.report.report import WEEK, Period, make_report
+    from analyzer.report.shelf import find_shelf
+
+    shelf = find_shelf(logs)
+    zone = home_zone(timezone, shelf.records())
+    if first is None:
+        first = shelf.last_whole_day(zone)
+    count = 1 if week is None else WEEK
+    page = output or Path(_name(shelf, first, count))
+    with share_done("reading what was heard") as progress:
+        made = make_report(shelf, Period(first, count, zone), page, labels, progress)
+    print(made.page)
+    print(made.picture)
+    for line in made.losses:
+        typer.echo(f"hearthlog: {line}", err=True)
+    if made.losses:
+        raise typer.Exit(3)
+
+
+def _first_day(day: str | None, week: str | None) -> date:
+    """Read a day, or find the Monday of a week."""
+    option, text = ("--day", day) if week is None else ("--week", week)
+    try:
+        found = date.fromisoformat(text or "")
+    except ValueError:
+        found = None
+    if found is None or found.year not in _YEARS:
+        example = "2026-03-01" if week is None else "2026-W09, or a day in it"
+        wrong_use(f"{option} {text}: not a {option[2:]} such as {example}")
+    return found if week is None else found - timedelta(days=found.weekday())
+
+
+def _name(shelf: "Shelf", first: date, count: int) -> str:
+    """Name a page after the home and the day."""
+    node = next((entry.node for entry in shelf.entries if entry.node), "home")
+    when = f"{first}" if count == 1 else f"{first:%G-W%V}"
+    return f"{node}_{when}.html"
