@@ -80,13 +80,14 @@ def find_heard(path: Path) -> dict[str, Heard]:
         ):
             spans = sorted(_spans(selection.logs, name))
             if spans:
-                found[microphone] = _heard(spans)
+                found[microphone] = heard_in(spans)
     if not found:
         raise DataError(f"{path}: no features of a microphone; name a log, or a folder of logs")
     return found
 
 
-def _heard(spans: Sequence[tuple[int, int, Path]]) -> Heard:
+def heard_in(spans: Sequence[tuple[int, int, Path]]) -> Heard:
+    """Tell when a microphone was heard, by start, end and log, in the order of time."""
     starts = [start for start, _, _ in spans]
     ends = [end for _, end, _ in spans]
     for i, following in enumerate(starts[1:]):

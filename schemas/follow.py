@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from threading import Event
@@ -58,21 +58,49 @@ def follow(
     LogError
         If there is no such folder, or a log is damaged.
     """
-    stop = stop or Event()
-    for messages in _messages(folder, topics, start, stop):
+    for _, messages in follow_messages(folder, topics, start, stop):
         yield decode(messages, fields)
 
 
-def _messages(
-    folder: Path, topics: Collection[str] | None, start: int | None, stop: Event
-) -> Iterator[list[RawMessages]]:
+def _refuse(error: LogError) -> None:
+    raise error
+
+
+def follow_messages(
+    folder: Path,
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    stop: Event | None = None,
+    damaged: Callable[[LogError], None] = _refuse,
+) -> Iterator[tuple[Path, list[RawMessages]]]:
+    """Read the messages of logs, still encoded, as they are written; as `follow` does.
+
+    Parameters
+    ----------
+    folder, topics, start, stop
+        Those of `follow`.
+    damaged : callable
+        Takes the error of a log that is damaged, of which no more is read then; by default it is
+        raised.
+
+    Yields
+    ------
+    Path, list of RawMessages
+        A log, and what was written to it since the last time.
+    """
+    stop = stop or Event()
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder")
     watch = _Folder(folder)
     present = watch.new_logs()
     if start is not None:
         finished = [path for path in present if not path.name.endswith(ACTIVE_SUFFIX)]
-        yield from iterate_messages(finished, topics, start)
+        for path in finished:
+            try:
+                for messages in iterate_messages([path], topics, start):
+                    yield path, messages
+            except LogError as error:
+                damaged(error)
     growing = [g for path in present if path.name.endswith(ACTIVE_SUFFIX) for g in _open(path)]
     if start is None:
         for log in growing:
@@ -81,9 +109,13 @@ def _messages(
         while not stop.is_set():
             found = False
             for log in growing:
-                for messages in log.read(topics, start):
-                    found = True
-                    yield messages
+                try:
+                    for messages in log.read(topics, start):
+                        found = True
+                        yield log.file.path, messages
+                except LogError as error:
+                    log.is_damaged = True
+                    damaged(error)
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
             if not found:
@@ -98,6 +130,7 @@ class _Growing:
 
     def __init__(self, file: LogFile) -> None:
         self.file = file
+        self.is_damaged = False
         self._replaced = False
 
     def read(
@@ -113,7 +146,7 @@ class _Growing:
 
     def is_open(self) -> bool:
         """Tell whether more may come; if not, close the log."""
-        if self.file.ended or self._replaced:
+        if self.file.ended or self._replaced or self.is_damaged:
             self.file.close()
             return False
         return True

@@ -90,10 +90,12 @@ class _Query(NamedTuple):
     start: int
     end: int
     check: bool = False
+    every: int = 1
 
     def wanted(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a wanted message."""
         chunks = file.chunks[(file.chunks["end"] >= self.start) & (file.chunks["start"] < self.end)]
+        chunks = chunks[:: self.every]
         if self.topics is None:
             return chunks
         others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}
@@ -127,13 +129,14 @@ class _Batch(NamedTuple):
     finished: list[LogFile]
 
 
-def iterate_messages(
+def iterate_messages(  # noqa: PLR0913
     logs: Iterable[Path],
     topics: Collection[str] | None = None,
     start: int | None = None,
     end: int | None = None,
     *,
     check: bool = False,
+    every: int = 1,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
 
@@ -146,6 +149,8 @@ def iterate_messages(
         Log times, in nanoseconds: from `start` on, before `end`.
     check : bool
         Whether to compare chunks with their checksums.
+    every : int
+        Read one of so many chunks of each log: a sample.
 
     Yields
     ------
@@ -158,7 +163,7 @@ def iterate_messages(
     LogError
         If a log is damaged.
     """
-    return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
+    return _iterate(logs, _query(topics, start, end)._replace(check=check, every=every), list)
 
 
 def iterate_pieces(

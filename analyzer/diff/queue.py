@@ -20,6 +20,9 @@ Float64 = NDArray[np.float64]
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])
+RANDOM = "random"
+_ALONE = {"uncertain": 0, "disagreeing": 1, "novel": 2}  # rows of what is weighed
+RANKINGS = (*_ALONE, RANDOM)
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ def make_queue(  # noqa: PLR0913
     other: Side | None,
     marks: Labelling | None,
     count: int,
+    ranking: str | None = None,
     progress: Progress = lambda _: None,
 ) -> Queue:
     """Choose spans whose labels are likely to be wrong, of many days and classes.
@@ -83,6 +87,8 @@ def make_queue(  # noqa: PLR0913
         What was reviewed already: it is left out.
     count : int
         Of spans.
+    ranking : str, optional
+        One of `RANKINGS`: by what alone they are chosen.
     progress : callable, optional
         Is called with the share that is done.
 
@@ -109,7 +115,9 @@ def make_queue(  # noqa: PLR0913
     if other is not None:
         labels, differing = other_labels(windows, events_of(other, classes))
     parts = doubt.uncertainty.values(), differing, doubt.novelty.values()
-    scores = (_WEIGHTS * np.stack(parts)).sum(axis=0)
+    scores = _scores(np.stack(parts), ranking)
+    if not scores.any():
+        raise DataError(f"{side.name}: no span is {ranking}")
     rows = _best_of_each(scores, windows.sources)
     rows = rows[_spread(scores[rows], windows.taken(rows), count)]
     return Queue(
@@ -122,6 +130,15 @@ def make_queue(  # noqa: PLR0913
         candidates=len(windows),
         sure=doubt.uncertainty.known,
     )
+
+
+def _scores(parts: Float64, ranking: str | None) -> Float64:
+    """Weigh what speaks for each window; at random the same windows come each time."""
+    if ranking == RANDOM:
+        return np.random.default_rng(0).random(parts.shape[1:])
+    weights = _WEIGHTS if ranking is None else np.eye(len(parts))[:, [_ALONE[ranking]]]
+    scored: Float64 = (weights * parts).sum(axis=0)
+    return scored
 
 
 def _add_frames(

@@ -225,20 +225,21 @@ class Sources:
                 yield match
 
 
-def find_sources(path: Path) -> Sources:
-    """Look what labellings there are in a log and its layers, or in a folder of logs.
+def find_sources(*paths: Path) -> Sources:
+    """Look what labellings there are in logs and their layers, or in folders of logs.
 
     Raises
     ------
     LogError
         If there is no log, or none that can be read.
     """
-    found = {each.resolve(): each for log in with_layers(path) for each in find_logs(log)}
+    given = [log for path in paths for log in with_layers(path)]
+    found = {each.resolve(): each for log in given for each in find_logs(log)}
     opened = list(map_logs(_opened, sorted(found.values())))
     logs = [log for log in opened if isinstance(log, Log)]
     losses = [str(error) for error in opened if isinstance(error, LogError)]
     if not logs:
-        raise LogError(losses[0] if losses else f"{path}: there is no message in these logs")
+        raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
     return Sources(sorted(logs, key=lambda log: log.first), losses)
 
 

@@ -20,7 +20,8 @@ def demo(
     ] = 24,
 ) -> None:
     """Simulate a home, learn its sounds, record and label a day of it, and draw the result."""
-    from analyzer.timeline import save_timeline
+    from analyzer.timeline.reading import read_timeline
+    from analyzer.viewer.file import save_timeline
     from recorder.config import load_settings
     from recorder.service import record_files
     from recorder.sources.replayed import FileSource
@@ -59,8 +60,8 @@ def demo(
     _say(f"4. hearthlog info {logs}")
     info(logs)
 
-    _say(f"5. hearthlog review {logs} --output {timeline}")
-    save_timeline(sorted(logs.rglob("*.mcap")), timeline)
+    _say(f"5. hearthlog review {logs} --save {timeline}")
+    save_timeline(read_timeline([logs]), timeline)
 
     _say(f"Look at it:           {_command('rerun')} --bind 127.0.0.1 {timeline}")
     print(f"Record a microphone:  {_command('hearthlog')} record --model {model}")

@@ -27,8 +27,10 @@ from tools.cli.record import record
 from tools.cli.recover import recover
 from tools.cli.relabel import relabel
 from tools.cli.replay import replay
+from tools.cli.report import report
 from tools.cli.review import review
 from tools.cli.train import train
+from tools.cli.watch import watch
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -51,6 +53,8 @@ for verb in (
     evaluate,
     diff,
     review,
+    watch,
+    report,
     replay,
     relabel,
     demo,

@@ -182,7 +182,7 @@ def _check_output(output: Path | None, source: Path) -> None:
     if output is None:
         return
     if output.suffix == ".rrd":
-        from analyzer.timeline import check_output
+        from analyzer.viewer.file import check_output
 
         check_output(output)
         return
@@ -204,12 +204,13 @@ def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
 
     if wanted.output is None or wanted.output.suffix != ".rrd":
         return run(wanted)
-    from analyzer.timeline import save_timeline
+    from analyzer.timeline.reading import read_timeline
+    from analyzer.viewer.file import save_timeline
 
     output = wanted.output
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
         result = run(replace(wanted, output=Path(folder) / "logs"))
-        save_timeline(result.logs, output)
+        save_timeline(read_timeline(result.logs), output)
     return replace(result, logs=[])
 
 

@@ -1,22 +1,233 @@
-"""`hearthlog review`: a log, or a folder of logs, on one time axis."""
+"""`hearthlog review`: logs on one time axis, and marks made where they are seen."""
 
 import shlex
+import webbrowser
+from contextlib import suppress
+from datetime import date, datetime, timedelta
 from pathlib import Path
-from typing import Annotated
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from tools.cli.keys import read_keys
+from tools.cli.progress import share_done
+from tools.cli.reviewer import reviewer_name
+from tools.cli.selection import wrong_use
+from tools.cli.times import parse_span
+
+if TYPE_CHECKING:
+    from analyzer.review.marking import Marking
+    from analyzer.review.session import Item
+    from analyzer.timeline.contents import Timeline
+    from analyzer.viewer.viewer import Viewer
+
+_SPANS = 60
+
 
 def review(
-    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Rerun recording to make, *.rrd.")],
+    logs: Annotated[list[Path], typer.Argument(help="Logs, or folders of logs.")],
+    day: Annotated[
+        str | None, typer.Option(help="A day of the home, as 2026-03-01, today or yesterday.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(help="From this time on, as 2026-03-01T07:00 (UTC).")
+    ] = None,
+    end: Annotated[str | None, typer.Option(help="Up to this time.")] = None,
+    *,
+    save: Annotated[
+        Path | None,
+        typer.Option("--save", "--output", "-o", help="Make a Rerun recording, *.rrd, instead."),
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
+    queue: Annotated[
+        str | None,
+        typer.Option(
+            help="Go through spans that are uncertain, novel, disagreeing or random, or through "
+            "a list of `hearthlog diff --list`."
+        ),
+    ] = None,
+    spans: Annotated[int, typer.Option(min=1, help="How many to go through.")] = _SPANS,
+    labels: Annotated[
+        str, typer.Option(help="Labelling to correct: live, or the model of a relabel layer.")
+    ] = "live",
+    microphone: Annotated[
+        str | None, typer.Option(help="Its name, where there are several.")
+    ] = None,
+    reviewer: Annotated[
+        str | None, typer.Option(help="Who makes the marks.  [default: the login name]")
+    ] = None,
+    timezone: Annotated[
+        str | None, typer.Option(help="Of the home, as Europe/Vienna.  [default: the logs say it]")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Of the viewer.")] = None,
 ) -> None:
-    """Show labels, probabilities and features on one time axis, in a Rerun recording."""
-    from analyzer.timeline import save_timeline
-    from schemas.files import find_logs
-    from tools.cli.progress import track
+    """Show a day or any other span in Rerun, and mark what was heard.
 
-    save_timeline(track(find_logs(path), "reading logs"), output)
+    Drag a span on the time ruler and press a key in the terminal. Every mark is in the review
+    layer at once. Exit status 3: some logs could not be read, or not all of them could be shown.
+    """
+    if save is not None and (web or queue or port):
+        wrong_use("--save makes a file: --web, --queue and --port go without it")
+    if day is not None and (start or end):
+        wrong_use("--day is a span of its own: leave out --start and --end")
+    limits = parse_span(start, end) if day is None else _day(logs, day, timezone)
+    if save is not None:
+        timeline = _save(logs, limits, timezone, save)
+    else:
+        with _open(web=web, port=port) as viewer:
+            timeline = _read(logs, limits, timezone)
+            chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
+            _show(viewer, timeline, logs, chosen)
+    for loss in timeline.losses:
+        typer.echo(f"hearthlog: {loss}", err=True)
+    if timeline.losses:
+        raise typer.Exit(3)
+
+
+def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
+    """Read the option --day: from midnight to midnight, at home."""
+    from analyzer.hometime import day_span
+    from analyzer.timeline.reading import zone_of
+
+    zone = zone_of(logs, timezone)
+    today = datetime.now(zone).date()
+    near = {"today": today, "yesterday": today - timedelta(days=1)}
+    try:
+        return day_span(near.get(text) or date.fromisoformat(text), zone)
+    except (ValueError, OverflowError):
+        wrong_use(f"--day {text}: not a day such as 2026-03-01, today or yesterday")
+
+
+def _read(
+    logs: list[Path], limits: tuple[int | None, int | None], timezone: str | None
+) -> "Timeline":
+    from analyzer.timeline.reading import read_timeline
+
+    with share_done("reading logs") as progress:
+        return read_timeline(logs, *limits, zone=timezone, progress=progress)
+
+
+def _save(
+    logs: list[Path],
+    limits: tuple[int | None, int | None],
+    timezone: str | None,
+    output: Path,
+) -> "Timeline":
+    from analyzer.viewer.file import check_output, save_timeline
+
+    check_output(output)
+    timeline = _read(logs, limits, timezone)
+    save_timeline(timeline, output)
     print(output)
     # Otherwise the viewer listens to the whole network.
     print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(output))}")
+    return timeline
+
+
+def _open(*, web: bool, port: int | None) -> "Viewer":
+    """Start the viewer before logs are read: it takes its time as well."""
+    if web:
+        from analyzer.viewer.web import open_page
+
+        return open_page(port)
+    from analyzer.viewer.window import open_window
+
+    return open_window(port)
+
+
+class _Choice(NamedTuple):
+    """What is to be corrected, by whom, and in which order."""
+
+    labels: str
+    microphone: str | None
+    reviewer: str
+    queue: str | None
+    spans: int
+    limits: tuple[int | None, int | None]
+
+
+def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
+    """Show a timeline until the reviewer is done."""
+    from analyzer.hometime import home_zone
+    from analyzer.review.session import Session
+    from analyzer.review.sound import listen
+    from analyzer.timeline.reading import read_timeline
+
+    microphone = _microphone(timeline, choice.microphone)
+    items, marking = _work(timeline, logs, choice, microphone)
+
+    def say(text: str) -> None:
+        print(text, flush=True)
+        viewer.say(text)
+
+    def look_closely(start: int, end: int) -> None:
+        heard = timeline.heard
+        spans = zip(heard.logs, heard.starts, heard.ends, strict=True)
+        near = [log for log, first, last in spans if first < end and last > start]
+        viewer.draw_close_up(read_timeline(near, start, end, zone=timeline.zone))
+
+    session = Session(
+        viewer,
+        marking,
+        _classes(timeline, microphone),
+        home_zone(timeline.zone),
+        say,
+        look_closely,
+        lambda start, end: listen(timeline.microphones[microphone].clips, start, end),
+        items,
+    )
+    keys: SimpleQueue[str] = SimpleQueue()
+    viewer.offer(session.keys, keys.put)
+    viewer.draw(timeline, close_up=bool(items))
+    if viewer.address:
+        print(f"open {viewer.address}", flush=True)
+        webbrowser.open(viewer.address)
+    viewer.wait_until_drawn()
+    with read_keys(keys), suppress(KeyboardInterrupt):
+        session.run(keys)
+
+
+def _work(
+    timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
+) -> "tuple[list[Item], Marking]":
+    """Find what is to be gone through, and what is corrected."""
+    from analyzer.diff.sources import find_sources
+    from analyzer.review.marking import Marking
+    from analyzer.review.queue import queue_items
+    from analyzer.timeline.contents import LIVE, no_spans
+
+    known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
+    labelling, items = choice.labels, []
+    if choice.queue is not None or labelling != LIVE:
+        sources = find_sources(*logs)
+        labelling = sources.find(microphone, choice.labels)
+        if choice.queue is not None:
+            items = queue_items(
+                choice.queue, sources, (microphone, labelling), choice.limits, choice.spans
+            )
+    marking = Marking(
+        microphone,
+        timeline.heard,
+        choice.reviewer,
+        labelling.removeprefix("relabel/"),
+        known.get(labelling, no_spans()),
+    )
+    return items, marking
+
+
+def _microphone(timeline: "Timeline", wanted: str | None) -> str:
+    """Return the microphone whose marks are made."""
+    known = ", ".join(timeline.microphones)
+    if wanted is not None and wanted not in timeline.microphones:
+        wrong_use(f"--microphone {wanted}: there is {known}")
+    if wanted is None and len(timeline.microphones) > 1:
+        wrong_use(f"choose one with --microphone: {known}")
+    return wanted or known
+
+
+def _classes(timeline: "Timeline", microphone: str) -> list[str]:
+    """List the classes that get a key: those of the models, and those that were marked."""
+    labellings = timeline.microphones[microphone].labellings
+    named = [name for one in labellings if one.probabilities for name in one.probabilities.names]
+    return list(dict.fromkeys([*named, *(text for one in labellings for text in one.spans.texts)]))

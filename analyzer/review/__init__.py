@@ -1,0 +1,1 @@
+"""Going through a timeline: marking what was heard, span after span."""

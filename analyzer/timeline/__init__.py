@@ -1,0 +1,1 @@
+"""What some logs hold, at the resolution of a screen: what a timeline shows."""

@@ -1,0 +1,103 @@
+"""Equal shares of a span of time, and what falls into them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int64 = NDArray[np.int64]
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A span of time, divided.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    count : int
+        Of its shares.
+    """
+
+    start: int
+    end: int
+    count: int
+
+    @property
+    def edges(self) -> Int64:
+        """Where the shares begin, and where the last one ends; shape (count + 1,)."""
+        shares = np.arange(self.count + 1) / self.count
+        return self.start + np.round(shares * (self.end - self.start)).astype(np.int64)
+
+    def find(self, times: Int64) -> NDArray[np.intp]:
+        """Find the shares that times lie in; those of times outside are cut off to the ends."""
+        found = (times - self.start) * (self.count / (self.end - self.start))
+        return np.clip(found.astype(np.int64), 0, self.count - 1)
+
+
+class Means:
+    """Means of what falls into the shares of a grid, value by value.
+
+    Parameters
+    ----------
+    grid : Grid
+    width : int
+        Values a row.
+    """
+
+    def __init__(self, grid: Grid, width: int) -> None:
+        self._grid = grid
+        self._sums = np.zeros((grid.count, width))
+        self._counts = np.zeros(grid.count, np.int64)
+
+    def add(self, times: Int64, values: NDArray[np.floating]) -> None:
+        """Take rows in the order of time; values that are not finite count as 0.
+
+        Parameters
+        ----------
+        times : np.ndarray [shape=(n,)], int64
+        values : np.ndarray [shape=(n, width)], float
+        """
+        share = self._grid.find(times)
+        first = np.flatnonzero(np.diff(share, prepend=-1))
+        finite = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+        self._sums[share[first]] += np.add.reduceat(finite, first, axis=0, dtype=np.float64)
+        self._counts[share[first]] += np.diff(first, append=len(share))
+
+    @property
+    def values(self) -> Float64:
+        """The means, shape (count, width); NaN where nothing fell."""
+        with np.errstate(invalid="ignore"):
+            return self._sums / self._counts[:, np.newaxis]
+
+
+def time_shares(
+    starts: Int64, ends: Int64, labels: NDArray[np.intp], width: int, grid: Grid
+) -> Float64:
+    """Measure how much of each share of a grid each label takes.
+
+    Parameters
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Of spans in the order of time; those of one label do not overlap.
+    labels : np.ndarray [shape=(n,)], int
+    width : int
+        How many labels there are.
+    grid : Grid
+
+    Returns
+    -------
+    np.ndarray [shape=(grid.count, width)], float64
+        0 to 1.
+    """
+    edges = grid.edges
+    shares = np.empty((grid.count, width))
+    for label in range(width):
+        own = labels == label
+        times = np.stack([starts[own], ends[own]], axis=1).ravel()
+        heard = np.cumsum(np.stack([0 * starts[own], (ends - starts)[own]], axis=1))
+        until = np.interp(edges, times, heard, left=0.0) if len(times) else np.zeros(len(edges))
+        shares[:, label] = np.diff(until)
+    return shares / np.diff(edges)[:, np.newaxis]

@@ -1,0 +1,521 @@
+"""Read logs, their layers and clips, as a timeline: once through, within bounded memory."""
+
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import tzinfo
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from analyzer.errors import DataError
+from analyzer.heard import heard_in
+from analyzer.hometime import home_zone
+from analyzer.known import decode_known
+from analyzer.marks import read_marks
+from analyzer.replay.clips import read_clips
+from analyzer.timeline.contents import (
+    LIVE,
+    REVIEW,
+    Clip,
+    Frames,
+    Labelling,
+    Lines,
+    Microphone,
+    Series,
+    Spans,
+    Timeline,
+    no_spans,
+)
+from analyzer.timeline.grid import Grid, Means
+from recorder.stream import FRAME_NANOSECONDS
+from schemas import messages
+from schemas.columns import Columns
+from schemas.errors import LogError
+from schemas.files import find_logs, is_layer, stem
+from schemas.logfile import LogFile, time_span
+from schemas.series import iterate_messages
+from schemas.writer import METADATA
+
+SHARES = 2_400  # of a timeline, at most: more than a screen has pixels
+_SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
+MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
+_WHOLE_BYTES = 3 << 30  # of messages that are read whole: about three days and their layers
+_MOST_NAMES = 256
+_QUIETEST = 1e-10  # of a mean square: -100 dB
+_ENERGY = "energy"
+TOPIC = re.compile(
+    r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"
+    r"(?P<kind>features|label|segment|gap)",
+    re.ASCII,
+)
+FIELDS = {
+    messages.FEATURES: ("header.stamp", "values"),
+    messages.LABEL: ("header.stamp", "novelty", "probabilities"),
+    messages.SEGMENT: ("header.stamp", "duration", "label"),
+    messages.GAP: ("header.stamp", "duration", "reason"),
+    messages.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
+    messages.LOG: ("stamp", "level", "msg"),
+}
+_OF_LAYERS = (messages.LABEL, messages.SEGMENT)
+
+Progress = Callable[[float], None]
+
+
+def read_timeline(
+    paths: Iterable[Path],
+    start: int | None = None,
+    end: int | None = None,
+    *,
+    zone: str | None = None,
+    progress: Progress = lambda _: None,
+) -> Timeline:
+    """Read what some logs hold.
+
+    Of more than about three days a sample is read: some chunks of each log, evenly.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, whose layers come with them, or folders of logs.
+    start, end : int, optional
+        In nanoseconds of UTC.
+    zone : str, optional
+        IANA name of the home's time zone; by default the logs say it.
+    progress : callable, optional
+        Is called with the share that is done.
+
+    Raises
+    ------
+    LogError
+        If there is no log.
+    DataError
+        If there is nothing in this span of time.
+    """
+    losses: list[str] = []
+    found = _files(paths, start, end, losses)
+    if not found:
+        raise _nothing(losses, limited=start is not None or end is not None)
+    first = min(file.first for file in found) if start is None else start
+    last = max(file.last for file in found) + FRAME_NANOSECONDS if end is None else end
+    last = max(last, first + _SHORTEST)
+    grid = Grid(first, last, min(SHARES, (last - first) // _SHORTEST))
+    every = -(-sum(file.size for file in found if not file.layer) // _WHOLE_BYTES)
+    reader = _Reader(grid, max(every, 1))
+    for number, file in enumerate(found):
+        try:
+            reader.read(file)
+        except (LogError, DataError) as error:
+            losses.append(str(error))
+        progress((number + 1) / len(found))
+    known = home_zone(zone, [file.about for file in found])
+    heard = heard_in([(f.first, f.last + FRAME_NANOSECONDS, f.path) for f in found if not f.layer])
+    timeline = Timeline(
+        grid, reader.microphones(), reader.lines(), str(known), heard, reader.every, losses
+    )
+    if not timeline.microphones:
+        raise _nothing(losses, limited=start is not None or end is not None)
+    return timeline
+
+
+def zone_of(paths: Iterable[Path], wanted: str | None) -> tzinfo:
+    """Find the time zone of a home, without reading more of its logs than it takes.
+
+    Raises
+    ------
+    DataError
+        If there is no such zone.
+    LogError
+        If there is no log.
+    """
+    return home_zone(wanted, _records(paths))
+
+
+def _records(paths: Iterable[Path]) -> Iterator[Mapping[str, str]]:
+    """Yield what logs say of themselves, the latest first."""
+    for path in reversed([each for given in paths for each in find_logs(given)]):
+        if not is_layer(path):
+            with suppress(LogError), LogFile(path) as file:
+                yield metadata_of(file)
+
+
+def _nothing(losses: Sequence[str], *, limited: bool) -> DataError:
+    where = "in this span of time; `hearthlog info` shows what there is" if limited else "to show"
+    first = f" ({losses[0]})" if losses else ""
+    return DataError(f"no features, labels, segments or gaps {where}{first}")
+
+
+@dataclass(frozen=True)
+class _File:
+    """A log or a layer that has messages in the span that is wanted."""
+
+    path: Path
+    first: int
+    last: int
+    size: int
+    layer: bool
+    about: Mapping[str, str]
+
+
+def _files(
+    paths: Iterable[Path], start: int | None, end: int | None, losses: list[str]
+) -> list[_File]:
+    """Look into logs and layers, in the order of time; those that cannot be read are lost."""
+    names = {path.resolve(): path for given in paths for path in _with_layers(given)}
+    files = []
+    for path in names.values():
+        try:
+            span = time_span(path)
+            if span is None or (start is not None and span[1] < start):
+                continue
+            # What ends in the span may be logged later, so only the start of a log excludes it.
+            if end is not None and span[0] >= end:
+                continue
+            with LogFile(path) as file:
+                size = int(file.chunks["size"].sum())
+                about = metadata_of(file)
+        except LogError as error:
+            losses.append(str(error))
+            continue
+        files.append(_File(path, *span, size, is_layer(path), about))
+    return sorted(files, key=lambda file: (file.first, file.path.name))
+
+
+def metadata_of(file: LogFile) -> Mapping[str, str]:
+    """Return what a log says of itself."""
+    records = (file.record(place) for place in file.places if place.opcode == Opcode.METADATA)
+    for record in records:
+        if isinstance(record, Metadata) and record.name == METADATA:
+            return record.metadata
+    return {}
+
+
+def _with_layers(path: Path) -> list[Path]:
+    """List logs, and the layers beside one that is named by itself."""
+    found = find_logs(path)
+    if found != [path] or is_layer(path):
+        return found
+    return [path, *sorted(path.parent.glob(f"{_escaped(stem(path))}.*.mcap"))]
+
+
+def _escaped(name: str) -> str:
+    return re.sub(r"([*?[])", r"[\1]", name)
+
+
+@dataclass
+class _Growing:
+    """Rows of one topic, whose names may differ from log to log."""
+
+    grid: Grid
+    keep: bool
+    means: dict[tuple[str, ...], Means] = field(default_factory=dict)
+    frames: list[Frames] = field(default_factory=list)
+
+    def add(self, names: tuple[str, ...], times: Any, values: Any) -> None:
+        self.means.setdefault(names, Means(self.grid, len(names))).add(times, values)
+
+    def series(self) -> Series | None:
+        """Bring all to the same columns."""
+        if not self.means:
+            return None
+        names = tuple(dict.fromkeys(name for names in self.means for name in names))
+        values = np.full((self.grid.count, len(names)), np.nan)
+        for own, means in self.means.items():
+            part = means.values
+            heard = ~np.isnan(part[:, 0])
+            columns = [names.index(name) for name in own]
+            values[np.flatnonzero(heard)[:, np.newaxis], columns] = part[heard]
+        return Series(names, values)
+
+
+@dataclass
+class _Heard:
+    """What was read of a microphone so far."""
+
+    features: _Growing
+    level_frames: list[Frames] = field(default_factory=list)
+    labels: dict[str, _Growing] = field(default_factory=dict)
+    novelty: dict[str, Means] = field(default_factory=dict)
+    spans: dict[str, list[Spans]] = field(default_factory=dict)
+    gaps: list[Spans] = field(default_factory=list)
+    troubles: list[tuple[int, str]] = field(default_factory=list)
+    clips: list[Clip] = field(default_factory=list)
+
+
+class _Reader:
+    """Takes one log after the other, in the order of time."""
+
+    def __init__(self, grid: Grid, every: int) -> None:
+        self.every = every
+        self._grid = grid
+        self._heard: dict[str, _Heard] = {}
+        self._lines: list[Lines] = []
+        self._clip_seconds = 0.0
+
+    def read(self, file: _File) -> None:
+        """Take a log or a layer."""
+        if file.path.name.endswith(".audio.mcap"):
+            self._read_clips(file.path)
+            return
+        if not file.layer:
+            self._read_marks(file.path)
+        elif ".review." in file.path.name:
+            return  # with its log
+        kinds = FIELDS
+        if file.layer:
+            kinds = {kind: FIELDS[kind] for kind in _OF_LAYERS}
+        self._read_messages(file, kinds)
+
+    def _read_messages(self, file: _File, kinds: Mapping[str, Sequence[str]]) -> None:
+        for topics, end, every in self._parts(file):
+            batches = iterate_messages([file.path], topics, self._grid.start, end, every=every)
+            for batch in batches:
+                for columns in decode_known(file.path, batch, kinds):
+                    self._take(file.path, columns)
+                if min(int(raw.log_times[0]) for raw in batch) > self._grid.end and topics is None:
+                    break  # what ended later began later, but for what lasted for minutes
+
+    def _parts(self, file: _File) -> Iterator[tuple[list[str] | None, int | None, int]]:
+        """Yield topics, the log time up to which they are read, and one of how many chunks."""
+        if not file.layer:
+            yield None, None, self.every
+            return
+        with LogFile(file.path) as log:
+            topics = [channel.topic for channel in log.channels.values()]
+        # They have chunks of their own, so all can be read even where labels are too many.
+        yield [name for name in topics if name.endswith("/segment")], None, 1
+        if self.every == 1:
+            yield [name for name in topics if name.endswith("/label")], self._grid.end, 1
+
+    def _take(self, path: Path, columns: Columns) -> None:
+        if columns.type == messages.LOG:
+            self._take_lines(columns)
+        elif columns.type == messages.DIAGNOSTICS:
+            self._take_health(columns)
+        elif match := TOPIC.fullmatch(columns.topic):
+            heard = self._microphone(match["microphone"])
+            name = match["labelling"] or LIVE
+            if columns.type == messages.FEATURES:
+                self._take_features(path, columns, heard)
+            elif columns.type == messages.LABEL:
+                self._take_labels(path, columns, heard, name)
+            elif columns.type == messages.SEGMENT:
+                heard.spans.setdefault(name, []).append(spans_of(columns, "label"))
+            elif columns.type == messages.GAP:
+                heard.gaps.append(spans_of(columns, "reason"))
+
+    def _microphone(self, name: str) -> _Heard:
+        return self._heard.setdefault(name, _Heard(_Growing(self._grid, keep=False)))
+
+    def _within(self, columns: Columns) -> Columns:
+        return columns.between(self._grid.start, self._grid.end)
+
+    def _take_features(self, path: Path, columns: Columns, heard: _Heard) -> None:
+        columns = self._within(columns)
+        if not len(columns):
+            return
+        names = value_names(path, columns, "values")
+        times, values = columns["header.stamp"], columns["values"]
+        heard.features.add(names, times, values)
+        if self.every == 1 and _ENERGY in names:
+            level = decibel(values[:, names.index(_ENERGY)])
+            heard.level_frames.append(Frames(("level",), times, level[:, np.newaxis]))
+
+    def _take_labels(self, path: Path, columns: Columns, heard: _Heard, name: str) -> None:
+        columns = self._within(columns)
+        if not len(columns):
+            return
+        names = value_names(path, columns, "probabilities")
+        times, values = columns["header.stamp"], columns["probabilities"]
+        growing = heard.labels.setdefault(name, _Growing(self._grid, keep=self.every == 1))
+        growing.add(names, times, values)
+        if growing.keep:
+            growing.frames.append(Frames(names, times, values))
+        novelty = columns["novelty"]
+        known = np.isfinite(novelty)
+        if known.any():
+            means = heard.novelty.setdefault(name, Means(self._grid, 1))
+            means.add(times[known], novelty[known, np.newaxis])
+
+    def _take_lines(self, columns: Columns) -> None:
+        columns = self._within(columns)
+        self._lines.append(Lines(columns["stamp"], columns["level"], columns["msg"]))
+
+    def _take_health(self, columns: Columns) -> None:
+        columns = self._within(columns)
+        rows = zip(
+            columns["header.stamp"].tolist(),
+            columns["header.frame_id"].tolist(),
+            columns["status"],
+            strict=True,
+        )
+        for stamp, name, statuses in rows:
+            bad = [status["message"] for status in statuses if status["level"]]
+            if TOPIC.fullmatch(f"/{name}/gap"):
+                self._microphone(name).troubles.append((stamp, "; ".join(bad)[:200]))
+
+    def _read_marks(self, log: Path) -> None:
+        for mark in read_marks(log):
+            if mark.start < self._grid.end and mark.end > self._grid.start:
+                spans = self._microphone(mark.microphone).spans.setdefault(REVIEW, [])
+                texts = np.array([mark.label], object)
+                spans.append(Spans(np.array([mark.start]), np.array([mark.end]), texts))
+
+    def _read_clips(self, path: Path) -> None:
+        with LogFile(path) as file:
+            topics = sorted(channel.topic for channel in file.channels.values())
+        for topic in topics:
+            if not re.fullmatch(r"/[a-z](_?[a-z0-9])*/audio", topic, re.ASCII):
+                raise LogError(f"{path}: has a topic {topic[:64]!r}, which no layer of sound has")
+            clips = self._microphone(topic.split("/")[1]).clips
+            for start, rate, samples in read_clips(path, topic, self._grid.start, self._grid.end):
+                self._clip_seconds += len(samples) / rate
+                if self._clip_seconds > MOST_CLIP_SECONDS:
+                    raise DataError(
+                        f"{path}: more than {MOST_CLIP_SECONDS // 60} minutes of sound: what comes "
+                        "later is not shown; name a shorter span with --start and --end"
+                    )
+                clips.append(Clip(start, rate, samples))
+
+    def microphones(self) -> dict[str, Microphone]:
+        """Return what was heard by those microphones that have something to show."""
+        return {
+            name: self._finished(name, heard)
+            for name, heard in sorted(self._heard.items())
+            if heard.features.means or heard.labels or heard.spans or heard.gaps or heard.clips
+        }
+
+    def lines(self) -> Lines:
+        """Return the events, in the order of time."""
+        if not self._lines:
+            return Lines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+        times = np.concatenate([lines.times for lines in self._lines])
+        levels = np.concatenate([lines.levels for lines in self._lines])
+        texts = np.concatenate([lines.texts for lines in self._lines])
+        order = np.argsort(times, kind="stable")
+        return Lines(times[order], levels[order], texts[order])
+
+    def _finished(self, name: str, heard: _Heard) -> Microphone:
+        labellings = [self._labelling(heard, each) for each in _ordered(heard)]
+        features = heard.features.series()
+        level = None
+        if features is not None and _ENERGY in features.names:
+            level = decibel(features.values[:, features.names.index(_ENERGY)])
+        return Microphone(
+            name=name,
+            labellings=labellings,
+            features=features,
+            level=level,
+            level_frames=heard.level_frames,
+            gaps=self._joined(heard.gaps),
+            troubles=_lasting(heard.troubles, self._grid.end),
+            clips=_chained(heard.clips),
+        )
+
+    def _labelling(self, heard: _Heard, name: str) -> Labelling:
+        growing = heard.labels.get(name)
+        parts = heard.spans.get(name, [])
+        if growing is not None:  # what is open at the end is no segment yet
+            parts = [
+                *parts,
+                *_runs(growing.frames, max((int(s.ends.max()) for s in parts), default=0)),
+            ]
+        spans = self._joined(parts)
+        return Labelling(
+            name,
+            spans,
+            None if growing is None else growing.series(),
+            heard.novelty[name].values[:, 0] if name in heard.novelty else None,
+            [] if growing is None else growing.frames,
+        )
+
+    def _joined(self, parts: Sequence[Spans]) -> Spans:
+        """Chain spans, in the order of time, cut off to the grid."""
+        if not parts:
+            return no_spans()
+        spans = Spans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        starts = np.maximum(spans.starts, self._grid.start)
+        ends = np.minimum(spans.ends, self._grid.end)
+        left = np.flatnonzero(starts < ends)
+        order = left[np.argsort(starts[left], kind="stable")]
+        return Spans(starts[order], ends[order], spans.texts[order])
+
+
+def _ordered(heard: _Heard) -> list[str]:
+    names = {*heard.labels, *heard.spans}
+    return sorted(names, key=lambda name: (name == REVIEW, name != LIVE, name))
+
+
+def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
+    """Return the names behind an array, by the channel."""
+    where = f"{path}: {columns.topic}"
+    try:
+        names: Any = json.loads(columns.metadata.get(f"{field_}_names", ""))
+    except ValueError:
+        names = None
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise LogError(f"{where}: the channel does not name its values")
+    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
+        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
+    if columns[field_].shape[1:] != (len(names),):
+        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
+    return tuple(names)
+
+
+def decibel(energy: Any) -> Any:
+    return 10 * np.log10(np.maximum(energy, _QUIETEST))
+
+
+def spans_of(columns: Columns, text: str) -> Spans:
+    starts = columns["header.stamp"]
+    return Spans(starts, starts + columns["duration"], columns[text])
+
+
+def _runs(parts: Sequence[Frames], after: int) -> Iterator[Spans]:
+    """Join successive frames whose most probable class is the same, from some time on."""
+    for names, all_times, all_values in parts:
+        later = all_times >= after
+        times, values = all_times[later], all_values[later]
+        if not len(times):
+            continue
+        best = values.argmax(axis=1)
+        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
+        first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
+        last = np.append(first[1:], len(times)) - 1
+        texts = np.array(names, object)[best[first]]
+        yield Spans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+
+
+def _lasting(troubles: Sequence[tuple[int, str]], end: int) -> Spans:
+    """Let a trouble last until the next message says that it is over, or that it is another."""
+    changes = [
+        (stamp, text)
+        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
+        if text != before
+    ]
+    stops = [*(stamp for stamp, _ in changes[1:]), end]
+    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
+    if not spans:
+        return no_spans()
+    starts, ends, texts = zip(*spans, strict=True)
+    return Spans(np.array(starts), np.array(ends), np.array(texts, object))
+
+
+def _chained(parts: Sequence[Clip]) -> list[Clip]:
+    """Join what follows each other."""
+    clips: list[list[Clip]] = []
+    for part in sorted(parts, key=lambda clip: clip.start):
+        last = clips[-1][-1] if clips else None
+        if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
+            clips[-1].append(part)
+        else:
+            clips.append([part])
+    return [
+        Clip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
+        for run in clips
+    ]

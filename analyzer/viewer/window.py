@@ -1,0 +1,97 @@
+"""The viewer in a window of its own."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from rerun.experimental import ViewerClient
+
+from analyzer.viewer.canvas import TIMELINE
+from analyzer.viewer.process import Process, check_display, free_port
+from analyzer.viewer.viewer import Blueprint, State, Viewer
+
+
+class WindowControl:
+    """Speaks with a viewer by Rerun's own client, over gRPC.
+
+    Parameters
+    ----------
+    process : Process
+    """
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self._client: ViewerClient | None = None
+
+    @property
+    def _connected(self) -> ViewerClient:
+        if self._client is None:
+            self._client = ViewerClient.connect(self.process.url)
+        return self._client
+
+    def state(self) -> State:
+        """Ask what it shows."""
+        found = self._connected.get_state()
+        errors = [
+            f"{view.name}: {report.summary}" for view in found.views for report in view.reports
+        ]
+        cursors = [
+            each.current_time
+            for each in found.recordings
+            if each.store_id == found.active_recording
+        ]
+        cursor = cursors[0] if cursors else None
+        return State(found.viewer_version or "", len(found.views), errors, cursor)
+
+    def blueprint(self) -> Blueprint:
+        """Ask for its blueprint."""
+        return self._connected.get_blueprint().blueprint
+
+    def set_blueprint(self, blueprint: Blueprint) -> None:
+        """Replace its blueprint."""
+        self._connected.set_blueprint(blueprint, of="recording")
+
+    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+        """Put its cursor on a time."""
+        self._connected.set_time(
+            TIMELINE,
+            timestamp=np.datetime64(nanoseconds, "ns"),
+            play_state="playing" if play else "paused",
+        )
+
+    def picture(self) -> bytes:
+        """Return what it shows, as PNG."""
+        return self._connected.take_screenshot()
+
+    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+        """Offer nothing: keys are those of the terminal."""
+
+    def say(self, text: str) -> None:
+        """Say nothing: lines are those of the terminal."""
+
+    def close(self) -> None:
+        """Close the window."""
+        self.process.close()
+
+
+def open_window(port: int | None = None, data: str | None = None) -> Viewer:
+    """Open Rerun's viewer in a window.
+
+    Parameters
+    ----------
+    port : int, optional
+    data : str, optional
+        URL of a server whose data it shows; by default it waits for what is sent to it.
+
+    Raises
+    ------
+    DataError
+        If there is no display, or the port is in use.
+    """
+    check_display(
+        "--save FILE.rrd to make a file that Rerun opens elsewhere"
+        if data is None
+        else "--serve to look from another machine"
+    )
+    source = ["--expect-data-soon"] if data is None else ["--connect", data]
+    process = Process(["--hide-welcome-screen", *source], free_port(port))
+    return Viewer(WindowControl(process))

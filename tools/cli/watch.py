@@ -1,0 +1,138 @@
+"""`hearthlog watch`: what is heard, live, from the log that a recorder is writing."""
+
+import signal
+import webbrowser
+from collections import deque
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tools.cli.selection import wrong_use
+
+if TYPE_CHECKING:
+    from analyzer.viewer.live import LiveServer
+    from analyzer.viewer.viewer import Viewer
+
+_LOOPBACK = "127.0.0.1"
+_POLL_SECONDS = 0.2
+_MOST_TROUBLES = 100  # that are remembered, so that none is said again and again
+
+
+def watch(
+    logs: Annotated[Path, typer.Argument(help="Folder that a recorder writes to.")] = Path("logs"),
+    *,
+    web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Open no viewer here: wait for those that connect.")
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="Where viewers connect, or, with --web, of the page."),
+    ] = None,
+    bind: Annotated[
+        str, typer.Option(help="With --serve: address of this machine to listen on.")
+    ] = _LOOPBACK,
+    minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 10,
+    timezone: Annotated[
+        str | None, typer.Option(help="Of the home, as Europe/Vienna.  [default: the logs say it]")
+    ] = None,
+) -> None:
+    """Show in Rerun what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.
+
+    The recorder takes no notice: only its logs are read. Exit status 3: some could not be read.
+    """
+    if web and serve:
+        wrong_use("--web opens a viewer here, --serve opens none: choose one")
+    if bind != _LOOPBACK and not serve:
+        wrong_use("--bind goes with --serve")
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+
+    from analyzer.timeline.live import last_time
+
+    newest = last_time(logs)
+    with ExitStack() as opened:
+        server = opened.enter_context(_server(port, bind, minutes, serve=serve, web=web))
+        if serve:
+            _say_where(server.url, bind)
+        else:
+            viewer = opened.enter_context(_open(server.url, port, web=web))
+            Thread(target=_wait_until_closed, args=(viewer, stop), daemon=True).start()
+        if newest is None:
+            typer.echo(f"hearthlog: no log in {logs} yet; waiting for a recorder", err=True)
+        start = 0 if newest is None else newest - minutes * 60_000_000_000
+        troubled = _follow(logs, start, timezone, server, stop)
+    if troubled:
+        raise typer.Exit(3)
+
+
+def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool) -> "LiveServer":
+    from analyzer.viewer.live import PORT, LiveServer
+    from analyzer.viewer.process import free_port
+
+    if serve:
+        port = port or PORT
+    elif web or port is None:
+        port = free_port()
+    return LiveServer(port, bind, minutes)
+
+
+def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
+    from analyzer.viewer.web import open_page
+    from analyzer.viewer.window import open_window
+
+    if not web:
+        return open_window(data=url)
+    viewer = open_page(port, url)
+    typer.echo(f"hearthlog: watching at {viewer.address}; Ctrl-C ends it", err=True)
+    webbrowser.open(viewer.address)
+    return viewer
+
+
+def _say_where(url: str, bind: str) -> None:
+    typer.echo(f"hearthlog: look with: rerun --bind {_LOOPBACK} --connect {url}", err=True)
+    if bind != _LOOPBACK:
+        typer.echo(
+            f"hearthlog: listening on {bind}: whoever reaches this port sees what is heard here; "
+            "without --bind, only those who log in to this machine do",
+            err=True,
+        )
+
+
+def _wait_until_closed(viewer: "Viewer", stop: Event) -> None:
+    while viewer.is_open() and not stop.wait(_POLL_SECONDS):
+        pass
+    stop.set()
+
+
+def _follow(
+    logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
+) -> bool:
+    """Draw what is written until it is enough; tell whether something could not be read."""
+    from analyzer.timeline.live import Live
+    from analyzer.timeline.reading import zone_of
+    from schemas.errors import LogError
+    from schemas.follow import follow_messages
+
+    told: deque[str] = deque(maxlen=_MOST_TROUBLES)
+
+    def tell(error: LogError) -> None:
+        if str(error) not in told:
+            told.append(str(error))
+            typer.echo(f"hearthlog: {error}", err=True)
+
+    live: Live | None = None
+    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell):
+        live = live or Live(zone_of([logs], timezone))
+        try:
+            for news in live.take(path, batch):
+                server.show(news)
+        except LogError as error:
+            tell(error)
+        if stop.is_set():
+            break
+    return bool(told)
