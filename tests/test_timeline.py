@@ -1,22 +1,37 @@
-"""What a Rerun recording of some logs shows."""
+"""What a timeline reads of logs, and what a Rerun recording of it holds."""
 
 import os
+import shutil
 import subprocess
 import sys
+from collections import Counter
+from datetime import UTC, datetime
+from itertools import pairwise
 from threading import Event as Flag
+from types import SimpleNamespace
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
 from blobs import blobs, ignore_progress
+from hypothesis import given
+from hypothesis import strategies as st
 from logs import features, read
 from lossy import LossySource
 from rerun.chunk import RrdReader
+from spliced import run, write_log
 from viewers import rerun_home, shown, viewer
 
+from analyzer.colours import GAP, colour
 from analyzer.errors import DataError
-from analyzer.timeline import save_timeline
-from analyzer.tracks import read_tracks
+from analyzer.marks import Mark, review_path, write_marks
+from analyzer.timeline import reading
+from analyzer.timeline.contents import Labelling, Series, Spans, no_spans
+from analyzer.timeline.grid import Grid, Means, time_shares
+from analyzer.timeline.lanes import BLOCKS, changes, clock, disagreements, from_afar
+from analyzer.timeline.reading import SHARES, read_timeline
 from analyzer.train import train_model
+from analyzer.viewer.file import save_timeline
 from models.modelfile import load_model, save_model
 from recorder.config import Settings
 from recorder.service import record
@@ -24,41 +39,598 @@ from recorder.sources.replayed import FileSource
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages
 from schemas.errors import LogError
-from schemas.files import find_logs
-from schemas.messages import nanoseconds
+from schemas.files import audio_path, find_logs
+from schemas.messages import header, message, nanoseconds
 from schemas.topics import Topic
 from schemas.writer import LogWriter, Rows
-from tools.cli.review import review
 
 __all__ = ["viewer"]  # a fixture
 
+SECOND = 1_000_000_000
+HOUR = 3600 * SECOND
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 400}
-CONTENTS = {
-    "/mic/label",
-    "/mic/label/probabilities",
-    "/mic/segment",
-    "/mic/gap",
-    "/mic/features/level",
-    "/mic/features/heat_map",
-}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, model_file, day):
-    """Logs of one recording with gaps."""
+    """Logs of one recording with gaps, and a mark that reaches from one log into the next."""
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=60)
     recording = record(settings, LossySource(FileSource([day], START), LOST), Flag())
     assert len(recording.logs) > 2
+    edge = int(features(recording.logs[1])[1][0])
+    write_marks(recording.logs[0], [Mark("mic", edge - SECOND, edge, "yelling", "Ann", 5, "live")])
+    write_marks(recording.logs[1], [Mark("mic", edge, edge + SECOND, "my_own", "Ann", 6, "live")])
     return folder
 
 
 @pytest.fixture(scope="module")
-def recording(folder, tmp_path_factory):
+def timeline(folder):
+    return read_timeline([folder])
+
+
+@pytest.fixture(scope="module")
+def recording(timeline, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "day.rrd"
-    save_timeline(find_logs(folder), path)
+    save_timeline(timeline, path)
     return path
+
+
+def stamps_of(found):
+    return np.array([nanoseconds(m.header.stamp) for m in found])
+
+
+def spans_of(folder, kind, text):
+    return [
+        (start := nanoseconds(m.header.stamp), start + nanoseconds(m.duration), getattr(m, text))
+        for m in read(folder, kind)
+        if not kind.endswith("review")
+    ]
+
+
+def as_list(spans):
+    return list(zip(spans.starts.tolist(), spans.ends.tolist(), spans.texts, strict=True))
+
+
+def slow_means(grid, times, values):
+    """Means share by share; NaN where there is nothing."""
+    parts = [values[(times >= a) & (times < b)] for a, b in pairwise(grid.edges.tolist())]
+    nothing = np.full(values.shape[1], np.nan)
+    return np.array([part.astype(float).mean(axis=0) if len(part) else nothing for part in parts])
+
+
+# What is read
+
+
+def test_the_timeline_begins_with_the_first_frame_and_ends_with_the_last(timeline, folder):
+    _, stamps, _ = features(folder)
+    assert timeline.grid.start == stamps[0]
+    assert 1 <= (timeline.grid.end - stamps[-1]) / FRAME_NANOSECONDS <= 2
+    assert 1000 < timeline.grid.count <= SHARES
+    assert timeline.losses == []
+    assert timeline.every == 1
+    assert list(timeline.microphones) == ["mic"]
+
+
+def test_features_and_level_are_means_of_what_is_logged_and_nothing_in_gaps(timeline, folder):
+    _, stamps, values = features(folder)
+    microphone = timeline.microphones["mic"]
+    expected = slow_means(timeline.grid, stamps, values)
+    assert microphone.features.names == tuple(read(folder, "info")[0].feature_names)
+    np.testing.assert_allclose(microphone.features.values, expected, rtol=1e-12)
+    level = 10 * np.log10(np.maximum(expected[:, 0], 1e-10))
+    np.testing.assert_allclose(microphone.level, level, rtol=1e-12)
+    (lost,) = [span for span in spans_of(folder, "gap", "reason") if span[1] - span[0] > SECOND]
+    edges = timeline.grid.edges
+    inside = (edges[:-1] > lost[0]) & (edges[1:] < lost[1])
+    assert inside.sum() > 100
+    assert np.isnan(microphone.level[inside]).all()
+    assert np.isnan(microphone.level).mean() < inside.mean() + 0.05
+
+
+def test_probabilities_and_novelty_are_means_of_what_is_logged(timeline, folder, model_file):
+    labels = read(folder, "label")
+    live = timeline.microphones["mic"].labellings[0]
+    assert live.name == "live"
+    assert live.probabilities.names == load_model(model_file).classes
+    values = np.array([m.probabilities for m in labels])
+    expected = slow_means(timeline.grid, stamps_of(labels), values)
+    np.testing.assert_allclose(live.probabilities.values, expected, rtol=1e-9)
+    novelty = np.array([[m.novelty] for m in labels])
+    expected = slow_means(timeline.grid, stamps_of(labels), novelty)
+    np.testing.assert_allclose(live.novelty, expected[:, 0], rtol=1e-6)
+
+
+def test_every_frame_is_there_for_zooming_in(timeline, folder):
+    labels = read(folder, "label")
+    microphone = timeline.microphones["mic"]
+    frames = microphone.labellings[0].frames
+    assert np.concatenate([part.times for part in frames]).tolist() == stamps_of(labels).tolist()
+    values = np.concatenate([part.values for part in frames])
+    np.testing.assert_array_equal(values, np.array([m.probabilities for m in labels], np.float32))
+    _, stamps, values = features(folder)
+    assert np.concatenate([p.times for p in microphone.level_frames]).tolist() == stamps.tolist()
+    levels = np.concatenate([part.values for part in microphone.level_frames])[:, 0]
+    np.testing.assert_allclose(levels, 10 * np.log10(np.maximum(values[:, 0], 1e-10)), rtol=1e-5)
+
+
+def test_segments_gaps_and_marks_are_the_spans_of_the_log(timeline, folder):
+    microphone = timeline.microphones["mic"]
+    live, review = microphone.labellings
+    own = [log for log in find_logs(folder) if ".review." not in log.name]
+    segments = [span for log in own for span in spans_of(log, "segment", "label")]
+    assert as_list(live.spans) == sorted(segments)
+    gaps = [span for log in own for span in spans_of(log, "gap", "reason")]
+    assert as_list(microphone.gaps) == gaps
+    assert len(gaps) == 2
+    edge = timeline.heard.starts[1]
+    assert as_list(review.spans) == [
+        (edge - SECOND, edge, "yelling"),
+        (edge, edge + SECOND, "my_own"),
+    ]
+
+
+def test_what_the_recorder_said_in_words_is_there(timeline, folder):
+    lines = read(folder, "rosout")
+    assert len(lines) > 2
+    assert timeline.lines.texts.tolist() == [line.msg for line in lines]
+    assert timeline.lines.levels.tolist() == [line.level for line in lines]
+    assert timeline.lines.times.tolist() == [nanoseconds(line.stamp) for line in lines]
+
+
+def test_what_is_open_when_a_log_is_cut_off_is_labelled_by_its_frames(tmp_path, model_file, day):
+    cut = []
+
+    def copy_active():
+        (active,) = (tmp_path / "logs").rglob("*.active")
+        cut.append(shutil.copy(active, tmp_path / "cut.mcap.active"))
+
+    settings = Settings(output=tmp_path / "logs", model=model_file)
+    record(settings, LossySource(FileSource([day], START), {}, copy_active), Flag())
+    live = read_timeline(cut).microphones["mic"].labellings[0]
+    written = [nanoseconds(m.header.stamp) + nanoseconds(m.duration) for m in read(cut[0], "segment")]
+    labels = [m for m in read(cut[0], "label") if nanoseconds(m.header.stamp) >= max(written)]
+    assert labels
+    assert live.spans.ends[-1] == nanoseconds(labels[-1].header.stamp) + FRAME_NANOSECONDS
+    classes = live.probabilities.names
+    for m in labels:
+        stamp = nanoseconds(m.header.stamp)
+        (text,) = [t for a, b, t in as_list(live.spans) if a <= stamp < b]
+        assert text == classes[int(np.argmax(m.probabilities))]
+
+
+def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
+    start, end = START + 41_234_567_891, START + 95_000_000_003
+    part = read_timeline([folder], start, end)
+    assert (part.grid.start, part.grid.end) == (start, end)
+    whole, cut = (t.microphones["mic"].labellings[0].spans for t in (timeline, part))
+    expected = [(max(a, start), min(b, end), t) for a, b, t in as_list(whole) if a < end and b > start]
+    assert as_list(cut) == expected
+    stamps = stamps_of(read(folder, "label"))
+    frames = part.microphones["mic"].labellings[0].frames
+    found = np.concatenate([each.times for each in frames])
+    assert found.tolist() == stamps[(stamps >= start) & (stamps < end)].tolist()
+    lines = timeline.lines
+    inside = (lines.times >= start) & (lines.times < end)
+    assert part.lines.texts.tolist() == lines.texts[inside].tolist()
+
+
+def test_a_span_in_which_there_is_nothing_is_one_line(folder):
+    with pytest.raises(DataError, match="in this span of time; `hearthlog info` shows what"):
+        read_timeline([folder], START + HOUR, START + 2 * HOUR)
+
+
+def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder, timeline):
+    back = read_timeline(find_logs(folder)[::-1])
+    assert (back.grid, back.heard) == (timeline.grid, timeline.heard)
+    one, other = back.microphones["mic"], timeline.microphones["mic"]
+    np.testing.assert_array_equal(one.features.values, other.features.values)
+    for a, b in zip(one.labellings, other.labellings, strict=True):
+        assert (a.name, as_list(a.spans)) == (b.name, as_list(b.spans))
+
+
+def test_a_log_named_by_itself_comes_with_its_layers_and_no_others(folder):
+    first, second, *_ = [log for log in find_logs(folder) if ".review." not in log.name]
+    texts = [read_timeline([log]).microphones["mic"].labellings[-1].spans.texts for log in (first, second)]
+    assert [list(each) for each in texts] == [["yelling"], ["my_own"]]
+
+
+def test_a_log_without_a_model_shows_its_features(tmp_path, day):
+    logs = record(Settings(output=tmp_path), FileSource([day], START), Flag()).logs
+    microphone = read_timeline(logs).microphones["mic"]
+    assert microphone.labellings == []
+    assert np.isfinite(microphone.level).all()
+
+
+def test_a_log_without_features_shows_its_labels(tmp_path):
+    path = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 1000)
+    found = read_timeline([path]).microphones["mic"]
+    assert (found.features, found.level) == (None, None)
+    assert as_list(found.labellings[0].spans) == [(START, START + 1000 * FRAME_NANOSECONDS, "speech")]
+
+
+def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
+    tmp_path, folder, timeline, day, model_file
+):
+    data, scenario = blobs(3, 12)
+    save_model(train_model(data, scenario, ignore_progress), tmp_path / "other.safetensors")
+    settings = Settings(output=tmp_path / "logs", model=tmp_path / "other.safetensors")
+    later = record(settings, FileSource([day], START + HOUR), Flag()).logs
+    both = read_timeline([*later, folder]).microphones["mic"].labellings[0]
+    classes = (*load_model(model_file).classes, *scenario.classes)
+    assert both.probabilities.names == classes
+    values = both.probabilities.values
+    early = np.flatnonzero(~np.isnan(values[:, 0]))
+    late = np.flatnonzero(~np.isnan(values[:, -1]))
+    assert early.max() < late.min()
+    assert np.isnan(values[early][:, -3:]).all()
+    assert np.isnan(values[late][:, :-3]).all()
+    expected = [span for log in (folder, *later) for span in spans_of(log, "segment", "label")]
+    found = as_list(both.spans)
+    own = as_list(timeline.microphones["mic"].labellings[0].spans)
+    assert found[: len(own)] == own
+    assert Counter(found) >= Counter(span for span in expected if span[2] in scenario.classes)
+
+
+def test_layers_are_labellings_of_their_own(tmp_path, folder, hearthlog, model_file):
+    logs = shutil.copytree(folder, tmp_path / "logs")
+    done = hearthlog("relabel", logs, "--model", model_file, "--name", "again")
+    if done.returncode:
+        pytest.skip(done.stderr)
+    found = read_timeline([logs]).microphones["mic"].labellings
+    assert [one.name for one in found] == ["live", "relabel/again", "review"]
+
+
+def labels_log(path, names, count, width=2, **about):
+    """A log of labels, 50 ms apart, whose first class is the most probable."""
+    times = START + np.arange(count) * FRAME_NANOSECONDS
+    probabilities = np.tile(np.linspace(0.9, 0.1, width, dtype=np.float32), (count, 1))
+    fields = {
+        "header.stamp": times,
+        "header.frame_id": "mic",
+        "frame": np.arange(count, dtype=np.uint64),
+        "label": ["speech"] * count,
+        "confidence": np.ones(count, np.float32),
+        "novelty": np.full(count, np.nan, np.float32),
+        "probabilities": probabilities,
+    }
+    topic = Topic("/mic/label", messages.LABEL, array_names=names)
+    writer = LogWriter(path, [topic], about)
+    writer.write_columns([Rows("/mic/label", times, fields)])
+    return writer.finish()
+
+
+def test_a_model_without_novelty_has_none(tmp_path):
+    path = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 10)
+    assert read_timeline([path]).microphones["mic"].labellings[0].novelty is None
+
+
+@pytest.mark.parametrize(
+    ("names", "width", "text"),
+    [
+        ({}, 2, "the channel does not name its values"),
+        ({"probabilities": ["speech", "crying"]}, 3, "a value for each of 2 names"),
+        ({"probabilities": ["speech", "speech"]}, 2, "not all different"),
+        ({"probabilities": [f"class_{i}" for i in range(257)]}, 257, "257 names, more than 256"),
+    ],
+)
+def test_labels_that_contradict_their_names_are_a_loss_of_one_line(tmp_path, names, width, text):
+    path = labels_log(tmp_path / "a.mcap", names, 20, width)
+    with pytest.raises(DataError, match=text) as caught:
+        read_timeline([path])
+    assert f"{path}: /mic/label: " in str(caught.value)
+
+
+def test_names_of_classes_that_are_markup_or_paths_are_only_names(tmp_path):
+    hostile = ["../../etc/passwd", "<script>alert(1)</script>\n\x1b[31m", "$origin/**"]
+    path = labels_log(tmp_path / "a.mcap", {"probabilities": hostile}, 2000, 3)
+    timeline = read_timeline([path])
+    save_timeline(timeline, tmp_path / "a.rrd")
+    assert lane(tmp_path / "a.rrd", "/exact/mic/1_live")[0] == (START, hostile[0])
+    assert set(entities(tmp_path / "a.rrd")) >= {"/mic/live/shares/0", "/lanes/mic/1_live"}
+
+
+def test_a_damaged_log_is_a_loss_and_the_others_are_shown(tmp_path, folder):
+    logs = shutil.copytree(folder, tmp_path / "logs")
+    own = [log for log in find_logs(logs) if ".review." not in log.name]
+    content = bytearray(own[1].read_bytes())
+    content[len(content) // 3 : len(content) // 3 + 4000] = bytes(4000)
+    own[1].write_bytes(content)
+    (logs / "empty.mcap").write_bytes(b"not a log")
+    timeline = read_timeline([logs])
+    assert len(timeline.losses) == 2
+    assert any(str(own[1]) in loss for loss in timeline.losses)
+    assert any("empty.mcap: is no MCAP file" in loss for loss in timeline.losses)
+    _, stamps, _ = features(own[2])
+    heard = ~np.isnan(timeline.microphones["mic"].level)
+    assert heard[timeline.grid.find(stamps)].all()
+
+
+def test_a_damaged_review_layer_is_a_loss_and_its_log_is_shown(tmp_path, folder, timeline):
+    logs = shutil.copytree(folder, tmp_path / "logs")
+    layer = next(log for log in find_logs(logs) if ".review." in log.name)
+    layer.write_bytes(layer.read_bytes()[:300])
+    found = read_timeline([logs])
+    assert len(found.losses) == 1
+    assert str(layer) in found.losses[0]
+    np.testing.assert_array_equal(found.microphones["mic"].level, timeline.microphones["mic"].level)
+
+
+def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, monkeypatch):
+    size = sum(log.stat().st_size for log in find_logs(folder))
+    monkeypatch.setattr(reading, "_WHOLE_BYTES", size // 3)
+    sample = read_timeline([folder])
+    assert sample.every > 1
+    one, other = sample.microphones["mic"], timeline.microphones["mic"]
+    assert one.level_frames == []
+    assert not one.labellings[0].frames
+    read_ = ~np.isnan(one.level)
+    assert 0.1 < read_.mean() < 0.9
+    far = np.abs(one.level[read_] - other.level[read_])
+    assert np.median(far) < 1e-9
+
+
+def health(stamp, *levels):
+    status = [
+        message(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name="hearthlog: mic",
+            message=f"level {level}",
+            hardware_id="mic",
+            values=[],
+        )
+        for level in levels
+    ]
+    return stamp, message(messages.DIAGNOSTICS, header=header(stamp, "mic"), status=status)
+
+
+def test_a_trouble_lasts_until_it_is_over_or_another_one_begins(tmp_path):
+    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 2000)
+    said = [(0, ()), (1, (1,)), (11, (1,)), (21, (2, 0, 1)), (31, (0,)), (41, (1,))]
+    rows = [health(START + second * SECOND, *levels) for second, levels in said]
+    write_log(tmp_path / "b.mcap", {"/diagnostics": rows})
+    timeline = read_timeline([labels, tmp_path / "b.mcap"])
+    assert as_list(timeline.microphones["mic"].troubles) == [
+        (START + 1 * SECOND, START + 21 * SECOND, "level 1"),
+        (START + 21 * SECOND, START + 31 * SECOND, "level 2; level 1"),
+        (START + 41 * SECOND, timeline.grid.end, "level 1"),
+    ]
+
+
+def sound(start, samples, rate=16_000):
+    data = (np.asarray(samples) * 32768).astype("<i2").tobytes()
+    return start, message(
+        "foxglove_msgs/msg/RawAudio",
+        timestamp=header(start, "").stamp,
+        data=np.frombuffer(data, np.uint8),
+        format="pcm-s16",
+        sample_rate=rate,
+        number_of_channels=1,
+    )
+
+
+def test_kept_sound_is_chained_to_clips_that_are_heard_where_they_were(tmp_path):
+    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 400)
+    rng = np.random.default_rng(1)
+    samples = rng.integers(-9000, 9000, 32_000) / 32768
+    times = [START + k * SECOND for k in (2, 3, 9)]
+    parts = samples[:16_000], samples[16_000:24_000], samples[24_000:]
+    rows = [sound(time, part) for time, part in zip(times, parts, strict=True)]
+    write_log(audio_path(labels), {"/mic/audio": rows})
+    one, two = read_timeline([labels]).microphones["mic"].clips
+    assert (one.start, one.end) == (times[0], times[1] + SECOND // 2)
+    assert (two.start, two.rate) == (times[2], 16_000)
+    np.testing.assert_array_equal(one.samples, samples[:24_000].astype(np.float32))
+    np.testing.assert_array_equal(two.samples, samples[24_000:].astype(np.float32))
+
+
+def test_of_more_sound_than_can_be_shown_the_first_is_shown_and_the_rest_a_loss(
+    tmp_path, monkeypatch
+):
+    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 2000)
+    write_log(
+        audio_path(labels),
+        {"/mic/audio": [sound(START + k * 10 * SECOND, np.zeros(16_000)) for k in range(5)]},
+    )
+    monkeypatch.setattr(reading, "MOST_CLIP_SECONDS", 3)
+    timeline = read_timeline([labels])
+    assert len(timeline.microphones["mic"].clips) == 3
+    assert "is not shown; name a shorter span" in timeline.losses[0]
+
+
+def test_the_time_zone_is_that_of_the_logs_unless_another_one_is_said(tmp_path):
+    path = labels_log(
+        tmp_path / "a.mcap", {"probabilities": ["speech", "no"]}, 10, timezone="Asia/Kolkata"
+    )
+    assert read_timeline([path]).zone == "Asia/Kolkata"
+    assert read_timeline([path], zone="Europe/Vienna").zone == "Europe/Vienna"
+    with pytest.raises(DataError, match="'Nowhere' is no time zone"):
+        read_timeline([path], zone="Nowhere")
+
+
+# Shares of a grid, against what a loop would do
+
+
+@st.composite
+def grids(draw):
+    start = draw(st.integers(0, 2**61))
+    count = draw(st.integers(1, 50))
+    return Grid(start, start + draw(st.integers(count, 40 * 86_400 * SECOND)), count)
+
+
+@given(grids(), st.data())
+def test_a_time_lies_in_the_share_whose_edges_are_around_it(grid, data):
+    times = np.array(data.draw(st.lists(st.integers(grid.start, grid.end - 1), min_size=1)))
+    found = grid.find(times)
+    edges = grid.edges
+    assert (edges[0], edges[-1]) == (grid.start, grid.end)
+    assert (np.diff(edges) > 0).all()
+    slack = 2 + (grid.end - grid.start) // 2**51  # ns, of arithmetic in floating point
+    assert (times >= edges[found] - slack).all()
+    assert (times <= edges[found + 1] + slack).all()
+
+
+@given(grids(), st.data())
+def test_means_are_those_of_the_rows_in_each_share_however_they_come(grid, data):
+    times = np.sort(np.array(data.draw(st.lists(st.integers(grid.start, grid.end - 1), min_size=1))))
+    finite = st.floats(-1e6, 1e6, width=32)
+    rows = data.draw(st.lists(finite, min_size=2 * len(times), max_size=2 * len(times)))
+    values = np.array(rows, np.float32).reshape(-1, 2)
+    cut = data.draw(st.integers(0, len(times)))
+    means = Means(grid, 2)
+    for part in (slice(0, cut), slice(cut, None)):
+        if len(times[part]):
+            means.add(times[part], values[part])
+    share = grid.find(times)
+    for i in range(grid.count):
+        own = values[share == i].astype(float)
+        expected = own.mean(axis=0) if len(own) else [np.nan, np.nan]
+        np.testing.assert_allclose(means.values[i], expected, rtol=1e-9, atol=1e-6)
+
+
+@st.composite
+def labelled(draw, grid, names="abc"):
+    """Spans in the order of time that do not overlap, some beyond the grid."""
+    margin = (grid.end - grid.start) // 5 + 1
+    edge = st.integers(max(grid.start - margin, 0), grid.end + margin)
+    edges = sorted(draw(st.sets(edge, max_size=16)))
+    pairs = [pair for pair in pairwise(edges) if draw(st.booleans())]
+    texts = [draw(st.sampled_from(names)) for _ in pairs]
+    columns = (np.array([pair[i] for pair in pairs], np.int64) for i in (0, 1))
+    return Spans(*columns, np.array(texts, object))
+
+
+@given(grids(), st.data())
+def test_shares_of_time_are_those_that_a_loop_adds_up(grid, data):
+    spans = data.draw(labelled(grid))
+    labels = np.array(["abc".index(text) for text in spans.texts], np.intp)
+    found = time_shares(spans.starts, spans.ends, labels, 3, grid)
+    expected = np.zeros((grid.count, 3))
+    for i, (first, last) in enumerate(pairwise(grid.edges.tolist())):
+        for start, end, text in as_list(spans):
+            inside = max(min(end, last) - max(start, first), 0)
+            expected[i, "abc".index(text)] += inside / (last - first)
+    slack = 1e-9 + 600 * (grid.end + 1) / 2**53 / np.diff(grid.edges).min()
+    np.testing.assert_allclose(found, expected, atol=slack)
+
+
+# Lanes
+
+
+@given(grids(), st.data())
+def test_a_lane_is_at_every_time_what_the_spans_say(grid, data):
+    spans = data.draw(labelled(grid))
+    lane_ = changes(spans)
+    assert (np.diff(lane_.times) > 0).all()
+    probes = {*spans.starts.tolist(), *spans.ends.tolist(), grid.start, *(spans.ends - 1).tolist()}
+    for time in probes:
+        said = [text for a, b, text in as_list(spans) if a <= time < b]
+        place = int(np.searchsorted(lane_.times, time, side="right")) - 1
+        assert (lane_.states[place] if place >= 0 else None) == (said[0] if said else None)
+
+
+@given(grids(), st.data())
+def test_labellings_differ_where_both_say_something_else(grid, data):
+    one, other = data.draw(labelled(grid)), data.draw(labelled(grid))
+    found = as_list(disagreements(one, other))
+    edges = sorted({t for spans in (one, other) for t in (*spans.starts.tolist(), *spans.ends.tolist())})
+    for time in edges:
+        said = [[t for a, b, t in as_list(spans) if a <= time < b] for spans in (one, other)]
+        expected = [f"{a} / {b}" for a, b in zip(*said, strict=False) if a != b]
+        assert [text for a, b, text in found if a <= time < b] == expected
+    assert all(a < b for a, b, _ in found)
+    assert all(a[1] <= b[0] for a, b in pairwise(found))
+
+
+def test_from_afar_a_block_says_what_was_heard_the_most_and_silence_counts_a_quarter():
+    grid = Grid(START, START + BLOCKS * 100 * SECOND, SHARES)
+    rng = np.random.default_rng(2)
+    edges = np.sort(rng.choice(np.arange(1, BLOCKS * 100), 3000, replace=False))
+    starts, ends = START + edges[:-1] * SECOND, START + edges[1:] * SECOND
+    texts = rng.choice(["silence", "silence", "silence", "speech", "crying"], len(starts))
+    heard = rng.random(len(starts)) < 0.8
+    spans = Spans(starts[heard], ends[heard], texts[heard].astype(object))
+    found = from_afar(Labelling("live", spans), grid)
+    assert all(a[1] < b[0] or a[2] != b[2] for a, b in pairwise(as_list(found)))
+    block = (grid.end - grid.start) // BLOCKS
+    for i in range(BLOCKS):
+        first, last = grid.start + i * block, grid.start + (i + 1) * block
+        weights = Counter()
+        for a, b, text in as_list(spans):
+            if a < last and b > first:
+                inside = min(b, last) - max(a, first)
+                weights[text] += inside * (0.25 if text == "silence" else 1.0)
+        middle = (first + last) // 2
+        said = [text for a, b, text in as_list(found) if a <= middle < b]
+        best = weights.most_common(2)
+        if len(best) == 2 and best[0][1] - best[1][1] < SECOND // 100:
+            assert said[0] in weights
+        else:
+            assert said == [text for text, _ in best[:1]]
+
+
+def test_from_afar_a_labelling_without_spans_is_what_was_most_probable():
+    grid = Grid(START, START + SHARES * SECOND, SHARES)
+    values = np.full((SHARES, 2), np.nan)
+    values[:600] = [0.2, 0.8]
+    values[1200:] = [0.9, 0.1]
+    found = from_afar(Labelling("m", no_spans(), Series(("a", "b"), values)), grid)
+    assert found.texts.tolist() == ["b", "a"]
+    near = 2 * SHARES // BLOCKS * SECOND
+    expected = [START, START + 600 * SECOND, START + 1200 * SECOND, grid.end]
+    np.testing.assert_allclose(
+        [found.starts[0], found.ends[0], found.starts[1], found.ends[1]], expected, atol=near, rtol=0
+    )
+
+
+def at(*moment, zone):
+    return int(datetime(*moment, tzinfo=ZoneInfo(zone)).timestamp()) * SECOND
+
+
+@pytest.mark.parametrize(
+    ("zone", "day", "hours"),
+    [
+        ("UTC", (2026, 3, 1), 24),
+        ("Europe/Vienna", (2026, 3, 29), 23),
+        ("Europe/Vienna", (2026, 10, 25), 25),
+        ("Asia/Kolkata", (2026, 3, 29), 24),
+        ("Australia/Lord_Howe", (2026, 4, 5), 24.5),
+        ("Australia/Lord_Howe", (2026, 10, 4), 23.5),
+    ],
+)
+def test_the_clock_shows_full_hours_of_the_home_on_days_of_any_length(zone, day, hours):
+    start = at(*day, zone=zone)
+    grid = Grid(start, start + round(hours * HOUR), SHARES)
+    found = clock(grid, ZoneInfo(zone))
+    assert (found.starts[0], found.ends[-1]) == (grid.start, grid.end)
+    np.testing.assert_array_equal(found.ends[:-1], found.starts[1:])
+    assert (np.diff(found.starts) > 0).all()
+    wall = [datetime.fromtimestamp(t // SECOND, UTC).astimezone(ZoneInfo(zone)) for t in found.starts]
+    assert [f"{moment:%H:%M}" for moment in wall] == list(found.texts)
+    assert all(moment.minute in {0, 30} for moment in wall)
+    assert set(found.ends - found.starts) <= {HOUR // 2, HOUR, HOUR * 3 // 2, 2 * HOUR}
+    assert found.texts[0] == "00:00"
+    assert found.texts[-1] == "23:00"
+    assert len(found) >= 23
+
+
+@given(st.integers(0, 2**60), st.integers(1, 40 * 86_400 * SECOND))
+def test_the_clock_has_few_blocks_and_covers_all(start, length):
+    grid = Grid(start, start + length, SHARES)
+    found = clock(grid, ZoneInfo("Europe/Vienna"))
+    assert len(found) <= 42
+    assert (found.starts[0], found.ends[-1]) == (grid.start, grid.end)
+    assert (found.ends > found.starts).all()
+
+
+# What is in the recording
+
+
+def entities(path):
+    found = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    return {name for name in found if not name.startswith("/__")}
 
 
 def column(path, entity, name):
@@ -84,254 +656,171 @@ def fixed(path, entity, name):
 def lane(path, entity):
     """States as (time, text), None where nothing is."""
     times, cells = column(path, entity, "StateChange:state")
-    return [(int(time), cell[0]) for time, cell in zip(times, cells, strict=True)]
+    return [
+        (int(time), cell[0] if cell else None) for time, cell in zip(times, cells, strict=True)
+    ]
 
 
 def test_everything_is_in_the_recording_and_nothing_else(recording):
-    found = {str(chunk.entity_path) for chunk in RrdReader(recording).stream()}
-    assert {name for name in found if not name.startswith("/__")} == CONTENTS
+    lanes = ["0_Etc-UTC", "mic/1_live", "mic/8_review", "mic/9_not_heard"]
+    expected = {f"/{root}/{name}" for root in ("lanes", "exact") for name in lanes}
+    expected |= {f"/mic/live/shares/{layer}" for layer in range(4)}
+    expected |= {"/mic/live/novelty", "/mic/level", "/mic/features", "/events"}
+    expected |= {"/mic/frames/live", "/mic/frames/level"}
+    assert entities(recording) == expected
 
 
-def test_the_probabilities_are_those_of_the_log_and_nothing_stands_in_a_gap(
-    recording, folder, model_file
-):
+@pytest.mark.parametrize("root", ["lanes", "exact"])
+def test_lanes_are_what_the_timeline_says_in_the_colours_of_the_classes(recording, timeline, root):
+    live, review = timeline.microphones["mic"].labellings
+    spans = live.spans if root == "exact" else from_afar(live, timeline.grid)
+    expected = changes(spans)
+    found = lane(recording, f"/{root}/mic/1_live")
+    assert found == list(zip(expected.times.tolist(), expected.states, strict=True))
+    marks = changes(review.spans)
+    found = lane(recording, f"/{root}/mic/8_review")
+    assert found == list(zip(marks.times.tolist(), marks.states, strict=True))
+    names = fixed(recording, f"/{root}/mic/1_live", "StateConfiguration:values")
+    colours = fixed(recording, f"/{root}/mic/1_live", "StateConfiguration:colors")
+    assert set(names) >= {*live.spans.texts, *review.spans.texts}
+    assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [colour(n) for n in names]
+    gap = fixed(recording, f"/{root}/mic/9_not_heard", "StateConfiguration:colors")
+    assert {(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in gap} == {GAP}
+
+
+def test_bands_are_the_probabilities_one_on_the_other(recording, timeline):
+    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    for layer in range(4):
+        _, middles = column(recording, f"/mic/live/shares/{layer}", "Measurements:values")
+        _, variances = column(recording, f"/mic/live/shares/{layer}", "Measurements:variances")
+        half = np.sqrt(np.array(variances, float))
+        np.testing.assert_allclose(np.array(middles, float) + half, np.cumsum(values, 1), atol=1e-6)
+        np.testing.assert_allclose(2 * half, values, atol=1e-6)
+        colours = fixed(recording, f"/mic/live/shares/{layer}", "Measurements:colors")
+        assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [colour(n) for n in names]
+    assert fixed(recording, "/mic/live/shares/0", "Measurements:names") == list(names)
+
+
+def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, folder, model_file):
     labels = read(folder, "label")
-    times, cells = column(recording, "/mic/label/probabilities", "Scalars:scalars")
+    times, cells = column(recording, "/mic/frames/live", "Scalars:scalars")
     values = np.array(cells)
-    gap = np.isnan(values).any(axis=1)
-    stamps = [nanoseconds(m.header.stamp) for m in labels]
-    np.testing.assert_array_equal(times[~gap], stamps)
-    np.testing.assert_array_equal(values[~gap], [m.probabilities for m in labels])
-    starts = [nanoseconds(m.header.stamp) for m in read(folder, "gap")]
-    assert times[gap].tolist() == starts
-    names = fixed(recording, "/mic/label/probabilities", "SeriesLines:names")
+    hole = np.isnan(values).any(axis=1)
+    np.testing.assert_array_equal(times[~hole], stamps_of(labels))
+    np.testing.assert_array_equal(values[~hole], [m.probabilities for m in labels])
+    after_gaps = stamps_of(labels)[1:][np.diff(stamps_of(labels)) > 2 * FRAME_NANOSECONDS]
+    assert len(after_gaps) == 2
+    for start in after_gaps:
+        assert hole[np.searchsorted(times, start) - 1]
+    names = fixed(recording, "/mic/frames/live", "SeriesLines:names")
     assert names == list(load_model(model_file).classes)
 
 
-def test_the_lane_of_labels_has_the_label_of_every_frame_and_is_empty_in_gaps(recording, folder):
-    changes = lane(recording, "/mic/label")
-    times = np.array([time for time, _ in changes])
-    labels = read(folder, "label")
-    stamps = np.array([nanoseconds(m.header.stamp) for m in labels])
-    for part in (0, FRAME_NANOSECONDS - 1):
-        places = np.searchsorted(times, stamps + part, side="right") - 1
-        assert [changes[i][1] for i in places] == [m.label for m in labels]
-    empty = [i for i, (_, text) in enumerate(changes) if text is None]
-    assert [changes[i][0] for i in empty] == [
-        *(nanoseconds(m.header.stamp) for m in read(folder, "gap")),
-        stamps[-1] + FRAME_NANOSECONDS,
-    ]
-    assert len(changes) < len(labels) / 5
-
-
-@pytest.mark.parametrize(("kind", "text"), [("segment", "label"), ("gap", "reason")])
-def test_the_lanes_of_segments_and_gaps_begin_and_end_with_them(recording, folder, kind, text):
-    spans = [
-        (start := nanoseconds(m.header.stamp), start + nanoseconds(m.duration), getattr(m, text))
-        for m in read(folder, kind)
-    ]
-    expected = [(start, name) for start, _, name in spans]
-    starts = {start for start, _, _ in spans}
-    expected += [(end, None) for _, end, _ in spans if end not in starts]
-    assert lane(recording, f"/mic/{kind}") == sorted(expected, key=lambda change: change[0])
-
-
-def test_the_level_is_the_energy_in_decibel(recording, folder):
-    _, stamps, values = features(folder)
-    times, cells = column(recording, "/mic/features/level", "Scalars:scalars")
-    levels = np.array(cells)[:, 0]
-    heard = ~np.isnan(levels)
-    np.testing.assert_array_equal(times[heard], stamps)
-    expected = 10 * np.log10(np.maximum(values[:, 0], 1e-10))
-    np.testing.assert_allclose(levels[heard], expected, atol=1e-4)
-    assert (~heard).sum() == len(LOST)
-
-
-def test_the_heat_map_is_brighter_where_a_feature_is_higher(recording, folder):
-    _, stamps, values = features(folder)
-    times, cells = column(recording, "/mic/features/heat_map", "SeriesPoints:colors")
-    assert 1500 < len(times) < 2100
+def test_the_heat_map_is_brighter_where_a_feature_is_higher(recording, timeline):
+    names, values = timeline.microphones["mic"].features
+    times, cells = column(recording, "/mic/features", "SeriesPoints:colors")
+    heard = ~np.isnan(values[:, 0])
+    assert len(times) == heard.sum()
     colours = np.array(cells, np.uint32)
     light = sum((colours >> shift & 255).astype(int) for shift in (8, 16, 24))
-    edges = np.searchsorted(stamps, times)
-    assert np.array_equal(stamps[edges], times)
-    sizes = np.diff(edges, append=len(stamps))
-    means = np.add.reduceat(values.astype(float), edges) / sizes[:, np.newaxis]
     for feature in (1, 3, 8, 12):
-        order = np.argsort(means[:, feature], kind="stable")
+        order = np.argsort(values[heard, feature], kind="stable")
         assert (np.diff(light[order, feature]) >= -2).all()
         assert np.ptp(light[:, feature]) > 600
-    names = fixed(recording, "/mic/features/heat_map", "SeriesPoints:names")
-    assert names == read(folder, "info")[0].feature_names
+    assert fixed(recording, "/mic/features", "SeriesPoints:names") == list(names)
 
 
-def test_the_layout_shows_every_entity_and_begins_with_the_whole_time(recording, folder):
+def test_the_layout_shows_every_entity_and_begins_with_the_whole_time(recording, timeline):
     (layout,) = RrdReader(recording).blueprints()
-    tables = [
+    rows = [
         (str(chunk.entity_path), chunk.to_record_batch().to_pylist()[0])
         for chunk in RrdReader(recording).stream(store=layout)
     ]
-    origins = [
-        row["ViewBlueprint:space_origin"]
-        for _, row in tables
-        if "ViewBlueprint:space_origin" in row
-    ]
-    queries = [row["ViewContents:query"] for _, row in tables if "ViewContents:query" in row]
-    shown = {name for (name,) in origins} | {line for query in queries for line in query}
-    assert shown >= CONTENTS
-    ((shared,),) = [
-        row["TimeAxis:view_range"] for _, row in tables if row.get("TimeAxis:view_range")
-    ]
-    _, stamps, _ = features(folder)
-    assert str(START) in str(shared)
-    assert str(stamps[-1] + FRAME_NANOSECONDS) in str(shared)
+    origins = [r["ViewBlueprint:space_origin"][0] for _, r in rows if "ViewBlueprint:space_origin" in r]
+    queries = [q for _, r in rows for q in r.get("ViewContents:query") or [] if q != "$origin/**"]
+    shown_ = {*origins, *queries} - {"/"}
+    for entity in entities(recording):
+        assert any(entity.lstrip("/").startswith(each.lstrip("/")) for each in shown_), entity
+    ((path, row),) = [(p, r) for p, r in rows if r.get("TimeAxis:view_range")]
+    assert path == "/view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
+    assert str(timeline.grid.start) in str(row["TimeAxis:view_range"])
+    assert str(timeline.grid.end) in str(row["TimeAxis:view_range"])
+    links = [r["TimeAxis:link"] for _, r in rows if r.get("TimeAxis:link")]
+    assert len(links) >= 5
+    assert len({str(link) for link in links}) == 1
 
 
-def test_a_log_without_a_model_shows_its_features(tmp_path, day):
-    settings = Settings(output=tmp_path / "logs")
-    logs = record(settings, FileSource([day], START), Flag()).logs
-    save_timeline(logs, tmp_path / "a.rrd")
-    found = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "a.rrd").stream()}
-    shown = {name for name in found if not name.startswith("/__")}
-    assert shown == {"/mic/features/level", "/mic/features/heat_map"}
+# Saving it
 
 
-def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
-    tmp_path, folder, day, model_file
-):
-    data, scenario = blobs(3, 12)
-    save_model(train_model(data, scenario, ignore_progress), tmp_path / "other.safetensors")
-    settings = Settings(output=tmp_path / "logs", model=tmp_path / "other.safetensors")
-    later = record(settings, FileSource([day], START + 3600 * 10**9), Flag()).logs
-    earlier = read_tracks(find_logs(folder)).rows[messages.LABEL]["/mic/label"]
-    both = read_tracks([*later, *find_logs(folder)]).rows[messages.LABEL]["/mic/label"]
-    count = len(earlier.times)
-    assert (np.diff(both.times) > 0).all()
-    assert both.names == (*scenario.classes, *load_model(model_file).classes)
-    np.testing.assert_array_equal(both.values[:count, 3:], earlier.values)
-    assert np.isnan(both.values[:count, :3]).all()
-    assert np.isnan(both.values[count:, 3:]).all()
-    expected = [m.label for path in (folder, *later) for m in read(path, "label")]
-    assert [both.names[i] for i in both.labels] == expected
-
-
-def labels_log(path, names, labels, width=2):
-    """A log of labels, 50 ms apart."""
-    count = len(labels)
-    times = START + np.arange(count) * FRAME_NANOSECONDS
-    fields = {
-        "header.stamp": times,
-        "header.frame_id": "mic",
-        "frame": np.arange(count, dtype=np.uint64),
-        "label": labels,
-        "confidence": np.ones(count, np.float32),
-        "novelty": np.ones(count, np.float32),
-        "probabilities": np.ones((count, width), np.float32),
-    }
-    topic = Topic("/mic/label", messages.LABEL, array_names=names)
-    writer = LogWriter(path, [topic], {})
-    writer.write_columns([Rows("/mic/label", times, fields)])
-    return writer.finish()
-
-
-@pytest.mark.parametrize(
-    ("names", "width", "message"),
-    [
-        ({}, 2, "the channel does not name its values"),
-        ({"probabilities": ["speech", "crying"]}, 3, "a value for each of 2 names"),
-        ({"probabilities": ["speech", "music"]}, 2, "label 'crying' is none of its classes"),
-    ],
-)
-def test_labels_that_contradict_their_names_are_one_line(tmp_path, names, width, message):
-    path = labels_log(tmp_path / "a.mcap", names, ["speech", "crying"], width)
-    with pytest.raises(LogError, match=message) as caught:
-        read_tracks([path])
-    assert str(caught.value).startswith(f"{path}: /mic/label: ")
-
-
-def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder):
-    logs = find_logs(folder)
-    there, back = read_tracks(logs), read_tracks(logs[::-1])
-    assert there.range == back.range
-    for kind, topics in there.rows.items():
-        for topic, rows in topics.items():
-            for name in ("times", "frames", "values", "labels"):
-                np.testing.assert_array_equal(
-                    getattr(back.rows[kind][topic], name), getattr(rows, name)
-                )
-    for kind, topics in there.spans.items():
-        for topic, spans in topics.items():
-            assert back.spans[kind][topic].starts.tolist() == spans.starts.tolist()
-            assert back.spans[kind][topic].texts.tolist() == spans.texts.tolist()
-
-
-def test_an_existing_file_is_left_alone(tmp_path, folder):
+def test_an_existing_file_is_left_alone(tmp_path, timeline):
     path = tmp_path / "mine.rrd"
     path.write_text("precious")
     with pytest.raises(DataError, match="exists already"):
-        save_timeline(find_logs(folder), path)
+        save_timeline(timeline, path)
     assert path.read_text() == "precious"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path, folder):
+def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path, timeline):
     with pytest.raises(DataError, match=r"must end in \.rrd"):
-        save_timeline(find_logs(folder), tmp_path / "a.mcap")
+        save_timeline(timeline, tmp_path / "a.mcap")
     with pytest.raises(DataError, match="there is no folder"):
-        save_timeline(find_logs(folder), tmp_path / "none" / "a.rrd")
-    with pytest.raises(DataError, match="nothing to show"):
-        save_timeline([], tmp_path / "a.rrd")
+        save_timeline(timeline, tmp_path / "none" / "a.rrd")
     (tmp_path / "b.mcap").write_bytes(b"not a log")
-    with pytest.raises(LogError, match="is no MCAP file"):
-        save_timeline([tmp_path / "b.mcap"], tmp_path / "a.rrd")
+    with pytest.raises(DataError, match="is no MCAP file"):
+        read_timeline([tmp_path / "b.mcap"])
+    with pytest.raises(LogError, match="no such log"):
+        read_timeline([tmp_path / "c.mcap"])
     assert [path.name for path in tmp_path.iterdir()] == ["b.mcap"]
 
 
+_SAVE = """
+import pathlib, resource, sys
+from analyzer.errors import DataError
+from analyzer.timeline.reading import read_timeline
+from analyzer.viewer.file import save_timeline
+timeline = read_timeline([pathlib.Path(sys.argv[1])])
+if sys.argv[3:]: resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+try: save_timeline(timeline, pathlib.Path(sys.argv[2]))
+except DataError as error: print(error)
+"""
+
+
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, folder):
-    code = (
-        "import resource, sys, pathlib\n"
-        "from analyzer.errors import DataError\n"
-        "from analyzer.timeline import save_timeline\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
-        "try: save_timeline([pathlib.Path(sys.argv[1])], pathlib.Path(sys.argv[2]))\n"
-        "except DataError as error: print(error)"
-    )
     output = tmp_path / "a.rrd"
-    command = [sys.executable, "-c", code, find_logs(folder)[0], output]
+    command = [sys.executable, "-c", _SAVE, folder, output, "full"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"{output}: cannot be written (")
     assert done.stdout.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_prints_the_file_and_how_to_open_it(tmp_path, folder, capsys):
+def test_writing_a_recording_collects_no_usage_statistics(tmp_path, folder):
+    home = tmp_path / "home"
+    home.mkdir()
+    environment = {k: v for k, v in os.environ.items() if k != "CI"} | rerun_home(home)
+    command = [sys.executable, "-c", _SAVE, folder, tmp_path / "a.rrd"]
+    subprocess.run(command, env=environment, check=True)
+    assert (tmp_path / "a.rrd").exists()
+    assert list(home.rglob("*")) == []
+
+
+def test_the_command_prints_the_file_and_how_to_open_it(tmp_path, folder, capfd):
     output = tmp_path / "a day.rrd"
-    review(folder, output)
-    assert capsys.readouterr().out.splitlines() == [
+    done = run(capfd, "review", folder, "--save", output)
+    assert done.returncode == 0
+    assert done.stdout.splitlines() == [
         str(output),
         f"open it with: rerun --bind 127.0.0.1 '{output}'",
     ]
     assert output.stat().st_size > 100_000
 
 
-def test_writing_a_recording_collects_no_usage_statistics(tmp_path, folder):
-    code = (
-        "import sys, pathlib; from analyzer.timeline import save_timeline; "
-        "save_timeline([pathlib.Path(sys.argv[1])], pathlib.Path(sys.argv[2]))"
-    )
-    home = tmp_path / "home"
-    home.mkdir()
-    environment = {k: v for k, v in os.environ.items() if k != "CI"} | rerun_home(home)
-    command = [sys.executable, "-c", code, find_logs(folder)[0], tmp_path / "a.rrd"]
-    subprocess.run(command, env=environment, check=True)
-    assert (tmp_path / "a.rrd").exists()
-    assert list(home.rglob("*")) == []
-
-
 def test_the_viewer_shows_every_view_without_complaint(viewer, recording):
-    picture, state = shown(viewer, recording, views=4)
-    assert sorted(view.view_class for view in state.views) == ["StateTimeline", *["TimeSeries"] * 3]
-    assert all(view.visible for view in state.views)
+    picture, state = shown(viewer, recording, views=5)
+    classes = Counter(view.view_class for view in state.views)
+    assert classes == {"StateTimeline": 2, "TimeSeries": 6, "TextLog": 1}
     assert [report for view in state.views for report in view.reports] == []
     (loaded,) = state.recordings
     assert loaded.current_timeline == "time"

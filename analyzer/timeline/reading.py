@@ -45,7 +45,7 @@ from schemas.writer import METADATA
 SHARES = 2_400  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
-_WHOLE_BYTES = 3 << 30  # of messages that are read whole: about three days and their layers
+_WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
 _MOST_NAMES = 256
 _QUIETEST = 1e-10  # of a mean square: -100 dB
 _ENERGY = "energy"
@@ -113,7 +113,7 @@ def read_timeline(
         except (LogError, DataError) as error:
             losses.append(str(error))
         progress((number + 1) / len(found))
-    known = home_zone(zone, [file.about for file in found])
+    known = home_zone(zone, _records(file.path for file in found))
     heard = heard_in([(f.first, f.last + FRAME_NANOSECONDS, f.path) for f in found if not f.layer])
     timeline = Timeline(
         grid, reader.microphones(), reader.lines(), str(known), heard, reader.every, losses
@@ -133,12 +133,12 @@ def zone_of(paths: Iterable[Path], wanted: str | None) -> tzinfo:
     LogError
         If there is no log.
     """
-    return home_zone(wanted, _records(paths))
+    return home_zone(wanted, _records(log for path in paths for log in find_logs(path)))
 
 
 def _records(paths: Iterable[Path]) -> Iterator[Mapping[str, str]]:
     """Yield what logs say of themselves, the latest first."""
-    for path in reversed([each for given in paths for each in find_logs(given)]):
+    for path in reversed(list(paths)):
         if not is_layer(path):
             with suppress(LogError), LogFile(path) as file:
                 yield metadata_of(file)
@@ -159,7 +159,6 @@ class _File:
     last: int
     size: int
     layer: bool
-    about: Mapping[str, str]
 
 
 def _files(
@@ -176,13 +175,11 @@ def _files(
             # What ends in the span may be logged later, so only the start of a log excludes it.
             if end is not None and span[0] >= end:
                 continue
-            with LogFile(path) as file:
-                size = int(file.chunks["size"].sum())
-                about = metadata_of(file)
-        except LogError as error:
+            size = path.stat().st_size
+        except (LogError, OSError) as error:
             losses.append(str(error))
             continue
-        files.append(_File(path, *span, size, is_layer(path), about))
+        files.append(_File(path, *span, size, is_layer(path)))
     return sorted(files, key=lambda file: (file.first, file.path.name))
 
 
@@ -256,6 +253,7 @@ class _Reader:
         self._heard: dict[str, _Heard] = {}
         self._lines: list[Lines] = []
         self._clip_seconds = 0.0
+        self._layers: dict[tuple[Path, str], Path] = {}
 
     def read(self, file: _File) -> None:
         """Take a log or a layer."""
@@ -287,10 +285,22 @@ class _Reader:
             return
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
+        self._check_alone(file.path, topics)
         # They have chunks of their own, so all can be read even where labels are too many.
         yield [name for name in topics if name.endswith("/segment")], None, 1
         if self.every == 1:
             yield [name for name in topics if name.endswith("/label")], self._grid.end, 1
+
+    def _check_alone(self, path: Path, topics: Sequence[str]) -> None:
+        """Raise LogError if another layer of the same log has the same labelling."""
+        log = path.with_name(_OF_LAYER.split(path.name)[0])
+        for topic in topics:
+            other = self._layers.setdefault((log, topic), path)
+            if other != path:
+                raise LogError(
+                    f"{path}: contradicts {other.name}, which has {topic} of the same log too; "
+                    "move one of them away"
+                )
 
     def _take(self, path: Path, columns: Columns) -> None:
         if columns.type == messages.LOG:
@@ -420,6 +430,8 @@ class _Reader:
     def _labelling(self, heard: _Heard, name: str) -> Labelling:
         growing = heard.labels.get(name)
         parts = heard.spans.get(name, [])
+        if name == LIVE and self.every > 1 and growing is not None:
+            parts = []  # of segments a sample says nothing
         if growing is not None:  # what is open at the end is no segment yet
             parts = [
                 *parts,

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from analyzer.colours import GAP, Colour, colour
 from analyzer.hometime import home_zone
-from analyzer.timeline.contents import REVIEW, Microphone, Spans, Timeline
+from analyzer.timeline.contents import REVIEW, Microphone, Spans, Timeline, no_spans
 from analyzer.timeline.grid import Int64
 from analyzer.timeline.lanes import changes, clock, disagreements, from_afar
 from analyzer.viewer.canvas import TIMELINE, Canvas
@@ -95,12 +95,10 @@ def _draw_lanes(timeline: Timeline, microphone: Microphone, canvas: Canvas) -> N
         for root in (AFAR, EXACT):
             entity = lane(root, microphone.name, place_, labelling.name)
             canvas.configure_lane(entity, colours)
-            marked = labelling.name == REVIEW
-            spans = (
-                from_afar(labelling, timeline.grid)
-                if root == AFAR and not marked
-                else labelling.spans
-            )
+            exact = root == EXACT or labelling.name == REVIEW
+            spans = labelling.spans if exact else no_spans()
+            if not len(spans) and labelling.name != REVIEW:
+                spans = from_afar(labelling, timeline.grid)
             canvas.change_states(entity, *changes(spans))
     if all(labelling.name != REVIEW for labelling in microphone.labellings):
         start = np.array([timeline.grid.start])

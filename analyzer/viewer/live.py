@@ -2,7 +2,7 @@
 
 import errno
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Self
 
 import rerun as rr
@@ -49,6 +49,8 @@ class LiveServer:
         Address to listen on.
     minutes : float
         That the time axes show.
+    memory : str
+        How much is kept for viewers that come later; then the oldest is dropped.
 
     Raises
     ------
@@ -61,11 +63,11 @@ class LiveServer:
         Where viewers connect to.
     """
 
-    def __init__(self, port: int, bind: str, minutes: float) -> None:
+    def __init__(self, port: int, bind: str, minutes: float, memory: str = _MEMORY) -> None:
         check_port(port, bind)
         rr.set_strict_mode(True)  # or its mistakes become warnings
         self._recording = rr.RecordingStream(_APPLICATION)
-        sink = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=_MEMORY)
+        sink = rr.GrpcServerSink(bind_ip=bind, port=port, server_memory_limit=memory)
         self.url = sink.uri
         self._recording.set_sinks(sink)
         self._recording.send_recording_name("live")
@@ -73,6 +75,7 @@ class LiveServer:
         self._minutes = minutes
         self._microphones: dict[str, dict[str, list[tuple[str, ...]]]] = {}
         self._lanes: dict[str, dict[str, Colour]] = {}
+        self._is_laid_out = True  # there is nothing to lay out
 
     def __enter__(self) -> Self:
         return self
@@ -80,14 +83,19 @@ class LiveServer:
     def __exit__(self, *_: object) -> None:
         self._recording.disconnect()
 
-    def show(self, news: News) -> None:
-        """Draw something new."""
-        if isinstance(news, Lines):
-            self._canvas.write_lines(_LINES, news)
-        elif isinstance(news, Lane):
-            self._show_lane(news)
-        elif len(news.times):
-            self._show_means(news)
+    def show(self, news: Iterable[News]) -> None:
+        """Draw what is new."""
+        for each in news:
+            if isinstance(each, Lines):
+                self._canvas.write_lines(_LINES, each)
+            elif isinstance(each, Lane):
+                self._show_lane(each)
+            elif len(each.times):
+                self._show_means(each)
+        if not self._is_laid_out:
+            layout = _Layout(self._microphones, self._minutes)
+            self._recording.send_blueprint(layout, make_active=True, make_default=True)
+            self._is_laid_out = True
 
     def _show_lane(self, news: Lane) -> None:
         place = _PLACES.get(news.name, 0)
@@ -119,8 +127,7 @@ class LiveServer:
         entity = f"{root}/{known.index(news.names)}"
         if new:
             self._configure_means(entity, news)
-            layout = _Layout(self._microphones, self._minutes)
-            self._recording.send_blueprint(layout, make_active=True, make_default=True)
+            self._is_laid_out = False
         if news.kind == "shares":
             self._canvas.add_bands(entity, news.times, news.values)
         elif news.kind == "features":
@@ -211,7 +218,7 @@ def _lanes() -> rrb.View:
 def _plots(microphone: str, kinds: dict[str, list[tuple[str, ...]]]) -> rrb.Container:
     rows: list[tuple[int, rrb.View]] = [
         (share, _plot(_ENTITIES[kind].format(microphone), kind, kinds[kind]))
-        for kind, share in (("shares", 280), ("level", 100), ("novelty", 90), ("features", 180))
+        for kind, share in (("shares", 280), ("level", 120), ("novelty", 90), ("features", 180))
         if kind in kinds
     ]
     return rrb.Vertical(

@@ -23,14 +23,15 @@ class WindowControl:
         self._client: ViewerClient | None = None
 
     @property
-    def _connected(self) -> ViewerClient:
+    def client(self) -> ViewerClient:
+        """Rerun's client, connected."""
         if self._client is None:
             self._client = ViewerClient.connect(self.process.url)
         return self._client
 
     def state(self) -> State:
         """Ask what it shows."""
-        found = self._connected.get_state()
+        found = self.client.get_state()
         errors = [
             f"{view.name}: {report.summary}" for view in found.views for report in view.reports
         ]
@@ -44,23 +45,19 @@ class WindowControl:
 
     def blueprint(self) -> Blueprint:
         """Ask for its blueprint."""
-        return self._connected.get_blueprint().blueprint
+        return self.client.get_blueprint().blueprint
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
         """Replace its blueprint."""
-        self._connected.set_blueprint(blueprint, of="recording")
+        self.client.set_blueprint(blueprint, of="recording")
 
     def set_time(self, nanoseconds: int, *, play: bool) -> None:
         """Put its cursor on a time."""
-        self._connected.set_time(
+        self.client.set_time(
             TIMELINE,
             timestamp=np.datetime64(nanoseconds, "ns"),
             play_state="playing" if play else "paused",
         )
-
-    def picture(self) -> bytes:
-        """Return what it shows, as PNG."""
-        return self._connected.take_screenshot()
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
         """Offer nothing: keys are those of the terminal."""
@@ -73,7 +70,24 @@ class WindowControl:
         self.process.close()
 
 
-def open_window(port: int | None = None, data: str | None = None) -> Viewer:
+class Window(Viewer):
+    """A viewer in a window.
+
+    Parameters
+    ----------
+    process : Process
+    """
+
+    def __init__(self, process: Process) -> None:
+        self._window = WindowControl(process)
+        super().__init__(self._window)
+
+    def picture(self) -> bytes:
+        """Return what it shows, as PNG; raises ConnectionError or TimeoutError."""
+        return self._window.client.take_screenshot()
+
+
+def open_window(port: int | None = None, data: str | None = None) -> Window:
     """Open Rerun's viewer in a window.
 
     Parameters
@@ -92,6 +106,13 @@ def open_window(port: int | None = None, data: str | None = None) -> Viewer:
         if data is None
         else "--serve to look from another machine"
     )
-    source = ["--expect-data-soon"] if data is None else ["--connect", data]
-    process = Process(["--hide-welcome-screen", *source], free_port(port))
-    return Viewer(WindowControl(process))
+    return _opened(port, *(["--expect-data-soon"] if data is None else ["--connect", data]))
+
+
+def open_hidden(port: int | None = None) -> Window:
+    """Run the same viewer without a window, for pictures of it; raises as `open_window`."""
+    return _opened(port, "--expect-data-soon", "--headless")
+
+
+def _opened(port: int | None, *more: str) -> Window:
+    return Window(Process(["--hide-welcome-screen", *more], free_port(port)))

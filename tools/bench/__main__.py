@@ -17,12 +17,22 @@ from typing import Annotated
 import typer
 
 from schemas.errors import HearthlogError
-from tools.bench import features, inference, live, reading, recording, relabel, size, writing
+from tools.bench import (
+    features,
+    inference,
+    live,
+    reading,
+    recording,
+    relabel,
+    review,
+    size,
+    writing,
+)
 from tools.bench.workload import Workload
 
 MEASUREMENTS = {
     module.__name__.rpartition(".")[2]: module.measure
-    for module in (features, recording, live, inference, size, reading, writing, relabel)
+    for module in (features, recording, live, inference, size, reading, writing, relabel, review)
 }
 
 

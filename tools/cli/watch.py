@@ -35,7 +35,7 @@ def watch(
     bind: Annotated[
         str, typer.Option(help="With --serve: address of this machine to listen on.")
     ] = _LOOPBACK,
-    minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 10,
+    minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 5,
     timezone: Annotated[
         str | None, typer.Option(help="Of the home, as Europe/Vienna.  [default: the logs say it]")
     ] = None,
@@ -129,8 +129,7 @@ def _follow(
     for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell):
         live = live or Live(zone_of([logs], timezone))
         try:
-            for news in live.take(path, batch):
-                server.show(news)
+            server.show(live.take(path, batch))
         except LogError as error:
             tell(error)
         if stop.is_set():

@@ -1,0 +1,367 @@
+"""What is being recorded is seen live, and the recorder does not notice who looks."""
+
+import io
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from contextlib import contextmanager
+from itertools import islice
+
+import numpy as np
+import psutil
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+from PIL import Image
+from rerun.experimental import ViewerClient
+
+from analyzer.colours import GAP, colour
+from analyzer.errors import DataError
+from analyzer.hometime import home_zone
+from analyzer.timeline.contents import Lines
+from analyzer.timeline.lanes import Changes
+from analyzer.timeline.live import GAP_LANE, LIVE_LANE, NOT_HEARD, Lane, Live, Means, last_time
+from analyzer.viewer.live import LiveServer
+from analyzer.viewer.process import Process, free_port
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.columns import read_columns
+from schemas.files import find_logs
+from schemas.follow import follow_messages
+
+SECOND = 1_000_000_000
+MINUTES = 3
+
+
+@pytest.fixture(scope="module")
+def logs(day, model_file, tmp_path_factory):
+    """Three minutes of a home, recorded."""
+    folder = tmp_path_factory.mktemp("watched") / "logs"
+    subprocess.run([*HEARTHLOG, "record", day, "--model", model_file, "-o", folder], check=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model_without_speech(model_file, tmp_path_factory):
+    """The model under another name and with another name for one of its classes."""
+    from dataclasses import replace
+
+    from models.modelfile import load_model, save_model
+
+    model = load_model(model_file)
+    classes = [f"{name}_2" for name in model.classes]
+    about = model.description.model_copy(update={"classes": classes, "name": "other"})
+    path = tmp_path_factory.mktemp("other") / "other.safetensors"
+    save_model(replace(model, description=about), path)
+    return path
+
+
+@contextmanager
+def watching(folder, *options):
+    """Run `hearthlog watch --serve` and yield its process and the URL for viewers."""
+    port = free_port()
+    command = [*HEARTHLOG, "watch", folder, "--serve", "--port", str(port), *options]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        wait_for(lambda: is_listening(port) or process.poll() is not None)
+        yield process, f"rerun+http://127.0.0.1:{port}/proxy"
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def looking(url):
+    """Run a viewer without a screen that connects to a server."""
+    with Process(["--headless", "--window-size", "1600x900", "--connect", url], free_port()) as run:
+        try:
+            run.wait_until_it_listens()
+        except DataError as error:
+            if os.environ.get("HEARTHLOG_REQUIRE_AUDIO") == "1":
+                raise
+            pytest.skip(f"Rerun's viewer does not run here: {error}")
+        yield Eye(run)
+
+
+class Eye:
+    """Looks at what a viewer shows."""
+
+    def __init__(self, process):
+        self.pid = psutil.Process(process._process.pid)
+        self._client = ViewerClient.connect(process.url)
+
+    def views(self, count=1):
+        """Wait until so many views are there."""
+
+        def enough():
+            state = answer(self._client.get_state)
+            return state.views if state and len(state.views) >= count else None
+
+        return wait_for(enough)
+
+    def picture(self):
+        png = wait_for(lambda: answer(self._client.take_screenshot))
+        return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def answer(operation):
+    """Ask a viewer, which paints slowly on a busy machine."""
+    try:
+        return operation()
+    except (TimeoutError, ConnectionError):
+        return None
+
+
+def wait_for(operation):
+    until = time.monotonic() + 90
+    while not (found := operation()):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    return found
+
+
+def is_listening(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def is_there(picture, tint, column):
+    """Tell whether a colour is in a column of the lanes."""
+    strip = picture[: len(picture) // 4, column]
+    return bool((np.abs(strip - tint).max(axis=1) < 3).any())
+
+
+def news(folder, live=None, **options):
+    """Give what is new to one who follows finished logs to their end."""
+    live = live or Live(home_zone("UTC"))
+    count = sum(1 for _ in batches(folder, **options))
+    found = islice(follow_messages(folder, start=0, **options), count)
+    return [each for path, batch in found for each in live.take(path, batch)]
+
+
+def batches(folder, **options):
+    """Give what there is, and end where one who follows would wait."""
+    from threading import Event
+
+    stop = Event()
+    stop.set()
+    return follow_messages(folder, start=0, stop=stop, **options)
+
+
+def lane_states(found, name):
+    """Give a lane as it stands in the end: what came last of each time counts."""
+    states = {}
+    for each in found:
+        if isinstance(each, Lane) and each.name == name:
+            states.update(zip(each.changes.times.tolist(), each.changes.states, strict=True))
+    times = np.array(sorted(states))
+    return times, [states[time] for time in times.tolist()]
+
+
+def test_a_lane_has_the_colour_of_what_is_heard_where_it_is_heard(logs):
+    segments = read_columns(find_logs(logs))["/mic/segment"]
+    durations = np.where(segments["label"] == "silence", 0, segments["duration"])
+    longest = int(durations.argmax())
+    middle = segments["header.stamp"][longest] + segments["duration"][longest] // 2
+    with watching(logs, "--minutes", str(MINUTES)) as (watcher, url), looking(url) as eye:
+        eye.views(6)
+        tint = colour(segments["label"][longest])
+        share = 1 - (last_time(logs) - middle) / (MINUTES * 60 * SECOND)
+        wait_for(lambda: is_there(eye.picture(), tint, round(share * 1599)))
+        assert [view.reports for view in eye.views(6)] == [[]] * 6
+        for process in (psutil.Process(watcher.pid), eye.pid):
+            found = [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
+            assert found == ["127.0.0.1"]
+        watcher.terminate()
+        assert watcher.wait(30) == 0
+
+
+def test_a_recorder_does_not_notice_who_looks(day, model_file, tmp_path):
+    sound = tmp_path / "sound.flac"
+    samples, rate = soundfile.read(day, dtype="int16")
+    soundfile.write(sound, samples[: 20 * rate], rate)
+    command = [*HEARTHLOG, "record", sound, "--model", model_file, "--start", "2026-03-01T07:00"]
+    subprocess.run([*command, "-o", tmp_path / "alone"], check=True)
+    watched = tmp_path / "watched"
+    watched.mkdir()
+    with watching(watched) as (watcher, url), looking(url) as first:
+        recorder = subprocess.Popen([*command, "-o", watched, "--realtime"])
+        assert first.views()
+        first.pid.kill()
+        with looking(url) as second:
+            assert second.views()
+            watcher.kill()
+            assert recorder.poll() is None
+        assert recorder.wait(60) == 0
+    alone, seen = (read_columns(find_logs(tmp_path / name)) for name in ("alone", "watched"))
+    assert alone.keys() == seen.keys()
+    for topic, fields in {"/mic/features": "values", "/mic/label": "probabilities"}.items():
+        assert np.array_equal(alone[topic]["frame"], seen[topic]["frame"])
+        assert np.array_equal(alone[topic][fields], seen[topic][fields])
+
+
+def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_colours():
+    port = free_port()
+    names = ("silence", "phone_ring")
+    start = 1_772_348_400 * SECOND
+    with LiveServer(port, "127.0.0.1", MINUTES, memory="200KB") as server:
+        before = psutil.Process().memory_info().rss
+        for number in range(3_000):
+            times = np.array([start + number * SECOND])
+            shares = Means("mic", "shares", names, times, np.array([[0.2, 0.8]]))
+            server.show([shares, Lane("mic", LIVE_LANE, Changes(times, ["phone_ring"]))])
+        assert psutil.Process().memory_info().rss - before < 50_000_000
+        with looking(server.url) as eye:
+            assert eye.views()
+            wait_for(lambda: is_there(eye.picture(), colour("phone_ring"), 1580))
+
+
+def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
+    found = news(logs)
+    times, states = lane_states(found, LIVE_LANE)
+    segments = read_columns(find_logs(logs))["/mic/segment"]
+    starts = segments["header.stamp"]
+    ends = starts + segments["duration"]
+    within = np.searchsorted(starts, times, side="right") - 1
+    for time_, state, at in zip(times.tolist(), states, within.tolist(), strict=True):
+        if at >= 0 and time_ < ends[at]:
+            assert state == segments["label"][at]
+    assert np.isin(starts, times).all()
+    first = next(each for each in found if isinstance(each, Lane) and each.name == LIVE_LANE)
+    assert None not in first.changes.states
+    assert np.diff(times).max() <= SECOND
+
+
+def test_means_are_those_of_the_frames_of_a_second(logs):
+    found = [each for each in news(logs) if isinstance(each, Means)]
+    columns = read_columns(find_logs(logs))
+    stamps, values = (columns["/mic/label"][name] for name in ("header.stamp", "probabilities"))
+    shares = [each for each in found if each.kind == "shares"]
+    times = np.concatenate([each.times for each in shares])
+    means = np.concatenate([each.values for each in shares])
+    second = times[40] // SECOND
+    assert np.allclose(means[40], values[stamps // SECOND == second].mean(axis=0), atol=1e-6)
+    assert len(times) < len(stamps) / 15
+    assert {each.kind for each in found} == {"shares", "level", "novelty", "features"}
+    heat = np.concatenate([each.values for each in found if each.kind == "features"])
+    assert heat.min() >= 0
+    assert heat.max() <= 1
+    assert (heat.std(axis=0) > 0.05).all()
+
+
+def test_what_was_not_heard_is_a_hole_in_lanes_and_lines(recorded):
+    found = news(recorded)
+    gaps = read_columns(find_logs(recorded))["/mic/gap"]
+    times, states = lane_states(found, GAP_LANE)
+    assert len(gaps)
+    assert np.array_equal(times[::2], gaps["header.stamp"])
+    assert states == [NOT_HEARD, None] * len(gaps)
+    live_times, live_states = lane_states(found, LIVE_LANE)
+    level = [each for each in found if isinstance(each, Means) and each.kind == "level"]
+    holes = np.concatenate([each.times[np.isnan(each.values[:, 0])] for each in level])
+    for start in gaps["header.stamp"]:
+        assert np.abs(holes - start).min() <= FRAME_NANOSECONDS
+        assert live_states[np.abs(live_times - start).argmin()] is None
+
+
+def test_events_are_told_in_words(logs):
+    lines = [text for each in news(logs) if isinstance(each, Lines) for text in each.texts]
+    assert len(lines) == len(read_columns(find_logs(logs))["/rosout"])
+
+
+def test_another_model_and_none_are_drawn_too(day, model_file, model_without_speech, tmp_path):
+    for number, model in enumerate(
+        (["--model", model_file], ["--model", model_without_speech], [])
+    ):
+        start = f"2026-03-01T0{number}:00"
+        subprocess.run(
+            [*HEARTHLOG, "record", day, "-o", tmp_path, "--start", start, *model], check=True
+        )
+    found = news(tmp_path)
+    shares = dict.fromkeys(e.names for e in found if isinstance(e, Means) and e.kind == "shares")
+    assert len(shares) == 2
+    levels = [each.times for each in found if isinstance(each, Means) and each.kind == "level"]
+    assert np.concatenate(levels)[-1] > lane_states(found, LIVE_LANE)[0][-1] + 3_000 * SECOND
+    with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
+        server.show(found)
+
+
+def test_what_is_kept_does_not_grow_with_what_was_watched(logs):
+    live = Live(home_zone("UTC"))
+    news(logs, live)
+    before = len(str(live.__dict__))
+    for _ in range(3):
+        news(logs, live)
+    assert len(str(live.__dict__)) < 1.1 * before
+
+
+def test_a_damaged_log_is_told_and_the_others_are_shown(logs, tmp_path):
+    (log,) = find_logs(logs)
+    data = bytearray(log.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 2_000] = os.urandom(2_000)
+    (tmp_path / "home_1.mcap").write_bytes(data)
+    shutil.copy(log, tmp_path / "home_2.mcap")
+    with watching(tmp_path) as (watcher, url), looking(url) as eye:
+        assert eye.views()
+        watcher.send_signal(signal.SIGINT)
+        _, said = watcher.communicate(timeout=30)
+    assert watcher.returncode == 3
+    assert said.count("home_1.mcap") == 1
+    assert "home_2.mcap" not in said
+
+
+def test_an_empty_folder_is_waited_for(day, model_file, tmp_path):
+    with watching(tmp_path) as (watcher, url), looking(url) as eye:
+        command = [*HEARTHLOG, "record", day, "--model", model_file, "-o", tmp_path]
+        subprocess.run(command, check=True)
+        eye.views(6)
+        watcher.terminate()
+        _, said = watcher.communicate(timeout=30)
+    assert f"no log in {tmp_path} yet; waiting for a recorder" in said
+
+
+def test_a_folder_that_is_not_there_is_told(hearthlog, tmp_path):
+    result = hearthlog("watch", tmp_path / "nowhere", "--serve")
+    assert result.returncode == 1
+    assert (
+        "nowhere: no such folder; name the one that `hearthlog record` writes to" in result.stderr
+    )
+
+
+def test_a_port_that_is_in_use_is_told(hearthlog, tmp_path):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        result = hearthlog("watch", tmp_path, "--serve", "--port", port)
+    assert result.returncode == 1
+    assert f"port {port} is in use" in result.stderr
+    assert "--port" in result.stderr
+
+
+def test_an_address_that_is_not_of_this_machine_is_told(hearthlog, tmp_path):
+    result = hearthlog("watch", tmp_path, "--serve", "--bind", "192.0.2.1", "--port", free_port())
+    assert result.returncode == 1
+    assert "cannot listen on 192.0.2.1" in result.stderr
+
+
+def test_without_a_display_it_is_said_what_else_there_is(hearthlog, tmp_path):
+    result = hearthlog("watch", tmp_path, env={"DISPLAY": "", "WAYLAND_DISPLAY": ""})
+    assert result.returncode == 1
+    assert "--web" in result.stderr
+    assert "--serve" in result.stderr
+
+
+def test_who_listens_to_the_network_is_warned(tmp_path):
+    with watching(tmp_path, "--bind", "0.0.0.0") as (watcher, _):  # noqa: S104
+        watcher.terminate()
+        _, said = watcher.communicate(timeout=30)
+    assert "whoever reaches this port sees what is heard here" in said
+
+
+def test_options_that_exclude_each_other_are_wrong_use(hearthlog, tmp_path):
+    assert hearthlog("watch", tmp_path, "--serve", "--web").returncode == 2
+    assert hearthlog("watch", tmp_path, "--bind", "0.0.0.0").returncode == 2  # noqa: S104

@@ -1,0 +1,66 @@
+"""A day, and a month, from logs to a picture of them in Rerun's viewer."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from schemas.files import find_logs
+from tools.bench.table import Row, Table, Target
+from tools.bench.timing import BenchError, hearthlog
+from tools.bench.workload import Workload
+
+_HOURS, _DAYS = 24, 31
+_MIDNIGHT = "2026-03-01T00:00"
+_RUN = """
+import json, resource, sys, time
+began = float(sys.argv[1])
+from pathlib import Path
+from analyzer.viewer.window import open_hidden
+with open_hidden() as viewer:
+    from analyzer.timeline.reading import read_timeline
+    timeline = read_timeline([Path(sys.argv[2])])
+    viewer.draw(timeline, close_up=False)
+    viewer.wait_until_drawn()
+    viewer.picture()
+    seconds = time.time() - began
+    ours = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+viewers = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+print(json.dumps([seconds, ours, viewers]))
+"""
+
+
+class _Run(NamedTuple):
+    seconds: float
+    ours: float  # megabytes
+    viewers: float
+
+
+def measure(work: Workload) -> Table:
+    """Measure from the start of the command to a picture of everything."""
+    logs, month = work.folder / "review", work.folder / "month"
+    sound = [work.wav] * round(_HOURS * 3600 / work.seconds)
+    hearthlog(["record", *sound, "-o", logs, "--model", work.model_file, "--start", _MIDNIGHT])
+    for number in range(_DAYS):  # they take as long to read as if they were of other days
+        (month / str(number)).mkdir(parents=True)
+        for log in find_logs(logs):
+            os.link(log, month / str(number) / log.name)
+    day, many = _shown(logs), _shown(month)
+    rows = [
+        Row("a day", day.seconds, "s", target=Target(5, at_most=True)),
+        Row("  peak memory of hearthlog", day.ours, "MB", target=Target(500, at_most=True)),
+        Row("  peak memory of the viewer", day.viewers, "MB"),
+        Row("a month, a sample of it", many.seconds, "s", target=Target(15, at_most=True)),
+    ]
+    return Table("review: from logs to a picture of them, elapsed", rows)
+
+
+def _shown(logs: Path) -> _Run:
+    command = [sys.executable, "-c", _RUN, str(time.time()), str(logs)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode:
+        raise BenchError(done.stderr.strip().splitlines()[-1])
+    return _Run(*json.loads(done.stdout.splitlines()[-1]))
