@@ -62,6 +62,7 @@ FIELDS = {
     messages.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
     messages.LOG: ("stamp", "level", "msg"),
 }
+_RELABELLED = re.compile(r"\.(?=relabel-)")  # in the name of a layer, between log and labelling
 _OF_LAYERS = (messages.LABEL, messages.SEGMENT)
 
 Progress = Callable[[float], None]
@@ -293,7 +294,7 @@ class _Reader:
 
     def _check_alone(self, path: Path, topics: Sequence[str]) -> None:
         """Raise LogError if another layer of the same log has the same labelling."""
-        log = path.with_name(_OF_LAYER.split(path.name)[0])
+        log = path.with_name(_RELABELLED.split(path.name)[0])
         for topic in topics:
             other = self._layers.setdefault((log, topic), path)
             if other != path:
@@ -480,10 +481,12 @@ def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
 
 
 def decibel(energy: Any) -> Any:
+    """Return the level of a mean square, in dB relative to full scale."""
     return 10 * np.log10(np.maximum(energy, _QUIETEST))
 
 
 def spans_of(columns: Columns, text: str) -> Spans:
+    """Return the spans that segments or gaps are about; `text` is the field that is shown."""
     starts = columns["header.stamp"]
     return Spans(starts, starts + columns["duration"], columns[text])
 
