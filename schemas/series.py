@@ -129,14 +129,13 @@ class _Batch(NamedTuple):
     finished: list[LogFile]
 
 
-def iterate_messages(  # noqa: PLR0913
+def iterate_messages(
     logs: Iterable[Path],
     topics: Collection[str] | None = None,
     start: int | None = None,
     end: int | None = None,
     *,
     check: bool = False,
-    every: int = 1,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
 
@@ -149,8 +148,6 @@ def iterate_messages(  # noqa: PLR0913
         Log times, in nanoseconds: from `start` on, before `end`.
     check : bool
         Whether to compare chunks with their checksums.
-    every : int
-        Read one of so many chunks of each log: a sample.
 
     Yields
     ------
@@ -163,26 +160,29 @@ def iterate_messages(  # noqa: PLR0913
     LogError
         If a log is damaged.
     """
-    return _iterate(logs, _query(topics, start, end)._replace(check=check, every=every), list)
+    return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
 
 
-def iterate_pieces(
+def iterate_pieces(  # noqa: PLR0913
     logs: Iterable[Path],
     topics: Collection[str] | None,
     start: int | None,
     end: int | None,
     function: Callable[[list[RawMessages]], list[Piece]],
+    *,
+    every: int = 1,
 ) -> Iterator[list[Piece]]:
     """Make something of the messages of some logs as they are read, in the threads that read.
 
-    Parameters and errors are those of `iterate_messages`.
+    Parameters and errors are those of `iterate_messages`; of `every` so many chunks of a log one
+    is read, for a sample.
 
     Yields
     ------
     list of Piece
         What the function made of messages: of those of the next span of time.
     """
-    return _iterate(logs, _query(topics, start, end), function)
+    return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
 
 
 def _query(topics: Collection[str] | None, start: int | None, end: int | None) -> _Query:

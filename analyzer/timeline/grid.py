@@ -62,8 +62,9 @@ class Means:
         """
         share = self._grid.find(times)
         first = np.flatnonzero(np.diff(share, prepend=-1))
-        finite = np.nan_to_num(values, posinf=0.0, neginf=0.0)
-        self._sums[share[first]] += np.add.reduceat(finite, first, axis=0, dtype=np.float64)
+        if not np.isfinite(values).all():
+            values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+        self._sums[share[first]] += np.add.reduceat(values, first, axis=0, dtype=np.float64)
         self._counts[share[first]] += np.diff(first, append=len(share))
 
     @property

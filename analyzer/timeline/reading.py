@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import tzinfo
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,10 @@ from schemas.columns import Columns
 from schemas.errors import LogError
 from schemas.files import find_logs, is_layer, stem
 from schemas.logfile import LogFile, time_span
-from schemas.series import iterate_messages
+from schemas.series import iterate_pieces
 from schemas.writer import METADATA
 
-SHARES = 2_400  # of a timeline, at most: more than a screen has pixels
+SHARES = 1_600  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
@@ -261,31 +262,32 @@ class _Reader:
         if file.path.name.endswith(".audio.mcap"):
             self._read_clips(file.path)
             return
-        if not file.layer:
-            self._read_marks(file.path)
-        elif ".review." in file.path.name:
+        if ".review." in file.path.name:
             return  # with its log
         kinds = FIELDS
         if file.layer:
             kinds = {kind: FIELDS[kind] for kind in _OF_LAYERS}
         self._read_messages(file, kinds)
+        if not file.layer:
+            self._read_marks(file.path)  # last, for a damaged layer must not hide its log
 
     def _read_messages(self, file: _File, kinds: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
-            batches = iterate_messages([file.path], topics, self._grid.start, end, every=every)
-            for batch in batches:
-                for columns in decode_known(file.path, batch, kinds):
+            decoded = partial(decode_known, file.path, wanted=kinds)
+            span = (self._grid.start, end)
+            for batch in iterate_pieces([file.path], topics, *span, decoded, every=every):
+                for columns in batch:
                     self._take(file.path, columns)
-                if min(int(raw.log_times[0]) for raw in batch) > self._grid.end and topics is None:
+                if min(int(columns.log_times[0]) for columns in batch) > self._grid.end:
                     break  # what ended later began later, but for what lasted for minutes
 
     def _parts(self, file: _File) -> Iterator[tuple[list[str] | None, int | None, int]]:
         """Yield topics, the log time up to which they are read, and one of how many chunks."""
-        if not file.layer:
-            yield None, None, self.every
-            return
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
+        if not file.layer:
+            yield [name for name in topics if not name.endswith("/statistics")], None, self.every
+            return
         self._check_alone(file.path, topics)
         # They have chunks of their own, so all can be read even where labels are too many.
         yield [name for name in topics if name.endswith("/segment")], None, 1
