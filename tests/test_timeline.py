@@ -799,15 +799,16 @@ from analyzer.errors import DataError
 from analyzer.timeline.reading import read_timeline
 from analyzer.viewer.file import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])
-if sys.argv[3:]: resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+if limit := int(sys.argv[3]): resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try: save_timeline(timeline, pathlib.Path(sys.argv[2]))
 except DataError as error: print(error)
 """
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, folder):
+@pytest.mark.parametrize("left", [50_000, 1_200_000])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, folder, left):
     output = tmp_path / "a.rrd"
-    command = [sys.executable, "-c", _SAVE, folder, output, "full"]
+    command = [sys.executable, "-c", _SAVE, folder, output, str(left)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"{output}: cannot be written (")
     assert done.stdout.count("\n") == 1
@@ -818,7 +819,7 @@ def test_writing_a_recording_collects_no_usage_statistics(tmp_path, folder):
     home = tmp_path / "home"
     home.mkdir()
     environment = {k: v for k, v in os.environ.items() if k != "CI"} | rerun_home(home)
-    command = [sys.executable, "-c", _SAVE, folder, tmp_path / "a.rrd"]
+    command = [sys.executable, "-c", _SAVE, folder, tmp_path / "a.rrd", "0"]
     subprocess.run(command, env=environment, check=True)
     assert (tmp_path / "a.rrd").exists()
     assert list(home.rglob("*")) == []

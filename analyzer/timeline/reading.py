@@ -43,7 +43,7 @@ from schemas.logfile import LogFile, time_span
 from schemas.series import iterate_pieces
 from schemas.writer import METADATA
 
-SHARES = 1_600  # of a timeline, at most: more than a screen has pixels
+SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days

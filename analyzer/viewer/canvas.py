@@ -16,6 +16,7 @@ from analyzer.timeline.grid import Float64, Int64
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough
 _ROWS_AT_ONCE = 72_000  # an hour of frames
+_HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
 _TINY = np.finfo(np.float64).tiny
@@ -111,9 +112,9 @@ class Canvas:
     ) -> None:
         """Show every value as a square, from its low values (dark) to its high ones (bright)."""
         heard = ~np.isnan(values[:, 0])
-        values, times = values[heard], times[heard]
-        if not len(values):
+        if not heard.any():
             return
+        times, values = _thinned(times[heard], values[heard])
         low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
         shade = np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
         self.configure_heat_map(entity, names)
@@ -174,6 +175,14 @@ class Canvas:
 
 def _time_column(times: Int64) -> rr.TimeColumn:
     return rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))
+
+
+def _thinned(times: Int64, values: Float64) -> tuple[Int64, Float64]:
+    """Average successive rows until they are few enough."""
+    size = -(-len(times) // _HEAT_COLUMNS)
+    first = np.arange(0, len(times), size)
+    sizes = np.diff(first, append=len(times))
+    return times[first + sizes // 2], np.add.reduceat(values, first) / sizes[:, np.newaxis]
 
 
 def _with_holes(part: Frames, names: Sequence[str]) -> tuple[Int64, Float64]:

@@ -13,6 +13,7 @@ from schemas.files import check_new, new_file
 from schemas.times import time_text
 
 SUFFIX = ".rrd"
+_LAYOUT_BYTES = 1 << 20  # more than a blueprint has
 
 
 def check_output(output: Path) -> None:
@@ -45,6 +46,7 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     try:
         with new_file(output) as temporary:
             rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+            temporary.write_bytes(bytes(_LAYOUT_BYTES))  # for `save` waits for ever on a full disk
             recording = rr.RecordingStream(APPLICATION)
             recording.save(temporary, default_blueprint=Layout(timeline))
             canvas = Canvas(recording)
