@@ -32,7 +32,7 @@ _STREAM = {
 _FIELDS = {
     messages.STREAM_INFO: _STREAM.values(),
     messages.LABEL: ("label",),
-    messages.SEGMENT: ("label",),
+    messages.SEGMENT: ("label", "duration"),
     messages.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     messages.DIAGNOSTICS: ("status",),
 }
@@ -311,6 +311,8 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
         frames.setdefault(microphone, Counter()).update(columns["label"].tolist())
     elif columns.type == messages.SEGMENT:
         summary.segments.setdefault(microphone, Counter()).update(columns["label"].tolist())
+        if microphone.endswith("/review"):  # which has no labels frame by frame
+            _note_marks(summary.label_seconds.setdefault(microphone, Counter()), columns)
     elif columns.type == messages.GAP:
         starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
         fields = starts, seconds, columns["reason"], columns["frames_lost"]
@@ -326,6 +328,12 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
             for status in statuses:
                 said = Health(status["level"], time, status["name"], status["message"])
                 summary.health = _worse(summary.health, said)
+
+
+def _note_marks(seconds: Counter[str], columns: Columns) -> None:
+    durations = (columns["duration"] / NANOSECONDS).tolist()
+    for label, duration in zip(columns["label"].tolist(), durations, strict=True):
+        seconds[label] += duration
 
 
 def _worse(one: Health | None, other: Health | None) -> Health | None:

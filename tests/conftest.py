@@ -1,5 +1,6 @@
 """Fixtures that several tests share."""
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
+from realday import write_real_day
 from spliced import record_logs
 from stores import bucket, in_memory, s3_account
 
@@ -114,3 +116,19 @@ def sounds(request) -> list[Path]:
 def recorded(sounds, tmp_path_factory, model_file) -> Path:
     """A folder of logs with gaps, of a minute each; the last one, unfinished, is beside it."""
     return record_logs(sounds, tmp_path_factory.mktemp("logs"), model_file)
+
+
+@pytest.fixture(scope="session")
+def real_day(household, tmp_path_factory) -> Path:
+    """The logs of a day of real household sound; processes of one test run share them."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    folder = root / "real_day"
+    with (root / "real_day.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "done").exists():
+            folder.mkdir()
+            write_real_day(household, folder)
+            (folder / "done").touch()
+    return folder / "logs"

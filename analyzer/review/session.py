@@ -17,7 +17,8 @@ from schemas.messages import NANOSECONDS
 
 _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
-_CLASS_KEYS = "1234567890efghijklmorstvwxy"
+_AROUND = 600 * NANOSECONDS
+_CLASS_KEYS = "1234567890eghijklmorstvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
 
@@ -93,7 +94,8 @@ class Session:
         keys = [("a", "accept: it is as labelled") if queued else ("c", "correct as labelled")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
         keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
-        return keys + ([("n", "skip"), ("b", "back")] if queued else []) + [("q", "quit")]
+        keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
+        return [*keys, ("q", "quit")]
 
     def run(self, keys: "SimpleQueue[str]") -> int:
         """Do what keys say until the reviewer quits, closes the viewer, or is through.
@@ -140,6 +142,10 @@ class Session:
             self._undo()
         elif key in {"[", "]"}:
             self._set_end(key)
+        elif key == "f" and not self.items:
+            cursor = self._cursor()
+            self.look_closely(cursor - _AROUND, cursor + _AROUND)
+            self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
         elif key == "p":
             start, end = self._chosen()
             self.say(self.listen(start, end))
@@ -175,15 +181,19 @@ class Session:
         self.screen.redraw_marks(self.marking.microphone, self.marking.marks())
 
     def _set_end(self, key: str) -> None:
-        cursor = self.screen.cursor()
-        if cursor is None:
-            raise DataError("there is no time cursor; click on the time axis first")
+        cursor = self._cursor()
         start, end = self._span or self.screen.selection() or (cursor, cursor)
         start, end = (cursor, end) if key == "[" else (start, cursor)
         self._span = (start, max(start, end))
         if start < end:
             self.screen.show(start, end, _margin(start, end))
             self.say(self._text(start, end))
+
+    def _cursor(self) -> int:
+        cursor = self.screen.cursor()
+        if cursor is None:
+            raise DataError("there is no time cursor; click on the time axis first")
+        return cursor
 
     def _chosen(self) -> tuple[int, int]:
         item = self.items[self._at] if self.items else None

@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from analyzer.colours import GAP, Colour, colour
 from analyzer.hometime import home_zone
-from analyzer.timeline.contents import REVIEW, Microphone, Spans, Timeline, no_spans
+from analyzer.timeline.contents import REVIEW, Frames, Microphone, Spans, Timeline, no_spans
 from analyzer.timeline.grid import Int64
 from analyzer.timeline.lanes import changes, clock, disagreements, from_afar
 from analyzer.viewer.canvas import TIMELINE, Canvas
@@ -41,19 +41,32 @@ def draw(timeline: Timeline, canvas: Canvas) -> None:
     canvas.write_lines(_LINES, timeline.lines)
 
 
-def draw_frames(timeline: Timeline, canvas: Canvas) -> None:
-    """Draw what is to be seen close up: the values of every single frame."""
+def draw_frames(
+    timeline: Timeline, canvas: Canvas, start: int | None = None, end: int | None = None
+) -> None:
+    """Draw what is to be seen close up: the values of every single frame, of a span or of all."""
     for microphone in timeline.microphones.values():
         for labelling in microphone.labellings:
             if labelling.probabilities is not None and labelling.frames:
                 entity = f"{microphone.name}/frames/{_word(labelling.name)}"
                 names = labelling.probabilities.names
                 canvas.configure_lines(entity, names, [colour(name) for name in names])
-                canvas.draw_frames(entity, names, labelling.frames)
+                canvas.draw_frames(entity, names, _between(labelling.frames, start, end))
         if microphone.level_frames:
             entity = f"{microphone.name}/frames/level"
             canvas.configure_lines(entity, ["level"], [_BRIGHT])
-            canvas.draw_frames(entity, ["level"], microphone.level_frames)
+            canvas.draw_frames(entity, ["level"], _between(microphone.level_frames, start, end))
+
+
+def _between(parts: Sequence[Frames], start: int | None, end: int | None) -> list[Frames]:
+    """Return the frames that begin in a span of time."""
+    found = []
+    for names, times, values in parts:
+        first = 0 if start is None else int(np.searchsorted(times, start))
+        last = len(times) if end is None else int(np.searchsorted(times, end))
+        if first < last:
+            found.append(Frames(names, times[first:last], values[first:last]))
+    return found
 
 
 def draw_close_up(timeline: Timeline, canvas: Canvas) -> None:

@@ -34,7 +34,7 @@ _BRIGHT: Colour = (235, 215, 140)
 _NEW: Colour = (160, 200, 255)
 _TROUBLE_COLOURS: tuple[Colour, ...] = ((240, 140, 40), (230, 60, 60), (150, 90, 160))
 _PLACES = {LIVE_LANE: 1, GAP_LANE: 9, TROUBLE_LANE: 9}
-_MOST_NAMES = 1_000  # classes in all, of all models that speak while we watch
+_MOST_STATES = 2_000  # of a lane that get the colours of their own
 
 
 class LiveServer:
@@ -98,24 +98,18 @@ class LiveServer:
             self._is_laid_out = True
 
     def _show_lane(self, news: Lane) -> None:
-        place = _PLACES.get(news.name, 0)
-        entity = lane(AFAR, news.microphone, place, news.name)
-        if not news.microphone:
+        if news.microphone:
+            entity = lane(AFAR, news.microphone, _PLACES[news.name], news.name)
+        else:
             entity = f"{AFAR}/0_{news.name.replace('/', '-')}"
-        if entity not in self._lanes and not any(news.changes.states):
+        states = {state for state in news.changes.states if state is not None}
+        if entity not in self._lanes and not states:
             return  # a lane is there once it has something to show
-        self._configure_lane(entity, news)
+        known = self._lanes.get(entity) or _colours_of(news)
+        if entity not in self._lanes or (states - known.keys() and len(known) < _MOST_STATES):
+            self._lanes[entity] = {state: colour(state) for state in sorted(states)} | known
+            self._canvas.configure_lane(entity, self._lanes[entity])
         self._canvas.change_states(entity, *news.changes)
-
-    def _configure_lane(self, entity: str, news: Lane) -> None:
-        known = self._lanes.setdefault(entity, {})
-        states = {state for state in news.changes.states if state is not None} - known.keys()
-        if not known:
-            self._lanes[entity] = known = _colours_of(news)
-        elif not states or len(known) > _MOST_NAMES:
-            return
-        known |= {state: colour(state) for state in states - known.keys()}
-        self._canvas.configure_lane(entity, known)
 
     def _show_means(self, news: Means) -> None:
         kinds = self._microphones.setdefault(news.microphone, {})
@@ -190,7 +184,7 @@ class _Layout(rrb.Blueprint):
         self, microphones: dict[str, dict[str, list[tuple[str, ...]]]], minutes: float
     ) -> None:
         panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
-        plots = [_plots(name, kinds) for name, kinds in microphones.items()]
+        plots = [_plots(name, kinds) for name, kinds in sorted(microphones.items())]
         rows: list[tuple[int, rrb.View | rrb.Container]] = [
             (75 + 90 * len(plots), _lanes()),
             (580, plots[0] if len(plots) == 1 else rrb.Tabs(*plots)),

@@ -118,6 +118,11 @@ class Process:
             time.sleep(0.02)
         raise self.failed()
 
+    def check(self) -> None:
+        """Raise DataError if it ended because it could not go on."""
+        if (self._process.poll() or 0) > 0:
+            raise self.failed()
+
     def failed(self) -> DataError:
         """Make the error that says why it does not run."""
         lines = self._log.read_text(errors="replace").splitlines()
@@ -126,8 +131,7 @@ class Process:
         ]
         text = (why or lines or ["it said nothing"])[-1].strip()
         return DataError(
-            f"Rerun's viewer does not run here ({text[:200]}); use --web to look in a browser, or "
-            "--save FILE.rrd"
+            f"Rerun's viewer does not run here ({text[:200]}); use --web to look in a browser"
         )
 
     def close(self) -> None:

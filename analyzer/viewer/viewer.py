@@ -18,6 +18,7 @@ from analyzer.viewer.drawing import (
     Layout,
     draw,
     draw_close_up,
+    draw_frames,
     review_lanes,
 )
 from analyzer.viewer.file import name_recording
@@ -107,6 +108,10 @@ class Viewer:
         """Tell whether it is still there; somebody may have closed it."""
         return self._control.process.is_running()
 
+    def check(self) -> None:
+        """Raise DataError if it ended because it could not go on."""
+        self._control.process.check()
+
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
         """Show a timeline, whose spans can be marked.
 
@@ -129,6 +134,11 @@ class Viewer:
         self._recording.connect_grpc(process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
         draw(timeline, self._canvas)
+        self._flush()
+
+    def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
+        """Show every single frame of a span of it, to be zoomed into."""
+        draw_frames(timeline, self._canvas, start, end)
         self._flush()
 
     def draw_close_up(self, timeline: Timeline) -> None:

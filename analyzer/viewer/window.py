@@ -115,4 +115,5 @@ def open_hidden(port: int | None = None) -> Window:
 
 
 def _opened(port: int | None, *more: str) -> Window:
-    return Window(Process(["--hide-welcome-screen", *more], free_port(port)))
+    limit = ["--server-memory-limit", "32MB"]  # nobody comes later to see what was sent
+    return Window(Process(["--hide-welcome-screen", *limit, *more], free_port(port)))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from analyzer.viewer.viewer import Viewer
 
 _SPANS = 60
+_ALL_FRAMES = 3 * 3600 * 10**9  # ns: of more, the viewer would take a gigabyte
 
 
 def review(
@@ -162,6 +163,9 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         viewer.say(text)
 
     def look_closely(start: int, end: int) -> None:
+        if not items:
+            viewer.draw_frames(timeline, start, end)
+            return
         heard = timeline.heard
         spans = zip(heard.logs, heard.starts, heard.ends, strict=True)
         near = [log for log, first, last in spans if first < end and last > start]
@@ -184,6 +188,9 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         print(f"open {viewer.address}", flush=True)
         webbrowser.open(viewer.address)
     viewer.wait_until_drawn()
+    grid = timeline.grid
+    if not items and grid.end - grid.start <= _ALL_FRAMES:
+        look_closely(grid.start, grid.end)
     with read_keys(keys), suppress(KeyboardInterrupt):
         session.run(keys)
 
@@ -217,13 +224,13 @@ def _work(
 
 
 def _microphone(timeline: "Timeline", wanted: str | None) -> str:
-    """Return the microphone whose marks are made."""
+    """Return the microphone whose marks are made; of several the first."""
     known = ", ".join(timeline.microphones)
     if wanted is not None and wanted not in timeline.microphones:
         wrong_use(f"--microphone {wanted}: there is {known}")
     if wanted is None and len(timeline.microphones) > 1:
-        wrong_use(f"choose one with --microphone: {known}")
-    return wanted or known
+        print(f"marks are of the first microphone of {known}; --microphone chooses another one")
+    return wanted or next(iter(timeline.microphones))
 
 
 def _classes(timeline: "Timeline", microphone: str) -> list[str]:

@@ -49,7 +49,7 @@ def watch(
     if bind != _LOOPBACK and not serve:
         wrong_use("--bind goes with --serve")
     stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
     from analyzer.timeline.live import last_time
@@ -57,6 +57,7 @@ def watch(
     newest = last_time(logs)
     with ExitStack() as opened:
         server = opened.enter_context(_server(port, bind, minutes, serve=serve, web=web))
+        viewer = None
         if serve:
             _say_where(server.url, bind)
         else:
@@ -66,6 +67,8 @@ def watch(
             typer.echo(f"hearthlog: no log in {logs} yet; waiting for a recorder", err=True)
         start = 0 if newest is None else newest - minutes * 60_000_000_000
         troubled = _follow(logs, start, timezone, server, stop)
+        if viewer is not None:
+            viewer.check()
     if troubled:
         raise typer.Exit(3)
 
