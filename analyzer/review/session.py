@@ -85,7 +85,7 @@ class Session:
     _at: int = -1
     _marked: int = 0
     _began: float = 0.0
-    _span: tuple[int, int] | None = None  # as set by keys
+    _begin: int | None = None  # of a span whose end is not set yet
 
     @property
     def keys(self) -> list[tuple[str, str]]:
@@ -132,28 +132,27 @@ class Session:
 
     def _press(self, key: str) -> None:
         labels = dict(zip(_CLASS_KEYS, self.classes, strict=False)) | {"u": UNKNOWN}
+        actions: dict[str, Callable[[], None]] = {
+            "a": lambda: self._mark(self.marking.confirm),
+            "c": lambda: self._mark(self.marking.confirm),
+            "d": lambda: self._mark(self.marking.delete),
+            "z": self._undo,
+            "p": self._play,
+            "[": self._begin_here,
+            "]": self._end_here,
+        }
+        if self.items:
+            actions |= {
+                "n": lambda: self._go(1),
+                " ": lambda: self._go(1),
+                "b": lambda: self._go(-1),
+            }
+        else:
+            actions["f"] = self._look_around
         if key in labels:
             self._mark(lambda start, end: self.marking.mark(start, end, labels[key]))
-        elif key in {"a", "c"}:
-            self._mark(self.marking.confirm)
-        elif key == "d":
-            self._mark(self.marking.delete)
-        elif key == "z":
-            self._undo()
-        elif key in {"[", "]"}:
-            self._set_end(key)
-        elif key == "f" and not self.items:
-            cursor = self._cursor()
-            self.look_closely(cursor - _AROUND, cursor + _AROUND)
-            self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
-        elif key == "p":
-            start, end = self._chosen()
-            self.say(self.listen(start, end))
-            self.screen.play(start)
-        elif key in {"n", " "} and self.items:
-            self._go(1)
-        elif key == "b" and self.items:
-            self._go(-1)
+        elif key in actions:
+            actions[key]()
         elif key.strip():
             self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
 
@@ -161,7 +160,6 @@ class Session:
         start, end = self._chosen()
         made = change(start, end)
         self._marked += 1
-        self._span = None
         labels = ", ".join(dict.fromkeys(mark.label for mark in made)) or "no mark"
         self.say(f"{self._text(start, end)}  {labels}")
         self._redraw()
@@ -180,14 +178,29 @@ class Session:
     def _redraw(self) -> None:
         self.screen.redraw_marks(self.marking.microphone, self.marking.marks())
 
-    def _set_end(self, key: str) -> None:
+    def _play(self) -> None:
+        start, end = self._chosen()
+        self.say(self.listen(start, end))
+        self.screen.play(start)
+
+    def _look_around(self) -> None:
         cursor = self._cursor()
-        start, end = self._span or self.screen.selection() or (cursor, cursor)
-        start, end = (cursor, end) if key == "[" else (start, cursor)
-        self._span = (start, max(start, end))
-        if start < end:
-            self.screen.show(start, end, _margin(start, end))
-            self.say(self._text(start, end))
+        self.look_closely(cursor - _AROUND, cursor + _AROUND)
+        self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
+
+    def _begin_here(self) -> None:
+        self._begin = self._cursor()
+        self.say(f"from {local_time(self._begin, self.zone):%H:%M:%S}; set the end with ]")
+
+    def _end_here(self) -> None:
+        selection = self.screen.selection()
+        start = self._begin if self._begin is not None else selection and selection[0]
+        end = self._cursor()
+        if start is None or start >= end:
+            raise DataError("a span ends after it begins: put the cursor where it begins, press [")
+        self._begin = None
+        self.screen.show(start, end, _margin(start, end))
+        self.say(self._text(start, end))
 
     def _cursor(self) -> int:
         cursor = self.screen.cursor()
@@ -197,15 +210,14 @@ class Session:
 
     def _chosen(self) -> tuple[int, int]:
         item = self.items[self._at] if self.items else None
-        span = self._span or self.screen.selection() or (item and (item.start, item.end))
-        if span is None or span[0] >= span[1]:
+        span = self.screen.selection() or (item and (item.start, item.end))
+        if span is None:
             raise DataError(f"no span is marked: {_HELP} press a key")
         return span
 
     def _go(self, step: int) -> None:
         """Show the next or the last span of the queue."""
         self._at = max(self._at + step, 0)
-        self._span = None
         if self._at >= len(self.items):
             return
         item = self.items[self._at]

@@ -10,6 +10,9 @@ from analyzer.viewer.process import Process, check_display, free_port
 from analyzer.viewer.viewer import Blueprint, State, Viewer
 
 
+_MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
+
+
 class WindowControl:
     """Speaks with a viewer by Rerun's own client, over gRPC.
 
@@ -106,7 +109,11 @@ def open_window(port: int | None = None, data: str | None = None) -> Window:
         if data is None
         else "--serve to look from another machine"
     )
-    return _opened(port, *(["--expect-data-soon"] if data is None else ["--connect", data]))
+    return _opened(port, *(["--expect-data-soon"] if data is None else _source(data)))
+
+
+def _source(data: str) -> list[str]:
+    return ["--connect", data, "--memory-limit", _MEMORY]
 
 
 def open_hidden(port: int | None = None) -> Window:
