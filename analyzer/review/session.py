@@ -107,7 +107,7 @@ class Session:
         """
         self._began = time.monotonic()
         self.screen.redraw_marks(self.marking.microphone, self.marking.marks())
-        self.say(f"{_HELP}: {', '.join(f'{key} {text}' for key, text in self.keys)}")
+        self.say(f"{_HELP} press a key")
         if self.items:
             self._go(1)
         while self.screen.is_open() and self._at < max(len(self.items), 1):

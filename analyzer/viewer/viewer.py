@@ -164,7 +164,7 @@ class Viewer:
         self._flush()
 
     def wait_until_drawn(self) -> State:
-        """Wait until it shows what was sent to it.
+        """Wait until it shows what was sent to it; for a page, until somebody opens it.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class Viewer:
             If it ends instead, takes too long, or is of another version than the package.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
-        while time.monotonic() < deadline:
+        while self.address or time.monotonic() < deadline:
             try:
                 state = self.state()
             except (ConnectionError, TimeoutError):

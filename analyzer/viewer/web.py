@@ -7,6 +7,7 @@ import threading
 import urllib.request
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -60,6 +61,15 @@ class Relay:
             return answer.result(_ANSWER_SECONDS)
         finally:
             del self.answers[number]
+
+    def next(self) -> tuple[int, bytes]:
+        """Return the number and content of what is asked next; 0 if nothing is for a while."""
+        with suppress(queue.Empty):
+            while True:
+                number, request = self.asked.get(timeout=_POLL_SECONDS)
+                if number in self.answers:  # somebody still waits for it
+                    return number, request
+        return 0, b""
 
     def answer(self, number: int, content: bytes | None) -> None:
         """Take an answer; None if the viewer refused."""
@@ -160,11 +170,7 @@ class _Handler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length))
 
     def _send_next(self) -> None:
-        relay = self._about.relay
-        try:
-            number, request = relay.asked.get(timeout=_POLL_SECONDS)
-        except queue.Empty:
-            number, request = 0, b""
+        number, request = self._about.relay.next()
         self._send(request, "application/octet-stream", {"Number": str(number)})
 
     def _send_said(self) -> None:

@@ -9,7 +9,6 @@ from analyzer.viewer.canvas import TIMELINE
 from analyzer.viewer.process import Process, check_display, free_port
 from analyzer.viewer.viewer import Blueprint, State, Viewer
 
-
 _MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
 
 

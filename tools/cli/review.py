@@ -1,7 +1,6 @@
 """`hearthlog review`: logs on one time axis, and marks made where they are seen."""
 
 import shlex
-import webbrowser
 from contextlib import suppress
 from datetime import date, datetime, timedelta
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from tools.cli.browser import show_page
 from tools.cli.keys import read_keys
 from tools.cli.progress import share_done
 from tools.cli.reviewer import reviewer_name
@@ -185,12 +185,12 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     viewer.offer(session.keys, keys.put)
     viewer.draw(timeline, close_up=bool(items))
     if viewer.address:
-        print(f"open {viewer.address}", flush=True)
-        webbrowser.open(viewer.address)
+        show_page(viewer.address)
     viewer.wait_until_drawn()
     grid = timeline.grid
     if not items and grid.end - grid.start <= _ALL_FRAMES:
         look_closely(grid.start, grid.end)
+    print(", ".join(f"{key} {text}" for key, text in session.keys), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
         session.run(keys)
 
