@@ -34,7 +34,7 @@ _CHROMIUM = (
     "--disable-sync",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--window-size=1600,900",
+    "--window-size=1100,760",
     "--remote-debugging-port=0",
 )
 

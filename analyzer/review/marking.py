@@ -1,7 +1,7 @@
 """Marks made one after the other, each in its layer before the next; and undone."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,6 +46,7 @@ class Marking:
     corrects: str
     labelled: Spans
     _done: list[list[_Change]] = field(default_factory=list)
+    _known: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
 
     def mark(self, start: int, end: int, label: str) -> list[Mark]:
         """Say what was heard in a span of time, in nanoseconds of UTC.
@@ -96,18 +97,17 @@ class Marking:
             return None
         changes = self._done[-1]
         for change in changes:
-            write_marks(change.log, change.before, [change.span])
+            self._change_layer(change.log, change.before, change.span)
         self._done.pop()
         return changes[0].span.start, changes[-1].span.end
 
     def marks(self) -> Spans:
         """Return all marks of the microphone in these logs."""
-        found = sorted(
-            mark
-            for log in dict.fromkeys(self.heard.logs)
-            for mark in read_marks(log)
-            if mark.microphone == self.microphone
-        )
+        for log in self.heard.logs:
+            if log not in self._known:
+                self._known[log] = read_marks(log)
+        marks = (mark for known in self._known.values() for mark in known)
+        found = sorted(mark for mark in marks if mark.microphone == self.microphone)
         return Spans(
             np.array([mark.start for mark in found], np.int64),
             np.array([mark.end for mark in found], np.int64),
@@ -131,9 +131,13 @@ class Marking:
         changes = [self._change(log, first, last) for log, first, last in pieces]
         for (log, first, last), _ in zip(pieces, changes, strict=True):
             own = [mark for mark in made if first <= mark.start < last]
-            write_marks(log, own, [Span(self.microphone, first, last)])
+            self._change_layer(log, own, Span(self.microphone, first, last))
         self._done.append(changes)
         return made
+
+    def _change_layer(self, log: Path, marks: Sequence[Mark], instead_of: Span) -> None:
+        write_marks(log, marks, [instead_of])
+        self._known[log] = read_marks(log)
 
     def _change(self, log: Path, start: int, end: int) -> _Change:
         """Note the marks that a change will touch, and how far they reach."""
