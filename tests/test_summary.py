@@ -1,7 +1,9 @@
 """What a summary says of logs is what is read of them message by message, and of any MCAP file."""
 
 import json
+import shutil
 from collections import Counter
+from pathlib import Path
 from threading import Event
 
 import numpy as np
@@ -13,6 +15,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
+from analyzer.marks import Mark, write_marks
 from analyzer.summary import GapSummary, Health, summarise
 from models.modelfile import load_model
 from recorder.config import Microphone, Settings
@@ -269,6 +272,15 @@ def test_a_relabelling_is_a_layer_with_labels_of_its_own(logs, tmp_path):
     assert both.layers == [path]
     assert alone.label_seconds == {"hall/relabel/better": {"speech": 0.2, "crying": 0.3}}
     assert both.label_seconds == alone.label_seconds | summarise(logs).label_seconds
+
+
+def test_minutes_of_a_review_are_those_of_its_marks(logs, tmp_path):
+    log = Path(shutil.copy(logs[0], tmp_path))
+    spans = [(0, 2, "speech"), (3, 7, "silence"), (8, 9, "speech")]
+    marks = [Mark("hall", START + a * SECOND, START + b * SECOND, name) for a, b, name in spans]
+    found = summarise([write_marks(log, marks)])
+    assert found.label_seconds == {"hall/review": {"speech": 3, "silence": 4}}
+    assert found.segments == {"hall/review": {"speech": 2, "silence": 1}}
 
 
 def status(level, name, text):
