@@ -62,6 +62,9 @@ def follow(
         yield decode(messages, fields)
 
 
+Damaged = Callable[[LogError], None]
+
+
 def _refuse(error: LogError) -> None:
     raise error
 
@@ -71,7 +74,7 @@ def follow_messages(
     topics: Collection[str] | None = None,
     start: int | None = None,
     stop: Event | None = None,
-    damaged: Callable[[LogError], None] = _refuse,
+    damaged: Damaged = _refuse,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     """Read the messages of logs, still encoded, as they are written; as `follow` does.
 
@@ -95,12 +98,7 @@ def follow_messages(
     present = watch.new_logs()
     if start is not None:
         finished = [path for path in present if not path.name.endswith(ACTIVE_SUFFIX)]
-        for path in finished:
-            try:
-                for messages in iterate_messages([path], topics, start):
-                    yield path, messages
-            except LogError as error:
-                damaged(error)
+        yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if path.name.endswith(ACTIVE_SUFFIX) for g in _open(path)]
     if start is None:
         for log in growing:
@@ -109,13 +107,9 @@ def follow_messages(
         while not stop.is_set():
             found = False
             for log in growing:
-                try:
-                    for messages in log.read(topics, start):
-                        found = True
-                        yield log.file.path, messages
-                except LogError as error:
-                    log.is_damaged = True
-                    damaged(error)
+                for messages in log.read(topics, start, damaged):
+                    found = True
+                    yield log.file.path, messages
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
             if not found:
@@ -125,18 +119,38 @@ def follow_messages(
             log.file.close()
 
 
+def _read_finished(
+    paths: list[Path], topics: Collection[str] | None, start: int, damaged: Damaged
+) -> Iterator[tuple[Path, list[RawMessages]]]:
+    for path in paths:
+        try:
+            for messages in iterate_messages([path], topics, start):
+                yield path, messages
+        except LogError as error:
+            damaged(error)
+
+
 class _Growing:
     """A log that is being written."""
 
     def __init__(self, file: LogFile) -> None:
         self.file = file
-        self.is_damaged = False
+        self._is_damaged = False
         self._replaced = False
 
     def read(
-        self, topics: Collection[str] | None, start: int | None
+        self, topics: Collection[str] | None, start: int | None, damaged: Damaged
     ) -> Iterator[list[RawMessages]]:
         """Read what was written since the last time."""
+        try:
+            yield from self._read(topics, start)
+        except LogError as error:
+            self._is_damaged = True
+            damaged(error)
+
+    def _read(
+        self, topics: Collection[str] | None, start: int | None
+    ) -> Iterator[list[RawMessages]]:
         self._replaced = self._is_replaced()  # asked first, so that nothing comes in between
         chunks = self.file.walk()
         for part in _batches(chunks):
@@ -146,7 +160,7 @@ class _Growing:
 
     def is_open(self) -> bool:
         """Tell whether more may come; if not, close the log."""
-        if self.file.ended or self._replaced or self.is_damaged:
+        if self.file.ended or self._replaced or self._is_damaged:
             self.file.close()
             return False
         return True

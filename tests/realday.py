@@ -91,7 +91,10 @@ def write_real_day(household: Path, folder: Path) -> Path:
     model = folder / "home.safetensors"
     save_model(train_model(data, scenario, lambda *_: None, RECIPES["paper"]), model)
     pieces = {name: _write_piece(folder / f"{name}.wav", clips[name]) for name in CLASSES}
-    halves = [(folder, model, [pieces[name] for name in names], half) for half, names in enumerate(_halves())]
+    halves = [
+        (folder, model, [pieces[name] for name in names], half)
+        for half, names in enumerate(_halves())
+    ]
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         pool.starmap(_record, halves)
     return folder / "logs"
@@ -108,7 +111,11 @@ def _halves() -> tuple[list[str], list[str]]:
 
 def _record(folder: Path, model: Path, paths: list[Path], half: int) -> None:
     settings = Settings(
-        output=folder / "logs", model=model, timezone=ZONE, statistics_every=200, sync_seconds=3600.0
+        output=folder / "logs",
+        model=model,
+        timezone=ZONE,
+        statistics_every=200,
+        sync_seconds=3600.0,
     )
     source = FileSource(paths, START + half * 12 * HOUR)
     record(settings, LossySource(source, {_LOST: _LOST_FRAMES} if half else {}), Flag())

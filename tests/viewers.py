@@ -34,7 +34,6 @@ _CHROMIUM = (
     "--disable-sync",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--window-size=1100,760",
     "--remote-debugging-port=0",
 )
 
@@ -234,12 +233,12 @@ class Window:
 class Page:
     """A page in a browser without a screen, over the protocol of its developer tools."""
 
-    def __init__(self, address, folder):
+    def __init__(self, address, folder, size):
         _need("chromium")
         folder.mkdir(parents=True, exist_ok=True)
         self._log = (folder / "chromium.log").open("wb")
         self._browser = subprocess.Popen(
-            ["chromium", *_CHROMIUM, f"--user-data-dir={folder}", address],
+            ["chromium", *_CHROMIUM, f"--window-size={size}", f"--user-data-dir={folder}", address],
             stdout=self._log,
             stderr=self._log,
         )
@@ -320,9 +319,9 @@ class Page:
 
 
 @contextmanager
-def browsing(address, folder):
-    """Open a page."""
-    page = Page(address, folder)
+def browsing(address, folder, size="1100,760"):
+    """Open a page; a large one is drawn slowly."""
+    page = Page(address, folder, size)
     try:
         yield page
     finally:

@@ -1,6 +1,7 @@
 """What is new in logs that are being written, second by second; what is kept does not grow."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from datetime import tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -75,11 +76,14 @@ def last_time(folder: Path) -> int | None:
     """
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that `hearthlog record` writes to")
-    try:
-        logs = [(path.stat().st_mtime_ns, path) for path in find_logs(folder) if not is_layer(path)]
-    except (LogError, OSError):  # none yet, or one got its final name at this moment
-        return None
+    logs: list[tuple[int, Path]] = []
+    with suppress(LogError):  # none yet
+        for path in find_logs(folder):
+            with suppress(FileNotFoundError):  # it got its final name at this moment
+                logs.append((path.stat().st_mtime_ns, path))
     for _, path in sorted(logs, reverse=True):
+        if is_layer(path):
+            continue
         try:
             span = time_span(path)
         except LogError:

@@ -1,7 +1,6 @@
 """`hearthlog watch`: what is heard, live, from the log that a recorder is writing."""
 
 import signal
-import webbrowser
 from collections import deque
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tools.cli.browser import show_page
 from tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
@@ -52,9 +52,11 @@ def watch(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
+    from analyzer.hometime import home_zone
     from analyzer.timeline.live import last_time
 
     newest = last_time(logs)
+    home_zone(timezone)
     with ExitStack() as opened:
         server = opened.enter_context(_server(port, bind, minutes, serve=serve, web=web))
         viewer = None
@@ -91,8 +93,7 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
     if not web:
         return open_window(data=url)
     viewer = open_page(port, url)
-    typer.echo(f"hearthlog: watching at {viewer.address}; Ctrl-C ends it", err=True)
-    webbrowser.open(viewer.address)
+    show_page(viewer.address)
     return viewer
 
 
