@@ -115,8 +115,8 @@ class Marking:
         )
 
     def _write(self, start: int, end: int, said: Iterable[tuple[int, int, str]]) -> list[Mark]:
-        start = max(start, self.heard.starts[0])
-        end = min(end, self.heard.ends[-1])
+        start = max([start, *self.heard.starts[:1]])
+        end = min([end, *self.heard.ends[-1:]])
         pieces = self.heard.split(start, end) if start < end else []
         if not pieces:
             raise DataError("not all of this span was recorded: mark a part that was")

@@ -72,7 +72,7 @@ def _listed(path: Path, microphone: str, limits: Limits) -> list[Span]:
 
 
 def _items(spans: Iterable[Span]) -> list[Item]:
-    return [Item(span.start, span.end, _text(span)) for span in spans]
+    return [Item(span.start, span.end, span.label_a, _text(span)) for span in spans]
 
 
 def _text(span: Span) -> str:

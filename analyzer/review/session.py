@@ -23,10 +23,21 @@ _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time
 
 
 class Item(NamedTuple):
-    """A span that is to be reviewed, and why."""
+    """A span that is to be reviewed.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    label : str
+        What it is labelled, the longest; this is what is accepted.
+    text : str
+        What else there is to say.
+    """
 
     start: int
     end: int
+    label: str
     text: str
 
 
@@ -91,7 +102,7 @@ class Session:
     def keys(self) -> list[tuple[str, str]]:
         """List the keys, and what they do."""
         queued = bool(self.items)
-        keys = [("a", "accept: it is as labelled") if queued else ("c", "correct as labelled")]
+        keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
         keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
         keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
@@ -133,8 +144,6 @@ class Session:
     def _press(self, key: str) -> None:
         labels = dict(zip(_CLASS_KEYS, self.classes, strict=False)) | {"u": UNKNOWN}
         actions: dict[str, Callable[[], None]] = {
-            "a": lambda: self._mark(self.marking.confirm),
-            "c": lambda: self._mark(self.marking.confirm),
             "d": lambda: self._mark(self.marking.delete),
             "z": self._undo,
             "p": self._play,
@@ -143,18 +152,22 @@ class Session:
         }
         if self.items:
             actions |= {
+                "a": lambda: self._mark_as(self.items[self._at].label),
                 "n": lambda: self._go(1),
                 " ": lambda: self._go(1),
                 "b": lambda: self._go(-1),
             }
         else:
-            actions["f"] = self._look_around
+            actions |= {"c": lambda: self._mark(self.marking.confirm), "f": self._look_around}
         if key in labels:
-            self._mark(lambda start, end: self.marking.mark(start, end, labels[key]))
+            self._mark_as(labels[key])
         elif key in actions:
             actions[key]()
         elif key.strip():
             self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
+
+    def _mark_as(self, label: str) -> None:
+        self._mark(lambda start, end: self.marking.mark(start, end, label))
 
     def _mark(self, change: Callable[[int, int], list[Mark]]) -> None:
         start, end = self._chosen()

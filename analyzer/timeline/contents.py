@@ -153,8 +153,8 @@ class Timeline:
     lines : Lines
     zone : str
         IANA name of the home's time zone.
-    heard : Heard
-        Which log has what.
+    heard : dict of str to Heard
+        Which log has what of each microphone.
     every : int
         One of so many parts of the logs was read.
     losses : list of str
@@ -165,7 +165,7 @@ class Timeline:
     microphones: dict[str, Microphone]
     lines: Lines
     zone: str
-    heard: Heard
+    heard: dict[str, Heard]
     every: int = 1
     losses: list[str] = field(default_factory=list)
 

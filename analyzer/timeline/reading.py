@@ -116,10 +116,18 @@ def read_timeline(
             losses.append(str(error))
         progress((number + 1) / len(found))
     known = home_zone(zone, _records(file.path for file in found))
-    heard = heard_in([(f.first, f.last + FRAME_NANOSECONDS, f.path) for f in found if not f.layer])
-    timeline = Timeline(
-        grid, reader.microphones(), reader.lines(), str(known), heard, reader.every, losses
-    )
+    microphones = reader.microphones()
+    heard = {
+        name: heard_in(
+            [
+                (file.first, file.last + FRAME_NANOSECONDS, file.path)
+                for file in found
+                if not file.layer and file.path in reader.logs(name)
+            ]
+        )
+        for name in microphones
+    }
+    timeline = Timeline(grid, microphones, reader.lines(), str(known), heard, reader.every, losses)
     if not timeline.microphones:
         raise _nothing(losses, limited=start is not None or end is not None)
     return timeline
@@ -244,6 +252,7 @@ class _Heard:
     gaps: list[Spans] = field(default_factory=list)
     troubles: list[tuple[int, str]] = field(default_factory=list)
     clips: list[Clip] = field(default_factory=list)
+    logs: set[Path] = field(default_factory=set)
 
 
 class _Reader:
@@ -312,6 +321,7 @@ class _Reader:
             self._take_health(columns)
         elif match := TOPIC.fullmatch(columns.topic):
             heard = self._microphone(match["microphone"])
+            heard.logs.add(path)
             name = match["labelling"] or LIVE
             if columns.type == messages.FEATURES:
                 self._take_features(path, columns, heard)
@@ -402,6 +412,10 @@ class _Reader:
             for name, heard in sorted(self._heard.items())
             if heard.features.means or heard.labels or heard.spans or heard.gaps or heard.clips
         }
+
+    def logs(self, microphone: str) -> set[Path]:
+        """Return the logs and layers that have something of a microphone."""
+        return self._heard[microphone].logs
 
     def lines(self) -> Lines:
         """Return the events, in the order of time."""

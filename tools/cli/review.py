@@ -166,7 +166,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         if not items:
             viewer.draw_frames(timeline, start, end)
             return
-        heard = timeline.heard
+        heard = timeline.heard[microphone]
         spans = zip(heard.logs, heard.starts, heard.ends, strict=True)
         near = [log for log, first, last in spans if first < end and last > start]
         viewer.draw_close_up(read_timeline(near, start, end, zone=timeline.zone))
@@ -215,7 +215,7 @@ def _work(
             )
     marking = Marking(
         microphone,
-        timeline.heard,
+        timeline.heard[microphone],
         choice.reviewer,
         labelling.removeprefix("relabel/"),
         known.get(labelling, no_spans()),
