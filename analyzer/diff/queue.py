@@ -119,6 +119,8 @@ def make_queue(  # noqa: PLR0913
     if not scores.any():
         raise DataError(f"{side.name}: no span is {ranking}")
     rows = _best_of_each(scores, windows.sources)
+    if ranking is not None:
+        rows = rows[scores[rows] > 0.0]
     rows = rows[_spread(scores[rows], windows.taken(rows), count)]
     return Queue(
         windows.taken(rows),

@@ -294,8 +294,10 @@ class _Reader:
         """Yield topics, the log time up to which they are read, and one of how many chunks."""
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
+            complete = log.complete  # or its topics are known only when all of it is read
         if not file.layer:
-            yield [name for name in topics if not name.endswith("/statistics")], None, self.every
+            wanted = [name for name in topics if not name.endswith("/statistics")]
+            yield wanted if complete else None, None, self.every
             return
         self._check_alone(file.path, topics)
         # They have chunks of their own, so all can be read even where labels are too many.

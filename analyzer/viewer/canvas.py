@@ -16,6 +16,7 @@ from analyzer.timeline.grid import Float64, Int64
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough
 _ROWS_AT_ONCE = 72_000  # an hour of frames
+_FLUSH_SECONDS = 60.0  # without a limit, Rerun waits for ever where a disk is full
 _HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
@@ -168,7 +169,7 @@ class Canvas:
             If it cannot be written.
         """
         try:
-            self.recording.flush()
+            self.recording.flush(timeout_sec=_FLUSH_SECONDS)
         except RuntimeError as error:  # all that comes of a full disk
             raise OSError(f"{error}; is the disk full?") from error
 

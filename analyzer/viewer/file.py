@@ -13,7 +13,7 @@ from schemas.files import check_new, new_file
 from schemas.times import time_text
 
 SUFFIX = ".rrd"
-_LAYOUT_BYTES = 1 << 20  # more than a blueprint has
+_FOOT, _END = b"RRF2FOOT", 64  # with which a recording ends, and within how many bytes
 
 
 def check_output(output: Path) -> None:
@@ -44,19 +44,26 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     """
     check_output(output)
     try:
-        with new_file(output) as temporary:
+        with new_file(output) as temporary, temporary.open("wb") as file:
             rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
-            temporary.write_bytes(bytes(_LAYOUT_BYTES))  # for `save` waits for ever on a full disk
             recording = rr.RecordingStream(APPLICATION)
-            recording.save(temporary, default_blueprint=Layout(timeline))
+            stream = rr.binary_stream(recording)  # for `save` waits for ever where the disk is full
+            recording.send_blueprint(Layout(timeline))
             canvas = Canvas(recording)
             name_recording(recording, timeline)
             draw(timeline, canvas)
             draw_frames(timeline, canvas)
-            canvas.flush()
-            recording.disconnect()
+            file.write(stream.read() or b"")
     except LogError as error:
         raise DataError(str(error)) from error
+
+
+def _check_complete(path: Path) -> None:
+    """Raise OSError if the end of a recording is missing, of which Rerun says nothing."""
+    with path.open("rb") as stream:
+        stream.seek(max(path.stat().st_size - _END, 0))
+        if _FOOT not in stream.read():
+            raise OSError("its end is missing: is the disk full?")
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:

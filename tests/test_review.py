@@ -1,0 +1,711 @@
+"""Marks that a reviewer makes at a viewer: in the layer at once, undone, never lost."""
+
+import contextlib
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from datetime import UTC
+from itertools import pairwise
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event as Flag
+
+import numpy as np
+import psutil
+import pytest
+from conftest import HEARTHLOG
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lossy import LossySource
+from spliced import run
+from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
+
+from analyzer.diff.listing import Span as Listed
+from analyzer.diff.listing import write_list
+from analyzer.diff.sources import find_sources
+from analyzer.errors import DataError
+from analyzer.heard import Heard
+from analyzer.marks import Mark, read_marks, write_marks
+from analyzer.review.marking import Marking
+from analyzer.review.queue import queue_items
+from analyzer.review.session import Item, Session
+from analyzer.review.sound import sound_of
+from analyzer.timeline.contents import Clip
+from analyzer.timeline.reading import read_timeline
+from recorder.config import Settings
+from recorder.service import record
+from recorder.sources.replayed import FileSource
+from recorder.stream import FRAME_NANOSECONDS
+from schemas.files import find_logs, is_layer
+
+__all__ = ["display"]  # a fixture
+
+SECOND = 1_000_000_000
+START = 1_772_348_370 * SECOND  # half a minute before a full hour: so there are four logs
+LOST = {5: 7, 9: 400}
+OLD = ("Bob", 7, "live")
+
+
+@pytest.fixture(scope="module")
+def recorded_home(tmp_path_factory, model_file, hmm_file, day):
+    """Logs of three minutes, and a second labelling of them."""
+    folder = tmp_path_factory.mktemp("home") / "logs"
+    options = Settings(output=folder, model=model_file, max_bag_duration=60)
+    recording = record(options, LossySource(FileSource([day], START), LOST), Flag())
+    assert len(recording.logs) == 4
+    command = [*HEARTHLOG, "relabel", str(folder), "--model", str(hmm_file)]
+    subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def timeline(recorded_home):
+    return read_timeline([recorded_home])
+
+
+@pytest.fixture
+def home(recorded_home, tmp_path):
+    """A copy of the logs, to be reviewed."""
+    return shutil.copytree(recorded_home, tmp_path / "home")
+
+
+@pytest.fixture(scope="module")
+def shared_home(recorded_home, tmp_path_factory):
+    return shutil.copytree(recorded_home, tmp_path_factory.mktemp("shared") / "home")
+
+
+def marking_of(folder, reviewer="Ann"):
+    timeline = read_timeline([folder])
+    spans = timeline.microphones["mic"].labellings[0].spans
+    return Marking("mic", timeline.heard["mic"], reviewer, "live", spans)
+
+
+def layers(folder):
+    """All marks that are in review layers."""
+    return [m for log in find_logs(folder) if not is_layer(log) for m in read_marks(log)]
+
+
+# Marking
+
+
+CELL = 2 * FRAME_NANOSECONDS
+CELLS = 2000
+operations = st.tuples(
+    st.sampled_from(["mark", "mark", "confirm", "delete", "undo"]),
+    st.integers(0, CELLS - 1),
+    st.integers(1, 900),
+    st.sampled_from(["coughing", "yelling", "unknown"]),
+)
+
+
+def cells_of(spans):
+    """What spans say in each cell; None where nothing."""
+    middles = START + np.arange(CELLS) * CELL + CELL // 2
+    found = np.full(CELLS, None, object)
+    for start, end, text in zip(*spans, strict=True):
+        found[(middles >= start) & (middles < end)] = text
+    return found
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(operations, min_size=1, max_size=6))
+def test_marks_are_what_was_said_last_and_undone_they_are_as_before(shared_home, done):
+    for log in find_logs(shared_home):
+        if ".review." in log.name:
+            log.unlink()
+    marking = marking_of(shared_home)
+    edge = marking.heard.starts[1]
+    for log, start, end in ((0, edge - SECOND, edge), (1, edge + SECOND, edge + 2 * SECOND)):
+        write_marks(marking.heard.logs[log], [Mark("mic", start, end, "music", *OLD)])
+    before = layers(shared_home)
+    said = np.array(cells_of(marking.labelled))
+    history = [cells_of(marking.marks())]
+    last = int((marking.heard.ends[-1] - START) // CELL)
+    for kind, first, length, label in done:
+        now = history[-1].copy()
+        cells = slice(first, min(first + length, last))
+        start, end = START + first * CELL, START + (first + length) * CELL
+        if kind == "undo":
+            assert (marking.undo() is not None) == (len(history) > 1)
+            history = history[:-1] or history
+            now = history[-1]
+        else:
+            extent = {"mark": label, "confirm": said[cells], "delete": None}[kind]
+            arguments = (start, end, label) if kind == "mark" else (start, end)
+            try:
+                getattr(marking, kind)(*arguments)
+            except DataError:
+                assert kind == "confirm" or first >= last
+            else:
+                now[cells] = extent
+                history.append(now)
+        unsure = {last - 1, last}  # the last cell may end between two frames
+        found = cells_of(marking.marks())
+        assert [c for i, c in enumerate(found) if i not in unsure] == [
+            c for i, c in enumerate(now) if i not in unsure
+        ]
+        assert as_rows(marking.marks()) == [(m.start, m.end, m.label) for m in layers(shared_home)]
+    while marking.undo() is not None:
+        pass
+    assert layers(shared_home) == before
+
+
+def as_rows(spans):
+    return list(zip(spans.starts.tolist(), spans.ends.tolist(), spans.texts, strict=True))
+
+
+def test_a_mark_says_who_made_it_when_and_what_it_corrects(home):
+    began = time.time_ns()
+    marking_of(home).mark(START + SECOND, START + 2 * SECOND, "yelling")
+    (mark,) = layers(home)
+    assert mark[:6] == ("mic", START + SECOND, START + 2 * SECOND, "yelling", "Ann", mark.made)
+    assert began <= mark.made <= time.time_ns()
+    assert mark.corrects == "live"
+
+
+def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
+    marking = marking_of(home)
+    first, second = marking.heard.starts[1:3]
+    marking.mark(first - SECOND, second + SECOND, "yelling")
+    found = [read_marks(log) for log in marking.heard.logs]
+    assert [[(m.start, m.end) for m in marks] for marks in found] == [
+        [(first - SECOND, first)],
+        [(first, second)],
+        [(second, second + SECOND)],
+        [],
+    ]
+
+
+def test_what_was_not_recorded_cannot_be_marked_and_nothing_changes(home):
+    whole = marking_of(home)
+    hole = Heard(*(list(column[:1]) + list(column[2:]) for column in vars(whole.heard).values()))
+    marking = Marking("mic", hole, "Ann", "live", whole.labelled)
+    for start, end in (
+        (hole.ends[0] - SECOND, hole.starts[1] + SECOND),
+        (hole.ends[0] + SECOND, hole.ends[0] + 2 * SECOND),
+        (START - 2 * SECOND, START - SECOND),
+        (hole.ends[-1] + SECOND, hole.ends[-1] + 2 * SECOND),
+    ):
+        with pytest.raises(DataError, match="not all of this span was recorded"):
+            marking.mark(start, end, "yelling")
+    assert layers(home) == []
+    assert marking.undo() is None
+
+
+def test_a_label_that_cannot_be_is_refused_and_nothing_changes(home):
+    marking = marking_of(home)
+    for label in ("", "a/b\n", "x" * 500):
+        with pytest.raises(DataError, match="cannot be the name of a class"):
+            marking.mark(START, START + SECOND, label)
+    assert layers(home) == []
+    assert marking.undo() is None
+
+
+def test_marks_of_one_of_two_homes_in_a_folder_are_beside_its_own_logs(
+    recorded_home, tmp_path, model_file, day
+):
+    shutil.copytree(recorded_home, tmp_path / "both")
+    options = Settings(
+        output=tmp_path / "both", model=model_file, node="other", microphone=[{"name": "bath"}]
+    )
+    others = record(options, FileSource([day], START + 7 * SECOND), Flag()).logs
+    timeline = read_timeline([tmp_path / "both"])
+    assert sorted(timeline.microphones) == ["bath", "mic"]
+    assert timeline.heard["bath"].logs == others
+    marking = Marking(
+        "bath",
+        timeline.heard["bath"],
+        "Ann",
+        "live",
+        timeline.microphones["bath"].labellings[0].spans,
+    )
+    marking.mark(START + 40 * SECOND, START + 50 * SECOND, "yelling")
+    assert [mark.microphone for log in others for mark in read_marks(log)] == ["bath"]
+    assert len(layers(tmp_path / "both")) == 1
+
+
+# Keys
+
+
+class Screen:
+    """A viewer that keeps what it is told."""
+
+    def __init__(self):
+        self.open = True
+        self.marked = None
+        self.at = None
+        self.answers = True
+        self.shown = []
+        self.played = []
+        self.lane = None
+
+    def is_open(self):
+        return self.open
+
+    def selection(self):
+        if not self.answers:
+            raise TimeoutError
+        return self.marked
+
+    def cursor(self):
+        return self.at
+
+    def show(self, start, end, margin):
+        self.marked = (start, end)
+        self.shown.append((start, end, margin))
+
+    def play(self, start):
+        self.played.append(start)
+
+    def redraw_marks(self, microphone, marks):
+        assert microphone == "mic"
+        self.lane = as_rows(marks)
+
+
+class Sitting:
+    """A session, and what it says."""
+
+    def __init__(self, home, items=()):
+        self.screen = Screen()
+        self.said = []
+        self.closely = []
+        self.heard = []
+        marking = marking_of(home)
+        self.labelled = marking.labelled
+        self.session = Session(
+            self.screen,
+            marking,
+            ["silence", "speech", "coughing"],
+            UTC,
+            self.said.append,
+            lambda start, end: self.closely.append((start, end)),
+            lambda start, end: self.heard.append((start, end)) or "playing",
+            items,
+        )
+
+    def run(self, keys):
+        queue = SimpleQueue()
+        for key in keys:
+            queue.put(key)
+        queue.put("q")
+        return self.session.run(queue)
+
+
+def items_of(count):
+    return [
+        Item(START + k * 10 * SECOND, START + (k * 10 + 5) * SECOND, "music", f"item {k}")
+        for k in range(count)
+    ]
+
+
+def test_a_key_names_the_span_that_is_marked_with_the_mouse(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = span = (START + 10 * SECOND, START + 12 * SECOND)
+    assert sitting.run("2") == 1
+    assert [(m.start, m.end, m.label) for m in layers(home)] == [(*span, "speech")]
+    assert sitting.screen.lane == [(*span, "speech")]
+    assert "speech" in sitting.said[1]
+    assert sitting.said[-1].startswith("1 span marked in")
+
+
+def test_correct_is_what_the_recorder_said_in_the_span(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = start, end = (START + 10 * SECOND, START + 40 * SECOND)
+    sitting.run("c")
+    said = [
+        (max(a, start), min(b, end), text)
+        for a, b, text in as_rows(sitting.labelled)
+        if a < end and b > start
+    ]
+    edge = marking_of(home).heard.starts[1]
+    found = [(m.start, m.end, m.label) for m in layers(home)]
+    assert len({label for *_, label in found}) > 1
+    assert [m for m in found if edge not in m[:2]] == [m for m in said if not m[0] < edge < m[1]]
+
+
+def test_unknown_delete_and_undo(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = (START + 10 * SECOND, START + 12 * SECOND)
+    assert sitting.run("u") == 1
+    assert [m.label for m in layers(home)] == ["unknown"]
+    assert sitting.run("d") == 2
+    assert layers(home) == []
+    assert sitting.run("z") == 1
+    assert [m.label for m in layers(home)] == ["unknown"]
+    assert sitting.run("zz") == 0
+    assert layers(home) == []
+    assert "nothing to undo" in sitting.said
+
+
+def test_the_ends_of_a_span_are_set_at_the_cursor(home):
+    sitting = Sitting(home)
+    sitting.screen.at = START + 10 * SECOND
+    sitting.session.press("[")
+    sitting.screen.at = START + 13 * SECOND
+    sitting.session.press("]")
+    assert sitting.screen.shown[-1][:2] == (START + 10 * SECOND, START + 13 * SECOND)
+    sitting.session.press("3")
+    assert [(m.start, m.end, m.label) for m in layers(home)] == [
+        (START + 10 * SECOND, START + 13 * SECOND, "coughing")
+    ]
+    sitting.screen.at = START + 9 * SECOND
+    sitting.session.press("[")
+    sitting.screen.at = START + 8 * SECOND
+    sitting.session.press("]")
+    assert "a span ends after it begins" in sitting.said[-1]
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("2", "no span is marked: drag a span on the time ruler"),
+        ("c", "no span is marked"),
+        ("]", "there is no time cursor"),
+        ("?", "'?' is no key; c correct"),
+        ("n", "'n' is no key"),
+    ],
+)
+def test_a_key_that_does_not_fit_is_explained_and_changes_nothing(home, key, said):
+    sitting = Sitting(home)
+    sitting.session.press(key)
+    assert said in sitting.said[-1]
+    assert layers(home) == []
+
+
+def test_a_span_that_was_not_recorded_is_explained_and_the_session_goes_on(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = (START - 9 * SECOND, START - 5 * SECOND)
+    sitting.session.press("2")
+    assert "not all of this span was recorded" in sitting.said[-1]
+    sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
+    sitting.session.press("2")
+    assert len(layers(home)) == 1
+
+
+def test_a_viewer_that_does_not_answer_costs_no_mark(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
+    sitting.screen.answers = False
+    sitting.session.press("2")
+    assert "did not answer" in sitting.said[-1]
+    sitting.screen.answers = True
+    sitting.session.press("2")
+    assert len(layers(home)) == 1
+
+
+def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
+    items = items_of(3)
+    sitting = Sitting(home, items)
+    queue = SimpleQueue()
+    for key in "23u":
+        queue.put(key)
+    assert sitting.session.run(queue) == 3
+    assert [(start, end) for start, end, _ in sitting.screen.shown] == [item[:2] for item in items]
+    assert [(m.start, m.end, m.label) for m in layers(home)] == [
+        (*item[:2], label)
+        for item, label in zip(items, ["speech", "coughing", "unknown"], strict=True)
+    ]
+    assert [line[:3] for line in sitting.said if line[1:2] == "/"] == ["1/3", "2/3", "3/3"]
+    assert all(
+        a < item.start and b > item.end for (a, b), item in zip(sitting.closely, items, strict=True)
+    )
+
+
+def test_in_a_queue_one_may_skip_go_back_and_accept(home):
+    items = items_of(4)
+    sitting = Sitting(home, items)
+    assert sitting.run("nnba" + "bbbbb" + "1p") == 2
+    starts = [item.start for item in items]
+    visited = [starts.index(start) for start, _, _ in sitting.screen.shown]
+    assert visited == [0, 1, 2, 1, 2, 1, 0, 0, 0, 0, 1]
+    assert [(m.start, m.end, m.label) for m in layers(home)] == [
+        (*items[0][:2], "silence"),
+        (*items[1][:2], "music"),
+    ]
+    assert sitting.heard == [items[1][:2]]
+    assert sitting.screen.played == [items[1].start]
+
+
+def test_in_a_queue_the_span_that_is_dragged_counts(home):
+    sitting = Sitting(home, items_of(2))
+    sitting.run("")
+    sitting.screen.marked = (START + SECOND, START + 2 * SECOND)
+    sitting.session.press("2")
+    assert [(m.start, m.end) for m in layers(home)] == [(START + SECOND, START + 2 * SECOND)]
+
+
+def test_a_session_ends_when_the_viewer_is_closed(home):
+    sitting = Sitting(home, items_of(2))
+    sitting.screen.open = False
+    assert sitting.session.run(SimpleQueue()) == 0
+
+
+def test_every_key_is_offered_once_with_what_it_does(home):
+    for items in ((), items_of(1)):
+        keys = [key for key, _ in Sitting(home, items).session.keys]
+        assert len(set(keys)) == len(keys)
+    many = Sitting(home)
+    many.session.classes = [f"class_{i}" for i in range(60)]
+    keys = [key for key, _ in many.session.keys]
+    assert len(set(keys)) == len(keys)
+
+
+# Sound
+
+
+def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
+    clips = [
+        Clip(START, 100, np.arange(500, dtype=np.float32)),
+        Clip(START + 10 * SECOND, 100, np.arange(1000, 1500, dtype=np.float32)),
+        Clip(START + 11 * SECOND, 44_100, np.zeros(5, np.float32)),
+    ]
+    rate, samples = sound_of(clips, START + 4 * SECOND, START + 12 * SECOND)
+    assert rate == 100
+    assert samples.tolist() == [*range(400, 500), *range(1000, 1200)]
+    assert len(sound_of(clips, START + 6 * SECOND, START + 7 * SECOND)[1]) == 0
+
+
+# What is in the queue
+
+
+@pytest.mark.parametrize("ranking", ["uncertain", "novel", "disagreeing", "random"])
+def test_a_queue_has_spans_of_the_labelling_that_do_not_overlap(recorded_home, timeline, ranking):
+    sources = find_sources(recorded_home)
+    found = queue_items(ranking, sources, ("mic", "live"), (None, None), 8)
+    assert 2 <= len(found) <= 8
+    ordered = sorted(found)
+    assert all(a.end <= b.start for a, b in pairwise(ordered))
+    assert all(timeline.grid.start <= item.start < item.end <= timeline.grid.end for item in found)
+    assert all(item.text.startswith("live: ") for item in found)
+    if ranking == "disagreeing":
+        spans = [one.spans for one in timeline.microphones["mic"].labellings[:2]]
+        for item in found:
+            texts = [
+                {t for a, b, t in as_rows(each) if a < item.end and b > item.start}
+                for each in spans
+            ]
+            assert texts[0] != texts[1] or len(texts[0]) > 1
+    again = queue_items(ranking, sources, ("mic", "live"), (None, None), 8)
+    assert again == found
+
+
+def test_what_was_reviewed_is_not_in_the_queue(home):
+    (first, *_) = queue_items("uncertain", find_sources(home), ("mic", "live"), (None, None), 5)
+    marking_of(home).mark(first.start, first.end, "yelling")
+    found = queue_items("uncertain", find_sources(home), ("mic", "live"), (None, None), 5)
+    assert all(item.end <= first.start or item.start >= first.end for item in found)
+
+
+def test_a_list_of_diff_is_gone_through_in_its_order(recorded_home, tmp_path):
+    spans = [
+        Listed(
+            "mic",
+            START + k * SECOND,
+            START + (k + 2) * SECOND,
+            "live",
+            "speech",
+            "",
+            "",
+            None,
+            "novelty",
+        )
+        for k in (50, 20, 90)
+    ]
+    other = spans[0]._replace(microphone="bath")
+    write_list(tmp_path / "list.csv", [other, *spans])
+    arguments = (str(tmp_path / "list.csv"), find_sources(recorded_home), ("mic", "live"))
+    found = queue_items(*arguments, (None, None), 60)
+    assert [item[:2] for item in found] == [span[1:3] for span in spans]
+    part = queue_items(*arguments, (START + 21 * SECOND, START + 60 * SECOND), 60)
+    assert [item.start for item in part] == [spans[0].start, spans[1].start]
+    assert len(queue_items(*arguments, (None, None), 1)) == 1
+
+
+# Bad input
+
+
+@pytest.fixture
+def in_folder(tmp_path, monkeypatch):
+    """A folder of its own, to be in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def no_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.mark.usefixtures("no_display")
+def test_without_a_display_it_says_what_else_there_is(recorded_home, capfd):
+    done = run(capfd, "review", recorded_home)
+    assert done.returncode == 1
+    assert "no display here: use --web to look in a browser, or --save FILE.rrd" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_port_that_is_in_use_is_said(recorded_home, capfd):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = run(capfd, "review", recorded_home, "--web", "--port", port)
+    assert done.returncode == 1
+    assert f"port {port} is in use" in done.stderr
+    assert "--port" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--save", "a.rrd", "--web"], (2, "--save makes a file")),
+        (["--save", "a.rrd", "--queue", "novel"], (2, "--save makes a file")),
+        (["--day", "2026-03-01", "--start", "2026-03-01T07:00"], (2, "--day is a span of its own")),
+        (["--day", "someday", "--save", "a.rrd"], (2, "not a day such as 2026-03-01")),
+        (["--day", "2020-01-01", "--save", "a.rrd"], (1, "in this span of time")),
+        (["--start", "2026-03-01T08", "--end", "2026-03-01T07"], (2, "is not after --start")),
+        (["--start", "2030-01-01T00:00", "--save", "a.rrd"], (1, "in this span of time")),
+        (["--timezone", "Nowhere", "--save", "a.rrd"], (1, "is no time zone")),
+        (["--save", "a.mcap"], (1, "must end in .rrd")),
+        (["--save", "none/a.rrd"], (1, "there is no folder")),
+        (["--web", "--microphone", "cellar"], (2, "--microphone cellar: there is mic")),
+        (["--web", "--labels", "nobody"], (1, "no labelling 'nobody'")),
+        (["--web", "--queue", "boring"], (1, "use uncertain, disagreeing, novel, random")),
+        (["--web", "--queue", "none.csv"], (1, "none.csv")),
+        (["--web", "--reviewer", "a\nb"], (2, "")),
+    ],
+)
+def test_what_cannot_be_is_one_clear_message(recorded_home, in_folder, capfd, options, expected):
+    status, text = expected
+    done = run(capfd, "review", recorded_home, *options)
+    assert (done.returncode, done.stdout) == (status, "")
+    assert text in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr
+    assert list(in_folder.iterdir()) == []
+
+
+def test_a_file_that_exists_is_left_alone(recorded_home, capfd, tmp_path):
+    (tmp_path / "a.rrd").write_text("precious")
+    done = run(capfd, "review", recorded_home, "--save", tmp_path / "a.rrd")
+    assert (done.returncode, (tmp_path / "a.rrd").read_text()) == (1, "precious")
+    assert "exists already" in done.stderr
+
+
+def test_a_queue_of_logs_without_labels_is_refused(tmp_path, capfd, day):
+    record(Settings(output=tmp_path / "logs"), FileSource([day], START), Flag())
+    done = run(capfd, "review", tmp_path / "logs", "--web", "--queue", "novel")
+    assert done.returncode == 1
+    assert "no labelling 'live'" in done.stderr or "no segments" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_logs_that_cannot_be_read_are_named_and_the_rest_is_saved(home, capfd, tmp_path):
+    (home / "broken.mcap").write_bytes(b"not a log")
+    done = run(capfd, "review", home, "--save", tmp_path / "a.rrd")
+    assert done.returncode == 3
+    assert "broken.mcap: is no MCAP file" in done.stderr
+    assert (tmp_path / "a.rrd").exists()
+
+
+# In the real viewer
+
+
+def one_mark(folder):
+    """Wait until there is a mark, and return the only one."""
+    return patiently(lambda: layers(folder), lambda found: len(found) == 1)[0]
+
+
+def programs_of(review):
+    """The command and the programs that it started."""
+    process = psutil.Process(review.process.pid)
+    return [process, *process.children(recursive=True)]
+
+
+def listening(processes):
+    """Addresses at which processes listen."""
+    return {
+        connection.laddr.ip
+        for process in processes
+        for connection in process.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+def check_privacy(review):
+    """Check that nothing is sent, and that only this machine is listened to."""
+    processes = programs_of(review)
+    assert listening(processes) == {"127.0.0.1"}
+    (viewer,) = [process for process in processes if process.name() == "rerun"]
+    configuration = Path(viewer.environ()["XDG_CONFIG_HOME"], "rerun", "analytics.json")
+    assert json.loads(configuration.read_text())["analytics_enabled"] is False
+
+
+def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, display):
+    port = free_port()
+    with reviewing(home, "--port", port, "--reviewer", "Ann", DISPLAY=display) as review:
+        review.wait_for("drag a span")
+        check_privacy(review)
+        window = Window(display, port)
+        x, y = ruler(patiently(window.picture, shows_ruler))
+        window.drag(y, x + 300, x + 500)
+        selected = patiently(window.selection, bool)
+        review.press("2")
+        mark = one_mark(home)
+        assert (mark.start, mark.end) == selected
+        assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
+        review.press("z")
+        patiently(lambda: layers(home), lambda found: found == [])
+        review.press("3")
+        assert one_mark(home)[1:4] == (*selected, "music")
+        assert review.quit() == 0
+    assert review.lines[-1].startswith("1 span marked in")
+
+
+def shows_ruler(picture):
+    with contextlib.suppress(AssertionError):
+        return ruler(picture)
+    return None
+
+
+def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp_path):
+    options = ("--web", "--port", free_port(), "--reviewer", "Ann")
+    with reviewing(home, *options, BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        address = line[line.index("http:") :].split()[0]
+        with browsing(address, tmp_path / "browser") as page:
+            review.wait_for("drag a span")
+            check_privacy(review)
+            x, y = ruler(patiently(page.picture, shows_ruler))
+            page.drag(y, x + 200, x + 350)  # a part of the second log
+            buttons = "[...document.querySelectorAll('button')]"
+            page.evaluate(f"{buttons}.find(each => each.textContent == '2speech').click()")
+            mark = one_mark(home)
+            assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
+            seconds = (mark.end - mark.start) / SECOND
+            assert 25 < seconds < 45  # of 200 in about 870 pixels
+            patiently(page.text, lambda text: text.endswith("speech"))
+            page.evaluate(f"{buttons}.find(each => each.textContent == 'zundo').click()")
+            patiently(lambda: layers(home), lambda found: found == [])
+            page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
+            assert review.process.wait(60) == 0
+
+
+def test_marks_of_a_review_that_is_killed_are_in_the_layer(home, display):
+    options = ("--port", free_port(), "--queue", "random", "--spans", "6")
+    with reviewing(home, *options, DISPLAY=display) as review:
+        review.wait_for("1/6")
+        for number in (2, 3, 4):
+            review.press("u")
+            review.wait_for(f"{number}/6")
+        viewers = programs_of(review)[1:]
+        review.process.send_signal(signal.SIGKILL)
+        review.process.wait()
+        for process in viewers:
+            process.kill()
+    marks = layers(home)
+    assert {mark.label for mark in marks} == {"unknown"}
+    assert len({mark.made for mark in marks}) == 3
