@@ -22,6 +22,7 @@ from schemas import messages
 from schemas.columns import Columns
 from schemas.errors import LogError
 from schemas.files import SUFFIX, replaced_file, stem
+from schemas.logfile import LogFile
 from schemas.messages import NANOSECONDS
 from schemas.topics import Topic, check_microphone_name, topic
 from schemas.writer import LogWriter, Rows
@@ -86,8 +87,10 @@ def read_marks(log: Path) -> list[Mark]:
     path = review_path(log)
     if not path.exists():
         return []
+    with LogFile(path) as file:
+        complete = file.complete
     selection = select([path])
-    if selection.unfinished:
+    if not complete:
         raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
     for name, same in selection.channels.items():
         kind = next((kind for kind in _KINDS if all(is_of_type(*d, kind) for d in same)), "")

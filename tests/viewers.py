@@ -17,6 +17,7 @@ from pathlib import Path
 
 import aiohttp
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 from rerun.experimental import ViewerClient
@@ -173,12 +174,11 @@ class Review:
         with suppress(OSError):
             self.process.stdin.close()
         if self.process.poll() is None:
-            self.process.terminate()
-        try:
-            self.process.wait(20)
-        except subprocess.TimeoutExpired:
+            started = psutil.Process(self.process.pid).children(recursive=True)
             self.process.kill()
-            self.process.wait()
+            for each in started:
+                each.kill()
+        self.process.wait()
         self._reader.join()
         self.process.stdout.close()
 
@@ -246,9 +246,13 @@ class Page:
         self._number = 0
         self._session = self._socket = None
         port = folder / "DevToolsActivePort"
-        patiently(port.exists, bool)
-        number = patiently(lambda: port.read_text().split("\n")[0], bool)
-        self._loop.run_until_complete(self._connect(f"http://127.0.0.1:{number}/json"))
+        try:
+            patiently(port.exists, bool)
+            number = patiently(lambda: port.read_text().split("\n")[0], bool)
+            self._loop.run_until_complete(self._connect(f"http://127.0.0.1:{number}/json"))
+        except BaseException:
+            self.close()
+            raise
 
     async def _connect(self, address):
         self._session = aiohttp.ClientSession()

@@ -1,7 +1,8 @@
 """A reviewer at a viewer: keys in, marks out."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import tzinfo
 from queue import Empty, SimpleQueue
@@ -117,7 +118,7 @@ class Session:
             How many spans were marked.
         """
         self._began = time.monotonic()
-        self.screen.redraw_marks(self.marking.microphone, self.marking.marks())
+        self._redraw()
         self.say(f"{_HELP} press a key")
         if self.items:
             self._go(1)
@@ -139,7 +140,7 @@ class Session:
         except HearthlogError as error:
             self.say(str(error))
         except (ConnectionError, TimeoutError):
-            self.say("the viewer did not answer; press the key again")
+            self.say("the viewer did not answer, and nothing was done; press the key again")
 
     def _press(self, key: str) -> None:
         labels = dict(zip(_CLASS_KEYS, self.classes, strict=False)) | {"u": UNKNOWN}
@@ -189,7 +190,17 @@ class Session:
         self._redraw()
 
     def _redraw(self) -> None:
-        self.screen.redraw_marks(self.marking.microphone, self.marking.marks())
+        marks = self.marking.marks()
+        with self._unless_silent():
+            self.screen.redraw_marks(self.marking.microphone, marks)
+
+    @contextmanager
+    def _unless_silent(self) -> Iterator[None]:
+        """Say that the viewer does not show what was done."""
+        try:
+            yield
+        except (ConnectionError, TimeoutError):
+            self.say("the viewer did not answer: what was done is done, but not shown")
 
     def _play(self) -> None:
         start, end = self._chosen()
@@ -238,8 +249,9 @@ class Session:
             f"{self._at + 1}/{len(self.items)}  {self._text(item.start, item.end)}  {item.text}"
         )
         margin = _margin(item.start, item.end)
-        self.look_closely(item.start - margin, item.end + margin)
-        self.screen.show(item.start, item.end, margin)
+        with self._unless_silent():
+            self.look_closely(item.start - margin, item.end + margin)
+            self.screen.show(item.start, item.end, margin)
 
     def _text(self, start: int, end: int) -> str:
         length = (end - start) / NANOSECONDS

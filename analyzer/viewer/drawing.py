@@ -220,7 +220,7 @@ def _views(timeline: Timeline, *, close_up: bool) -> rrb.Vertical:
     microphones = list(timeline.microphones.values())
     sampled = "" if timeline.every == 1 else f" (a sample: one part in {timeline.every})"
     lanes = rrb.Tabs(
-        _lane_view(AFAR, f"What was heard, from afar{sampled}"),
+        _lane_view(AFAR, f"What was heard, from afar{sampled}: clock of the home, axes in UTC"),
         _lane_view(EXACT, "What was heard, exactly"),
         active_tab=1 if close_up else 0,
     )
@@ -274,14 +274,14 @@ def _rest(microphone: Microphone) -> Rows:
     """Show what is not a label: level, novelty, features."""
     rows: Rows = []
     if microphone.level is not None:
-        rows.append((100, _plot(f"{microphone.name}/level", "Level in dBFS", (-100.0, 0.0))))
+        rows.append((100, _plot(f"{microphone.name}/level", "Level in dBFS")))
     novelty = [
         f"{microphone.name}/{_word(one.name)}/novelty"
         for one in microphone.labellings
         if one.novelty is not None
     ]
     if novelty:
-        view = _plot("/", "Novelty: 0 as learnt, 1 never heard", (0.0, 1.0), contents=novelty)
+        view = _plot("/", "Novelty: 0 as learnt, 1 never heard", contents=novelty)
         rows.append((90, view))
     if microphone.features is not None:
         names = microphone.features.names
@@ -307,7 +307,7 @@ def _share_view(microphone: Microphone, name: str, note: str, scale: str = "") -
 def _plot(
     origin: str,
     name: str,
-    scale: tuple[float, float],
+    scale: tuple[float, float] | None = None,
     *,
     legend: bool = False,
     contents: Sequence[str] | None = None,
@@ -317,7 +317,7 @@ def _plot(
         contents="$origin/**" if contents is None else list(contents),
         name=name,
         axis_x=_axis(),
-        axis_y=rrb.ScalarAxis(range=scale),
+        axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
         plot_legend=rrb.PlotLegend(visible=legend, corner="RightTop"),
     )
 
@@ -342,11 +342,13 @@ def _more(microphone: Microphone, *, close_up: bool) -> list[rrb.View]:
         rest: list[Any] = [view for _, view in _rest(microphone)]
         if microphone.level is not None:
             entity = f"{microphone.name}{_CLOSE}/level"
-            rest.insert(0, _plot(entity, "Level in dBFS, close up", (-100.0, 0.0)))
+            rest.insert(0, _plot(entity, "Level in dBFS, close up"))
         return rest
-    names = [(one.name, (0.0, 1.0)) for one in microphone.labellings if one.frames]
+    names: list[tuple[str, tuple[float, float] | None]] = [
+        (one.name, (0.0, 1.0)) for one in microphone.labellings if one.frames
+    ]
     if microphone.level_frames:
-        names.append(("level", (-100.0, 0.0)))
+        names.append(("level", None))
     return [
         _plot(f"{microphone.name}/frames/{_word(name)}", f"{name}, 20 a second: zoom in", scale)
         for name, scale in names

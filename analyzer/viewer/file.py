@@ -13,7 +13,6 @@ from schemas.files import check_new, new_file
 from schemas.times import time_text
 
 SUFFIX = ".rrd"
-_FOOT, _END = b"RRF2FOOT", 64  # with which a recording ends, and within how many bytes
 
 
 def check_output(output: Path) -> None:
@@ -56,14 +55,6 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
             file.write(stream.read() or b"")
     except LogError as error:
         raise DataError(str(error)) from error
-
-
-def _check_complete(path: Path) -> None:
-    """Raise OSError if the end of a recording is missing, of which Rerun says nothing."""
-    with path.open("rb") as stream:
-        stream.seek(max(path.stat().st_size - _END, 0))
-        if _FOOT not in stream.read():
-            raise OSError("its end is missing: is the disk full?")
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:

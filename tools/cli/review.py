@@ -1,6 +1,7 @@
 """`hearthlog review`: logs on one time axis, and marks made where they are seen."""
 
 import shlex
+import signal
 from contextlib import suppress
 from datetime import date, datetime, timedelta
 from pathlib import Path
@@ -76,6 +77,8 @@ def review(
     if save is not None:
         timeline = _save(logs, limits, timezone, save)
     else:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _end)  # or the viewer would stay, and listen
         with _open(web=web, port=port) as viewer:
             timeline = _read(logs, limits, timezone)
             chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
@@ -84,6 +87,10 @@ def review(
         typer.echo(f"hearthlog: {loss}", err=True)
     if timeline.losses:
         raise typer.Exit(3)
+
+
+def _end(number: int, _frame: object) -> None:
+    raise SystemExit(128 + number)
 
 
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
