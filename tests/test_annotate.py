@@ -384,12 +384,14 @@ def test_marks_that_cannot_be_are_not_written(log, zero, marks, reason):
     assert not review_path(log).exists()
 
 
-@pytest.mark.parametrize("damage", ["cut off", "changed"])
+@pytest.mark.parametrize("damage", ["cut off", "cut off at once", "changed"])
 def test_a_damaged_layer_is_named_and_left_alone(log, zero, damage):
     layer = write_marks(log, [mark(zero, start / 10, start / 10 + 0.1) for start in range(99)])
     damaged = layer.read_bytes()
     if damage == "cut off":
         damaged = damaged[:-30]
+    elif damage == "cut off at once":
+        damaged = damaged[:100]
     else:
         with LogFile(layer) as file:
             place = int(file.chunks["offset"][0]) + 33  # the checksum

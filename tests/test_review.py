@@ -237,7 +237,7 @@ class Screen:
         self.open = True
         self.marked = None
         self.at = None
-        self.answers = True
+        self.answers = self.draws = True
         self.shown = []
         self.played = []
         self.lane = None
@@ -262,6 +262,8 @@ class Screen:
 
     def redraw_marks(self, microphone, marks):
         assert microphone == "mic"
+        if not self.draws:
+            raise TimeoutError
         self.lane = as_rows(marks)
 
 
@@ -394,6 +396,19 @@ def test_a_viewer_that_does_not_answer_costs_no_mark(home):
     sitting.screen.answers = True
     sitting.session.press("2")
     assert len(layers(home)) == 1
+
+
+def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
+    sitting.session.press("2")
+    sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
+    sitting.screen.draws = False
+    sitting.session.press("3")
+    assert "what was done is done" in sitting.said[-1]
+    sitting.session.press("z")
+    assert "what was done is done" in sitting.said[-1]
+    assert [mark.label for mark in layers(home)] == ["speech"]
 
 
 def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
@@ -692,6 +707,18 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             patiently(lambda: layers(home), lambda found: found == [])
             page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
             assert review.process.wait(60) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_review_that_is_ended_ends_its_viewer(home, number):
+    with reviewing(home, "--web", DISPLAY="", WAYLAND_DISPLAY="") as review:
+        review.wait_for("open http://")
+        viewers = programs_of(review)[1:]
+        assert viewers
+        review.process.send_signal(number)
+        assert review.process.wait(60) == 128 + number
+        gone, left = psutil.wait_procs(viewers, 20)
+        assert (len(gone), left) == (len(viewers), [])
 
 
 def test_marks_of_a_review_that_is_killed_are_in_the_layer(home, display):
