@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from analyzer.known import decode_known
 from analyzer.timeline.contents import Lines, Spans
+from analyzer.timeline.decoding import FIELDS, TOPIC, decibel, spans_of, value_names
 from analyzer.timeline.grid import Float64, Grid, Int64
 from analyzer.timeline.lanes import Changes, changes, clock
-from analyzer.timeline.reading import FIELDS, TOPIC, decibel, spans_of, value_names
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages
 from schemas.chunks import RawMessages

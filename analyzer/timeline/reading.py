@@ -1,18 +1,13 @@
 """Read logs, their layers and clips, as a timeline: once through, within bounded memory."""
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import tzinfo
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Metadata
 
 from analyzer.errors import DataError
 from analyzer.heard import heard_in
@@ -33,36 +28,30 @@ from analyzer.timeline.contents import (
     Timeline,
     no_spans,
 )
+from analyzer.timeline.decoding import (
+    FIELDS,
+    TOPIC,
+    chained,
+    decibel,
+    lasting,
+    runs,
+    spans_of,
+    value_names,
+)
+from analyzer.timeline.files import File, find_files, records_of
 from analyzer.timeline.grid import Grid, Means
 from recorder.stream import FRAME_NANOSECONDS
 from schemas import messages
 from schemas.columns import Columns
 from schemas.errors import LogError
-from schemas.files import find_logs, is_layer, stem
-from schemas.logfile import LogFile, time_span
+from schemas.logfile import LogFile
 from schemas.series import iterate_pieces
-from schemas.writer import METADATA
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
-_MOST_NAMES = 256
-_QUIETEST = 1e-10  # of a mean square: -100 dB
 _ENERGY = "energy"
-TOPIC = re.compile(
-    r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"
-    r"(?P<kind>features|label|segment|gap)",
-    re.ASCII,
-)
-FIELDS = {
-    messages.FEATURES: ("header.stamp", "values"),
-    messages.LABEL: ("header.stamp", "novelty", "probabilities"),
-    messages.SEGMENT: ("header.stamp", "duration", "label"),
-    messages.GAP: ("header.stamp", "duration", "reason"),
-    messages.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
-    messages.LOG: ("stamp", "level", "msg"),
-}
 _RELABELLED = re.compile(r"\.(?=relabel-)")  # in the name of a layer, between log and labelling
 _OF_LAYERS = (messages.LABEL, messages.SEGMENT)
 
@@ -100,7 +89,7 @@ def read_timeline(
         If there is nothing in this span of time.
     """
     losses: list[str] = []
-    found = _files(paths, start, end, losses)
+    found = find_files(paths, start, end, losses)
     if not found:
         raise _nothing(losses, limited=start is not None or end is not None)
     first = min(file.first for file in found) if start is None else start
@@ -115,7 +104,7 @@ def read_timeline(
         except (LogError, DataError) as error:
             losses.append(str(error))
         progress((number + 1) / len(found))
-    known = home_zone(zone, _records(file.path for file in found))
+    known = home_zone(zone, records_of(file.path for file in found))
     microphones = reader.microphones()
     heard = {
         name: heard_in(
@@ -133,85 +122,10 @@ def read_timeline(
     return timeline
 
 
-def zone_of(paths: Iterable[Path], wanted: str | None) -> tzinfo:
-    """Find the time zone of a home, without reading more of its logs than it takes.
-
-    Raises
-    ------
-    DataError
-        If there is no such zone.
-    LogError
-        If there is no log.
-    """
-    return home_zone(wanted, _records(log for path in paths for log in find_logs(path)))
-
-
-def _records(paths: Iterable[Path]) -> Iterator[Mapping[str, str]]:
-    """Yield what logs say of themselves, the latest first."""
-    for path in reversed(list(paths)):
-        if not is_layer(path):
-            with suppress(LogError), LogFile(path) as file:
-                yield metadata_of(file)
-
-
 def _nothing(losses: Sequence[str], *, limited: bool) -> DataError:
     where = "in this span of time; `hearthlog info` shows what there is" if limited else "to show"
     first = f" ({losses[0]})" if losses else ""
     return DataError(f"no features, labels, segments or gaps {where}{first}")
-
-
-@dataclass(frozen=True)
-class _File:
-    """A log or a layer that has messages in the span that is wanted."""
-
-    path: Path
-    first: int
-    last: int
-    size: int
-    layer: bool
-
-
-def _files(
-    paths: Iterable[Path], start: int | None, end: int | None, losses: list[str]
-) -> list[_File]:
-    """Look into logs and layers, in the order of time; those that cannot be read are lost."""
-    names = {path.resolve(): path for given in paths for path in _with_layers(given)}
-    files = []
-    for path in names.values():
-        try:
-            span = time_span(path)
-            if span is None or (start is not None and span[1] < start):
-                continue
-            # What ends in the span may be logged later, so only the start of a log excludes it.
-            if end is not None and span[0] >= end:
-                continue
-            size = path.stat().st_size
-        except (LogError, OSError) as error:
-            losses.append(str(error))
-            continue
-        files.append(_File(path, *span, size, is_layer(path)))
-    return sorted(files, key=lambda file: (file.first, file.path.name))
-
-
-def metadata_of(file: LogFile) -> Mapping[str, str]:
-    """Return what a log says of itself."""
-    records = (file.record(place) for place in file.places if place.opcode == Opcode.METADATA)
-    for record in records:
-        if isinstance(record, Metadata) and record.name == METADATA:
-            return record.metadata
-    return {}
-
-
-def _with_layers(path: Path) -> list[Path]:
-    """List logs, and the layers beside one that is named by itself."""
-    found = find_logs(path)
-    if found != [path] or is_layer(path):
-        return found
-    return [path, *sorted(path.parent.glob(f"{_escaped(stem(path))}.*.mcap"))]
-
-
-def _escaped(name: str) -> str:
-    return re.sub(r"([*?[])", r"[\1]", name)
 
 
 @dataclass
@@ -266,7 +180,7 @@ class _Reader:
         self._clip_seconds = 0.0
         self._layers: dict[tuple[Path, str], Path] = {}
 
-    def read(self, file: _File) -> None:
+    def read(self, file: File) -> None:
         """Take a log or a layer."""
         if file.path.name.endswith(".audio.mcap"):
             self._read_clips(file.path)
@@ -280,7 +194,7 @@ class _Reader:
         if not file.layer:
             self._read_marks(file.path)  # last, for a damaged layer must not hide its log
 
-    def _read_messages(self, file: _File, kinds: Mapping[str, Sequence[str]]) -> None:
+    def _read_messages(self, file: File, kinds: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
             decoded = partial(decode_known, file.path, wanted=kinds)
             span = (self._grid.start, end)
@@ -290,7 +204,7 @@ class _Reader:
                 if min(int(columns.log_times[0]) for columns in batch) > self._grid.end:
                     break  # what ended later began later, but for what lasted for minutes
 
-    def _parts(self, file: _File) -> Iterator[tuple[list[str] | None, int | None, int]]:
+    def _parts(self, file: File) -> Iterator[tuple[list[str] | None, int | None, int]]:
         """Yield topics, the log time up to which they are read, and one of how many chunks."""
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
@@ -442,8 +356,8 @@ class _Reader:
             level=level,
             level_frames=heard.level_frames,
             gaps=self._joined(heard.gaps),
-            troubles=_lasting(heard.troubles, self._grid.end),
-            clips=_chained(heard.clips),
+            troubles=lasting(heard.troubles, self._grid.end),
+            clips=chained(heard.clips),
         )
 
     def _labelling(self, heard: _Heard, name: str) -> Labelling:
@@ -454,7 +368,7 @@ class _Reader:
         if growing is not None:  # what is open at the end is no segment yet
             parts = [
                 *parts,
-                *_runs(growing.frames, max((int(s.ends.max()) for s in parts), default=0)),
+                *runs(growing.frames, max((int(s.ends.max()) for s in parts), default=0)),
             ]
         spans = self._joined(parts)
         return Labelling(
@@ -480,75 +394,3 @@ class _Reader:
 def _ordered(heard: _Heard) -> list[str]:
     names = {*heard.labels, *heard.spans}
     return sorted(names, key=lambda name: (name == REVIEW, name != LIVE, name))
-
-
-def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
-    """Return the names behind an array, by the channel."""
-    where = f"{path}: {columns.topic}"
-    try:
-        names: Any = json.loads(columns.metadata.get(f"{field_}_names", ""))
-    except ValueError:
-        names = None
-    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
-        raise LogError(f"{where}: the channel does not name its values")
-    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
-        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
-    if columns[field_].shape[1:] != (len(names),):
-        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
-    return tuple(names)
-
-
-def decibel(energy: Any) -> Any:
-    """Return the level of a mean square, in dB relative to full scale."""
-    return 10 * np.log10(np.maximum(energy, _QUIETEST))
-
-
-def spans_of(columns: Columns, text: str) -> Spans:
-    """Return the spans that segments or gaps are about; `text` is the field that is shown."""
-    starts = columns["header.stamp"]
-    return Spans(starts, starts + columns["duration"], columns[text])
-
-
-def _runs(parts: Sequence[Frames], after: int) -> Iterator[Spans]:
-    """Join successive frames whose most probable class is the same, from some time on."""
-    for names, all_times, all_values in parts:
-        later = all_times >= after
-        times, values = all_times[later], all_values[later]
-        if not len(times):
-            continue
-        best = values.argmax(axis=1)
-        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
-        first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
-        last = np.append(first[1:], len(times)) - 1
-        texts = np.array(names, object)[best[first]]
-        yield Spans(times[first], times[last] + FRAME_NANOSECONDS, texts)
-
-
-def _lasting(troubles: Sequence[tuple[int, str]], end: int) -> Spans:
-    """Let a trouble last until the next message says that it is over, or that it is another."""
-    changes = [
-        (stamp, text)
-        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
-        if text != before
-    ]
-    stops = [*(stamp for stamp, _ in changes[1:]), end]
-    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
-    if not spans:
-        return no_spans()
-    starts, ends, texts = zip(*spans, strict=True)
-    return Spans(np.array(starts), np.array(ends), np.array(texts, object))
-
-
-def _chained(parts: Sequence[Clip]) -> list[Clip]:
-    """Join what follows each other."""
-    clips: list[list[Clip]] = []
-    for part in sorted(parts, key=lambda clip: clip.start):
-        last = clips[-1][-1] if clips else None
-        if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
-            clips[-1].append(part)
-        else:
-            clips.append([part])
-    return [
-        Clip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
-        for run in clips
-    ]

@@ -96,7 +96,7 @@ def _end(number: int, _frame: object) -> None:
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
     """Read the option --day: from midnight to midnight, at home."""
     from analyzer.hometime import day_span
-    from analyzer.timeline.reading import zone_of
+    from analyzer.timeline.files import zone_of
 
     zone = zone_of(logs, timezone)
     today = datetime.now(zone).date()

@@ -117,8 +117,8 @@ def _follow(
     logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
+    from analyzer.timeline.files import zone_of
     from analyzer.timeline.live import Live
-    from analyzer.timeline.reading import zone_of
     from schemas.errors import LogError
     from schemas.follow import follow_messages
 
