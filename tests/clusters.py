@@ -51,7 +51,7 @@ def scheduler_in(folder):
     about = folder / "scheduler.json"
     command = [DASK, "scheduler", "--port", "0", "--scheduler-file", str(about)]
     with running([*command, *PRIVATE]) as process:
-        until(about.exists)
+        until(lambda: about.exists() and about.read_text().endswith("}"))  # it is written in place
         yield json.loads(about.read_text())["address"], process
 
 
