@@ -16,7 +16,6 @@ from analyzer.timeline.grid import Float64, Int64
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough
 _ROWS_AT_ONCE = 72_000  # an hour of frames
-_FLUSH_SECONDS = 60.0  # without a limit, Rerun waits for ever where a disk is full
 _HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
@@ -159,19 +158,6 @@ class Canvas:
             entity, rr.AssetAudio(contents=stream.getvalue(), media_type="audio/flac")
         )
         self.recording.reset_time()
-
-    def flush(self) -> None:
-        """Hand over what was drawn.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
-        try:
-            self.recording.flush(timeout_sec=_FLUSH_SECONDS)
-        except RuntimeError as error:  # all that comes of a full disk
-            raise OSError(f"{error}; is the disk full?") from error
 
 
 def _time_column(times: Int64) -> rr.TimeColumn:

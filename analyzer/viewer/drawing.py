@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from analyzer.colours import GAP, Colour, colour
 from analyzer.hometime import home_zone
-from analyzer.timeline.contents import REVIEW, Frames, Microphone, Spans, Timeline, no_spans
+from analyzer.timeline.contents import REVIEW, Frames, Microphone, Timeline, no_spans
 from analyzer.timeline.grid import Int64
 from analyzer.timeline.lanes import changes, clock, disagreements, from_afar
 from analyzer.viewer.canvas import TIMELINE, Canvas
@@ -83,13 +83,6 @@ def lane(root: str, microphone: str, place: int, name: str) -> str:
 def review_lanes(microphone: str) -> list[str]:
     """Name the lanes that show a reviewer's marks."""
     return [lane(root, microphone, 8, REVIEW) for root in (AFAR, EXACT)]
-
-
-def change_lane(canvas: Canvas, entities: Iterable[str], spans: Spans) -> None:
-    """Show spans in lanes, from the first one's start on."""
-    times, states = changes(spans)
-    for entity in entities:
-        canvas.change_states(entity, times, states)
 
 
 def _draw_clock(timeline: Timeline, canvas: Canvas, root: str) -> None:
