@@ -1,6 +1,7 @@
 """What a report counts: a number of events, minutes, a time of day; and how they are said."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
@@ -69,7 +70,7 @@ def exactly(number: int) -> Count:
     return Count(number, 0.0, number, number)
 
 
-class _Plain:
+class _Plain(ABC):
     """What has no interval."""
 
     @property
@@ -80,9 +81,9 @@ class _Plain:
     high = low
 
     @property
+    @abstractmethod
     def middle(self) -> float:
         """The number."""
-        raise NotImplementedError
 
     @property
     def text(self) -> str:
@@ -90,9 +91,9 @@ class _Plain:
         return self.show(self.middle)
 
     @staticmethod
+    @abstractmethod
     def show(number: float) -> str:
         """Write a number."""
-        raise NotImplementedError
 
     def spread(self, median: float, lowest: float, highest: float) -> str:
         """Write what is usual."""

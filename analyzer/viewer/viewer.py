@@ -231,7 +231,7 @@ def check_version(found: str) -> None:
     """Raise DataError if a viewer is of another version than the package."""
     if found != rr.__version__:
         raise DataError(
-            f"the viewer is of Rerun {found or 'of an unknown version'}, and hearthlog works with "
+            f"the viewer is of Rerun {found or 'an unknown version'}, and hearthlog works with "
             f"{rr.__version__}; `pip install rerun-sdk=={rr.__version__}`"
         )
 
