@@ -12,14 +12,22 @@ demo: $(VENV)/.analyzer
 test: $(VENV)/.dev
 	$(BIN)/pytest -n 2
 
-check: $(VENV)/.dev
+check: $(VENV)/.dev build/checked/hearthlog
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	PYTHONPATH=build/checked $(BIN)/lint-imports
+
+# The folders under the name they are installed by, for the linters, which follow no finder of
+# setuptools: links, so they are what is edited. Point the type checker of an editor here too.
+build/checked/hearthlog: Makefile
+	mkdir -p $@
+	ln -sfn $(addprefix $(CURDIR)/,analyzer models recorder schemas tools) $@
+	ln -sfn $(CURDIR)/tools/package/__init__.py $(CURDIR)/tools/package/py.typed $@
+	touch $@
 
 bench: $(VENV)/.dev
-	$(BIN)/python -m tools.bench
+	$(BIN)/python -m hearthlog.tools.bench
 
 $(VENV)/.analyzer: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -11,11 +11,11 @@ from joblib import delayed
 from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 
-from analyzer.dataset import Dataset, Progress
-from analyzer.errors import DataError
-from analyzer.home import HOME_WEIGHT
-from analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
-from analyzer.workers.parallel import in_parallel
+from hearthlog.analyzer.dataset import Dataset, Progress
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.home import HOME_WEIGHT
+from hearthlog.analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
+from hearthlog.analyzer.workers.parallel import in_parallel
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_GROUPS = 8

@@ -7,8 +7,8 @@ the cepstra stand for, so the sound itself is not needed.
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import bands_of, dct_weights
-from recorder.features import mel_centres
+from hearthlog.models.inputs import bands_of, dct_weights
+from hearthlog.recorder.features import mel_centres
 
 _ENERGY, _CEPSTRA = 0, slice(8, None)
 _SHARE = 0.6  # of the segments, of each of gain, tilt and every bump

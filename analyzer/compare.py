@@ -6,22 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.dataset import Dataset, Progress, Recording, clip_features, cut_recordings
-from analyzer.errors import DataError
-from analyzer.evaluation.clips import check_classes
-from analyzer.evaluation.scores import (
+from hearthlog.analyzer.dataset import Dataset, Progress, Recording, clip_features, cut_recordings
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.clips import check_classes
+from hearthlog.analyzer.evaluation.scores import (
     Difference,
     Scores,
     calibration_error,
     difference,
     score,
 )
-from analyzer.manifest import Clip
-from analyzer.scenario import Scenario
-from models.classifier import Classifier
-from models.inputs import window_inputs
-from models.modelfile import Model
-from recorder.features import FEATURE_NAMES
+from hearthlog.analyzer.manifest import Clip
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import window_inputs
+from hearthlog.models.modelfile import Model
+from hearthlog.recorder.features import FEATURE_NAMES
 
 Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.errors import DataError
-from analyzer.manifest import Clip
-from analyzer.scenario import Scenario
-from models.inputs import WINDOW_FRAMES
-from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
-from recorder.sources.files import read_audio
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.manifest import Clip
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.recorder.sources.files import read_audio
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24

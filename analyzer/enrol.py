@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.errors import DataError
-from analyzer.export.names import names_of
-from analyzer.heard import find_heard
-from analyzer.marks import Mark, write_marks
-from analyzer.selection import select
-from analyzer.splice import splice
-from models.modelfile import CLASS_NAME
-from recorder.config import Microphone, load_settings
-from recorder.service import Source, record
-from recorder.sources.files import audio_seconds
-from recorder.sources.microphone import MicrophoneSource
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames
-from schemas.columns import read_columns
-from schemas.errors import HearthlogError
-from schemas.files import SUFFIX, log_path, new_file
-from schemas.logfile import time_span
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.heard import find_heard
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.selection import select
+from hearthlog.analyzer.splice import splice
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.recorder.config import Microphone, load_settings
+from hearthlog.recorder.service import Source, record
+from hearthlog.recorder.sources.files import audio_seconds
+from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.files import SUFFIX, log_path, new_file
+from hearthlog.schemas.logfile import time_span
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 FOLDER = "enrolled"
 SECONDS = 5.0  # of a microphone, unless it is said

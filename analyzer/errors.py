@@ -1,6 +1,6 @@
 """Errors of the analyzer."""
 
-from schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError
 
 
 class DataError(HearthlogError):

@@ -5,16 +5,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from analyzer.errors import DataError
-from analyzer.known import is_of_type
-from analyzer.marks import ROUNDING
-from analyzer.selection import select
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.columns import iterate_columns
-from schemas.logfile import time_span
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.known import is_of_type
+from hearthlog.analyzer.marks import ROUNDING
+from hearthlog.analyzer.selection import select
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.logfile import time_span
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 _KIND = "features"
 _TAIL = 60 * NANOSECONDS

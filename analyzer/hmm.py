@@ -6,8 +6,8 @@ import numpy as np
 from hmmlearn.base import BaseHMM
 from numpy.typing import NDArray
 
-from models.smoothing import Float32, Float64, States, log_likelihoods
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.models.smoothing import Float32, Float64, States, log_likelihoods
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
 
 FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.dataset import Recording
-from analyzer.marks import Mark, read_marks
-from models.inputs import WINDOW_FRAMES
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.columns import Columns, read_columns
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.dataset import Recording
+from hearthlog.analyzer.marks import Mark, read_marks
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.columns import Columns, read_columns
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 HOME_WEIGHT = 5.0  # of a segment of the home, where others count 1
 HOME = "this home"

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime, timedelta, tzinfo
 
-from analyzer.errors import DataError
-from recorder.zone import DEFAULT, time_zone
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.errors import DataError
+from hearthlog.recorder.zone import DEFAULT, time_zone
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
 
 KEY = "timezone"  # in the `hearthlog` metadata record of a log
 Span = tuple[int, int]

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from mcap.records import Channel, Schema
 
-from schemas.chunks import RawMessages
-from schemas.columns import Columns, decode
-from schemas.errors import LogError
-from schemas.layout import message_type
-from schemas.writer import ENCODING
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.columns import Columns, decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.writer import ENCODING
 
 
 def decode_known(

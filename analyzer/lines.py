@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.pieces import DURATION, TIME, Field, Piece
-from schemas.messages import NANOSECONDS
-from schemas.rows import Int64
+from hearthlog.analyzer.pieces import DURATION, TIME, Field, Piece
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.rows import Int64
 
 _SHOWN = 4  # elements of an array
 _LENGTH = 120  # characters of a field

@@ -4,9 +4,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from analyzer.errors import DataError
-from analyzer.textfile import csv_records, read_text
-from models.modelfile import TEXT
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.textfile import csv_records, read_text
+from hearthlog.models.modelfile import TEXT
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence")

@@ -7,25 +7,25 @@ import tempfile
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from analyzer.errors import DataError
-from analyzer.known import decode_known, is_of_type
-from analyzer.selection import select
-from models.modelfile import CLASS_NAME
-from schemas import messages
-from schemas.columns import Columns
-from schemas.errors import LogError
-from schemas.files import SUFFIX, replaced_file, stem
-from schemas.logfile import LogFile
-from schemas.messages import NANOSECONDS
-from schemas.topics import Topic, check_microphone_name, topic
-from schemas.writer import LogWriter, Rows
+from hearthlog import __version__
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.analyzer.selection import select
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import SUFFIX, replaced_file, stem
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import Topic, check_microphone_name, topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 ROUNDING = 1_000_000  # ns; times that passed through a label file are off by up to this
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
@@ -147,7 +147,7 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) 
             path.unlink(missing_ok=True)
             return path
         about = {
-            "version": version("hearthlog"),
+            "version": __version__,
             "node": next((found.get("node", "") for found in select([log]).metadata), ""),
             "log": stem(log) + SUFFIX,
         }

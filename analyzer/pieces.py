@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 from rosbags.interfaces import Nodetype
 
-from schemas.chunks import RawMessages
-from schemas.columns import Columns, decode
-from schemas.errors import LogError
-from schemas.layout import MessageType, message_type
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.columns import Columns, decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import MessageType, message_type
 
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"

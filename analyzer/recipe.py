@@ -13,11 +13,11 @@ from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from analyzer.augment import augmented
-from analyzer.dataset import Dataset
-from analyzer.workers.parallel import in_parallel
-from models.classifier import HOME_SHARPNESS, home_votes, weakest_pairs
-from models.inputs import Kind, window_inputs
+from hearthlog.analyzer.augment import augmented
+from hearthlog.analyzer.dataset import Dataset
+from hearthlog.analyzer.workers.parallel import in_parallel
+from hearthlog.models.classifier import HOME_SHARPNESS, home_votes, weakest_pairs
+from hearthlog.models.inputs import Kind, window_inputs
 
 _SEED = 20_261_121
 
@@ -140,7 +140,7 @@ def _decide_unseen(recipe: Recipe, classes: int, fold: Fold, *arrays: Any) -> Fl
 
 
 def decide(machine: Pipeline, inputs: NDArray[np.float32], classes: int) -> Float64:
-    """Decide as `models.classifier.Classifier` does.
+    """Decide as `hearthlog.models.classifier.Classifier` does.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def decide_with_home(
     home: NDArray[np.float32],
     target: Indices,
 ) -> Float64:
-    """Decide as `models.classifier.Classifier` does for a home with vectors of its own.
+    """Decide as `hearthlog.models.classifier.Classifier` does for a home with vectors of its own.
 
     Parameters
     ----------

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from analyzer.errors import DataError
-from models.modelfile import CLASS_NAME, MOST_CLASSES, TEXT
+from hearthlog.analyzer.errors import DataError
+from hearthlog.models.modelfile import CLASS_NAME, MOST_CLASSES, TEXT
 
 _SIZE_LIMIT = 1 << 20
 

@@ -3,11 +3,11 @@
 from itertools import product
 from typing import NamedTuple
 
-from analyzer.dataset import Dataset, Progress
-from analyzer.evaluation.folds import Kind, divide
-from analyzer.evaluation.scores import Scores, score
-from analyzer.recipe import Recipe, cross_validate, prepare
-from analyzer.train import check_varied
+from hearthlog.analyzer.dataset import Dataset, Progress
+from hearthlog.analyzer.evaluation.folds import Kind, divide
+from hearthlog.analyzer.evaluation.scores import Scores, score
+from hearthlog.analyzer.recipe import Recipe, cross_validate, prepare
+from hearthlog.analyzer.train import check_varied
 
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)

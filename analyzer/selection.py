@@ -10,16 +10,16 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
-from schemas.chunks import RawMessages, read_chunks
-from schemas.errors import LogError
-from schemas.files import CATALOG, find_logs
-from schemas.logfile import LogFile, time_span
-from schemas.ranges import map_logs, store_errors
-from schemas.series import iterate_messages, time_spans
-from schemas.writer import METADATA
+from hearthlog.schemas.chunks import RawMessages, read_chunks
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import CATALOG, find_logs
+from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.ranges import map_logs, store_errors
+from hearthlog.schemas.series import iterate_messages, time_spans
+from hearthlog.schemas.writer import METADATA
 
 if TYPE_CHECKING:
-    from analyzer.catalog import Catalog
+    from hearthlog.analyzer.catalog import Catalog
 
 _LAST = (1 << 63) - 1  # log time
 _BATCH = 2 << 20  # bytes, stored and decompressed together, that are verified at once
@@ -159,7 +159,7 @@ def _catalog(folder: Path) -> "Catalog | None":
     if not exists:
         return None
     try:
-        from analyzer.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
+        from hearthlog.analyzer.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
     except ModuleNotFoundError:
         return None
     return read_catalog(folder)

@@ -13,16 +13,16 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
-from analyzer.export.names import unused
-from analyzer.selection import Described, Progress, Selection, identity
-from schemas import rosbag2
-from schemas.chunks import RawMessages
-from schemas.chunkwriter import Block, ChunkWriter, blocks_of
-from schemas.errors import LogError
-from schemas.files import new_file
-from schemas.logfile import LogFile
-from schemas.series import iterate_messages
-from schemas.writer import ENCODING
+from hearthlog.analyzer.export.names import unused
+from hearthlog.analyzer.selection import Described, Progress, Selection, identity
+from hearthlog.schemas import rosbag2
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.chunkwriter import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import new_file
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.series import iterate_messages
+from hearthlog.schemas.writer import ENCODING
 
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters

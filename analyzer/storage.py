@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 from typing import Any, cast
 
-from schemas.errors import LogError
-from schemas.ranges import store_errors
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.ranges import store_errors
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _FILES = {"file", "local"}

@@ -11,15 +11,15 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from analyzer.known import decode_known, is_of_type
-from schemas import messages
-from schemas.chunks import read_chunks
-from schemas.columns import Columns
-from schemas.errors import LogError
-from schemas.files import is_layer
-from schemas.logfile import LogFile, Place
-from schemas.messages import NANOSECONDS
-from schemas.records import HEAD
+from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import is_layer
+from hearthlog.schemas.logfile import LogFile, Place
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.records import HEAD
 
 _STREAM = {
     "microphone": "header.frame_id",

@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
-from analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError
 
 
 def read_text(path: Path, what: str, size_limit: int) -> str:

@@ -10,16 +10,16 @@ from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
 from sklearn.pipeline import Pipeline
 
-from analyzer.dataset import Dataset, Progress
-from analyzer.errors import DataError
-from analyzer.evaluation.scores import calibration_error
-from analyzer.hmm import (
+from hearthlog.analyzer.dataset import Dataset, Progress
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.scores import calibration_error
+from hearthlog.analyzer.hmm import (
     LAG_SECONDS,
     default_transitions,
     expected_durations,
     transitions_from_sequences,
 )
-from analyzer.recipe import (
+from hearthlog.analyzer.recipe import (
     RECIPES,
     Fold,
     Recipe,
@@ -29,9 +29,9 @@ from analyzer.recipe import (
     prepare,
     softmax,
 )
-from analyzer.scenario import Scenario
-from models.inputs import WINDOW_FRAMES
-from models.modelfile import (
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.models.modelfile import (
     Amount,
     ClassMetrics,
     Collection,
@@ -41,7 +41,7 @@ from models.modelfile import (
     Smoothing,
     TrainingData,
 )
-from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, NAME, SAMPLE_RATE
+from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, NAME, SAMPLE_RATE
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")
@@ -69,7 +69,7 @@ def train_model(
         Told how many fits of how many are done.
     recipe : Recipe
     smoothing : str
-        How labels become segments: see `models.modelfile.Smoothing`.
+        How labels become segments: see `hearthlog.models.modelfile.Smoothing`.
 
     Raises
     ------

@@ -5,8 +5,8 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from models.modelfile import Model
-from models.rowwise import aligned, rowwise_matmul
+from hearthlog.models.modelfile import Model
+from hearthlog.models.rowwise import aligned, rowwise_matmul
 
 _ROWS_AT_ONCE = 256
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
@@ -34,7 +34,7 @@ class Classifier:
     classes : tuple of str
         Names behind the columns of the probabilities.
     inputs : str
-        What `probabilities` takes, as `models.inputs` makes them.
+        What `probabilities` takes, as `hearthlog.models.inputs` makes them.
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
         How probabilities become segments.

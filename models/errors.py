@@ -1,6 +1,6 @@
 """Errors of models and their files."""
 
-from schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError
 
 
 class ModelError(HearthlogError):

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.rowwise import rowwise_matmul
+from hearthlog.models.rowwise import rowwise_matmul
 
 WINDOW_FRAMES = 20
 Kind = Literal["statistics", "bands"]

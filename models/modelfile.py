@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from safetensors.numpy import load, save
 
-from models.errors import ModelError
-from models.inputs import WINDOW_FRAMES, Kind, input_width
-from schemas.errors import LogError
-from schemas.files import check_new, new_file
+from hearthlog.models.errors import ModelError
+from hearthlog.models.inputs import WINDOW_FRAMES, Kind, input_width
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_new, new_file
 
 SUFFIX = ".safetensors"
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
@@ -167,7 +167,7 @@ class Model:
     ----------
     description : Description
     scaler_mean, scaler_scale : np.ndarray [shape=(width,)], float64
-        Of the inputs that `models.inputs` makes.
+        Of the inputs that `hearthlog.models.inputs` makes.
     support_vectors : np.ndarray [shape=(n, width)], float32
         Inputs, not scaled, class after class.
     support_counts : np.ndarray [shape=(C,)], int64

@@ -13,9 +13,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from models.errors import ModelError
-from models.modelfile import SUFFIX, Model, load_model
-from schemas.files import sync_folder
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile import SUFFIX, Model, load_model
+from hearthlog.schemas.files import sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 _HISTORY = "history"

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.modelfile import Smoothing
-from models.smoothing import FixedLagSmoother
+from hearthlog.models.modelfile import Smoothing
+from hearthlog.models.smoothing import FixedLagSmoother
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]

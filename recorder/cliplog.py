@@ -4,22 +4,22 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from datetime import datetime, time, timedelta
-from importlib.metadata import version
 from pathlib import Path
 
-from recorder.clips import PRIVATE_LIMIT, Sound
-from recorder.config import Settings
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from recorder.retention import find_clips
-from recorder.stream import FRAME_NANOSECONDS
-from recorder.zone import time_zone
-from schemas import messages
-from schemas.errors import LogError
-from schemas.files import audio_path
-from schemas.logfile import LogFile
-from schemas.messages import NANOSECONDS, encode, message, time_message
-from schemas.topics import audio_topic
-from schemas.writer import LogWriter
+from hearthlog import __version__
+from hearthlog.recorder.clips import PRIVATE_LIMIT, Sound
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.recorder.retention import find_clips
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.recorder.zone import time_zone
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import audio_path
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import NANOSECONDS, encode, message, time_message
+from hearthlog.schemas.topics import audio_topic
+from hearthlog.schemas.writer import LogWriter
 
 _MESSAGE_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 _SAMPLE_BYTES = 2
@@ -141,7 +141,7 @@ class ClipLog:
 
     def _metadata(self, log: Path) -> dict[str, str]:
         return {
-            "version": version("hearthlog"),
+            "version": __version__,
             "node": self._settings.node,
             "log": log.name,
             "keep_audio": self._settings.keep_audio,

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from models.inputs import WINDOW_FRAMES
-from recorder.features import FRAME_SAMPLES
-from recorder.stream import FRAME_NANOSECONDS, Frames
-from schemas.messages import NANOSECONDS
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames
+from hearthlog.schemas.messages import NANOSECONDS
 
 Keep = Literal["off", "events", "unsure", "always"]
 

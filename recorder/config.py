@@ -8,12 +8,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_settings import BaseSettings, InitSettingsSource, SettingsConfigDict
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
-from recorder.clips import Keep
-from recorder.errors import ConfigurationError
-from recorder.zone import check_time_zone, machine_zone
-from schemas.errors import HearthlogError
-from schemas.files import check_node_name
-from schemas.topics import check_microphone_name
+from hearthlog.recorder.clips import Keep
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.zone import check_time_zone, machine_zone
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.files import check_node_name
+from hearthlog.schemas.topics import check_microphone_name
 
 
 def _checked(check: Any) -> AfterValidator:

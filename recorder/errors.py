@@ -1,6 +1,6 @@
 """Errors of the recorder."""
 
-from schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError
 
 
 class SourceError(HearthlogError):

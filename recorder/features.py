@@ -10,8 +10,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import dct_weights
-from models.rowwise import rowwise_matmul
+from hearthlog.models.inputs import dct_weights
+from hearthlog.models.rowwise import rowwise_matmul
 
 NAME = "auros21"
 SAMPLE_RATE = 16_000

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from recorder.cliplog import ClipLog
-from recorder.clips import ClipFinder, Labelled
-from recorder.config import Settings
-from recorder.errors import ConfigurationError
-from recorder.retention import Retention
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.cliplog import ClipLog
+from hearthlog.recorder.clips import ClipFinder, Labelled
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.retention import Retention
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.schemas.messages import NANOSECONDS
 
 
 class ClipKeeper:

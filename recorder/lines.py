@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from models.segments import Segment
-from recorder.stream import Gap, Health
-from schemas import messages
-from schemas.messages import NANOSECONDS, encode, message, nanoseconds, time_message
+from hearthlog.models.segments import Segment
+from hearthlog.recorder.stream import Gap, Health
+from hearthlog.schemas import messages
+from hearthlog.schemas.messages import NANOSECONDS, encode, message, nanoseconds, time_message
 
 _INFO, _WARN, _ERROR = 20, 30, 40  # of rcl_interfaces/msg/Log
 _LEVELS = {0: _INFO, 1: _WARN}  # by those of diagnostic_msgs

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recorder.pipeline import Record, opening
-from schemas.errors import LogError
-from schemas.files import active_path, log_path
-from schemas.messages import NANOSECONDS, header
-from schemas.topics import Topic
-from schemas.writer import Attachment, LogWriter
+from hearthlog.recorder.pipeline import Record, opening
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import active_path, log_path
+from hearthlog.schemas.messages import NANOSECONDS, header
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import Attachment, LogWriter
 
 # What may lie between a sound and its being written: a block of frames, and the capture's delay.
 _DELAY_SECONDS = 0.9

@@ -9,8 +9,8 @@ from threading import Event as Flag
 from threading import Thread
 from typing import NamedTuple
 
-from models.classifier import Classifier
-from models.modelfile import Model, load_model
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.modelfile import Model, load_model
 
 _LOOK_SECONDS = 1.0
 

@@ -7,19 +7,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.classifier import Classifier
-from models.inputs import WINDOW_FRAMES, InputStream
-from models.modelfile import Model
-from models.segments import Segment, Segmenter
-from recorder import features, lines
-from recorder.clips import Labelled
-from recorder.features import FeatureExtractor
-from recorder.statistics import RollingStatistics
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
-from schemas import messages
-from schemas.messages import duration_message, encode, header, message, nanoseconds
-from schemas.rows import Column, encode_rows
-from schemas.topics import DIAGNOSTICS, ROSOUT, topic
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import WINDOW_FRAMES, InputStream
+from hearthlog.models.modelfile import Model
+from hearthlog.models.segments import Segment, Segmenter
+from hearthlog.recorder import features, lines
+from hearthlog.recorder.clips import Labelled
+from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
+from hearthlog.schemas import messages
+from hearthlog.schemas.messages import duration_message, encode, header, message, nanoseconds
+from hearthlog.schemas.rows import Column, encode_rows
+from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT, topic
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]

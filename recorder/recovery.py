@@ -11,16 +11,16 @@ from typing import BinaryIO
 import numpy as np
 from mcap.records import Message
 
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages, rosbag2
-from schemas.chunks import read_chunks
-from schemas.chunkwriter import ChunkWriter
-from schemas.damage import Damage
-from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, is_layer, stem, sync_folder
-from schemas.intact import FoundAttachment, FoundChunk
-from schemas.logfile import LogFile
-from schemas.salvage import Definition, Piece, Salvage
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages, rosbag2
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.chunkwriter import ChunkWriter
+from hearthlog.schemas.damage import Damage
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, is_layer, stem, sync_folder
+from hearthlog.schemas.intact import FoundAttachment, FoundChunk
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.salvage import Definition, Piece, Salvage
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
 _ENCODING = "cdr"

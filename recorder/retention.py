@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from schemas.files import AUDIO_SUFFIX
-from schemas.messages import NANOSECONDS
+from hearthlog.schemas.files import AUDIO_SUFFIX
+from hearthlog.schemas.messages import NANOSECONDS
 
 _DAY = 86_400 * NANOSECONDS
 _EVERY = 3600 * NANOSECONDS

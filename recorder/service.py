@@ -4,25 +4,25 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Protocol
 
-from models.modelfile import Model
-from recorder import features
-from recorder.config import Settings
-from recorder.keeper import ClipKeeper, time_of
-from recorder.log import LogDescription, RollingLog
-from recorder.modelwatch import ModelWatch
-from recorder.pipeline import Pipeline, Record, stream_info
-from recorder.recovery import Recovered, recover_active
-from recorder.sources.microphone import MicrophoneSource
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
-from schemas.topics import topics_of
-from schemas.writer import Attachment
+from hearthlog import __version__
+from hearthlog.models.modelfile import Model
+from hearthlog.recorder import features
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.keeper import ClipKeeper, time_of
+from hearthlog.recorder.log import LogDescription, RollingLog
+from hearthlog.recorder.modelwatch import ModelWatch
+from hearthlog.recorder.pipeline import Pipeline, Record, stream_info
+from hearthlog.recorder.recovery import Recovered, recover_active
+from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.schemas.topics import topics_of
+from hearthlog.schemas.writer import Attachment
 
 
 class Source(Protocol):
@@ -203,7 +203,7 @@ def _describe(settings: Settings, source: Source, model: Model | None) -> LogDes
     classes = None if model is None else list(model.classes)
     info = stream_info(microphone, source.device, model)
     metadata = {
-        "version": version("hearthlog"),
+        "version": __version__,
         "node": settings.node,
         "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
         "feature_set": features.NAME,

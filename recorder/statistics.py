@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import WINDOW_FRAMES, mean_and_std, successive
+from hearthlog.models.inputs import WINDOW_FRAMES, mean_and_std, successive
 
 _FRAMES_AT_ONCE = 256
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.messages import NANOSECONDS
 
 FRAME_NANOSECONDS = NANOSECONDS * FRAME_SAMPLES // SAMPLE_RATE
 

@@ -5,7 +5,7 @@ from datetime import UTC, tzinfo
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
-from schemas.errors import LogError
+from hearthlog.schemas.errors import LogError
 
 DEFAULT = "UTC"
 _NAME_FILE = Path("/etc/timezone")

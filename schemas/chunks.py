@@ -13,10 +13,10 @@ from mcap import records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from schemas.errors import LogError
-from schemas.logfile import LogFile
-from schemas.records import HEAD, ChunkHead, McapError, chunk_head, decompress_into, parse
-from schemas.rows import Bytes, Int64, gather
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.records import HEAD, ChunkHead, McapError, chunk_head, decompress_into, parse
+from hearthlog.schemas.rows import Bytes, Int64, gather
 
 _INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")])

@@ -18,10 +18,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from schemas.ahead import map_ahead
-from schemas.chunks import MESSAGE_HEAD, RawMessages
-from schemas.records import HEAD, MAGIC
-from schemas.rows import Int64, gather
+from hearthlog.schemas.ahead import map_ahead
+from hearthlog.schemas.chunks import MESSAGE_HEAD, RawMessages
+from hearthlog.schemas.records import HEAD, MAGIC
+from hearthlog.schemas.rows import Int64, gather
 
 CHUNK_SIZE = 1 << 20
 _COMPRESSION = b"zstd"

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.chunks import RawMessages, bounds
-from schemas.errors import LogError
-from schemas.layout import message_type
-from schemas.logfile import topic_counts
-from schemas.ranges import map_logs
-from schemas.rows import Fields, Int64, decode_rows, ragged
-from schemas.series import iterate_pieces
+from hearthlog.schemas.chunks import RawMessages, bounds
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.logfile import topic_counts
+from hearthlog.schemas.ranges import map_logs
+from hearthlog.schemas.rows import Fields, Int64, decode_rows, ragged
+from hearthlog.schemas.series import iterate_pieces
 
 _HEADS = ("log_times", "publish_times", "sequences")
 

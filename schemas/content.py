@@ -7,11 +7,11 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from schemas import rosbag2
-from schemas.chunkwriter import Block, ChunkWriter
-from schemas.messages import definition, type_hash
-from schemas.rows import Column, Int64, encode_groups
-from schemas.topics import Topic
+from hearthlog.schemas import rosbag2
+from hearthlog.schemas.chunkwriter import Block, ChunkWriter
+from hearthlog.schemas.messages import definition, type_hash
+from hearthlog.schemas.rows import Column, Int64, encode_groups
+from hearthlog.schemas.topics import Topic
 
 PROFILE = "ros2"
 ENCODING = "cdr"
@@ -37,7 +37,7 @@ class Rows(NamedTuple):
     log_times : np.ndarray [shape=(n,)], int64
         Nanoseconds; the publish times are the same.
     fields : mapping of str to column
-        As `schemas.rows.encode_groups` takes them.
+        As `hearthlog.schemas.rows.encode_groups` takes them.
     """
 
     topic: str

@@ -14,10 +14,10 @@ from mcap import records
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from schemas import rosbag2
-from schemas.intact import MESSAGE_SIZE, SHORTEST, IntactReader
-from schemas.logfile import FOOTER_SIZE
-from schemas.records import HEAD, LIMIT, MAGIC, McapError, parse
+from hearthlog.schemas import rosbag2
+from hearthlog.schemas.intact import MESSAGE_SIZE, SHORTEST, IntactReader
+from hearthlog.schemas.logfile import FOOTER_SIZE
+from hearthlog.schemas.records import HEAD, LIMIT, MAGIC, McapError, parse
 
 _BLOCK = 1 << 20
 _TIMES = struct.Struct("<QQ")

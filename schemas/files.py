@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
-from schemas.ranges import is_local, store_errors
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.ranges import is_local, store_errors
 
 SUFFIX = ".mcap"
 ACTIVE_SUFFIX = SUFFIX + ".active"

@@ -10,12 +10,12 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.chunks import RawMessages, read_chunks
-from schemas.columns import Columns, decode
-from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, stem
-from schemas.logfile import LogFile
-from schemas.series import iterate_messages
+from hearthlog.schemas.chunks import RawMessages, read_chunks
+from hearthlog.schemas.columns import Columns, decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, stem
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.series import iterate_messages
 
 _POLL_SECONDS = 0.2
 _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change

@@ -17,9 +17,9 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from numpy.typing import NDArray
 
-from schemas.chunkwriter import StoredChunk
-from schemas.records import HEAD, LIMIT, MAGIC, ChunkHead, McapError, decompress, parse
-from schemas.rows import gather
+from hearthlog.schemas.chunkwriter import StoredChunk
+from hearthlog.schemas.records import HEAD, LIMIT, MAGIC, ChunkHead, McapError, decompress, parse
+from hearthlog.schemas.rows import gather
 
 MESSAGE_SIZE = 31  # bytes of a message without payload, opcode and length included
 _SMALL = 16 << 20  # bytes; a record that is neither chunk, message nor attachment has fewer

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
-from schemas.errors import LogError
-from schemas.messages import definition, typestore
-from schemas.records import LIMIT
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import definition, typestore
+from hearthlog.schemas.records import LIMIT
 
 START = 4  # of the fields: alignment counts from here
 _ENCAPSULATION = {"<": b"\x00\x01", ">": b"\x00\x00"}  # plain CDR, by byte order

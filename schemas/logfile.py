@@ -16,10 +16,10 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from numpy.typing import NDArray
 
-from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX
-from schemas.ranges import LocalFile, Section, StoredFile, open_file
-from schemas.records import HEAD, LIMIT, MAGIC, McapError, parse
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import ACTIVE_SUFFIX
+from hearthlog.schemas.ranges import LocalFile, Section, StoredFile, open_file
+from hearthlog.schemas.records import HEAD, LIMIT, MAGIC, McapError, parse
 
 FOOTER_SIZE = HEAD.size + 20 + len(MAGIC)
 CHUNKS = np.dtype(

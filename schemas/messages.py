@@ -27,8 +27,9 @@ NANOSECONDS = 1_000_000_000
 def typestore() -> Typestore:
     """Return the types of ROS 2 and those of `schemas/msg`."""
     store = get_typestore(Stores.ROS2_JAZZY)
+    folder = files("hearthlog.schemas") / "msg"
     for name in _DEFINED_HERE:
-        text = files("schemas").joinpath("msg", name.rpartition("/")[2] + ".msg").read_text()
+        text = (folder / f"{name.rpartition('/')[2]}.msg").read_text()
         store.register(get_types_from_msg(text, name))
     return store
 

@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from schemas.ahead import map_ahead
-from schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.ahead import map_ahead
+from hearthlog.schemas.errors import HearthlogError, LogError
 
 _BLOCK = 1 << 17  # bytes: a store hands them out in hardly more time than a few
 _KEPT = 4  # blocks

@@ -9,10 +9,10 @@ import numpy as np
 from mcap.records import Attachment, Channel, Metadata
 from rosbags.serde import SerdeError
 
-from schemas.chunks import RawMessages, read_chunks
-from schemas.errors import LogError
-from schemas.logfile import LogFile
-from schemas.messages import decode
+from hearthlog.schemas.chunks import RawMessages, read_chunks
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import decode
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from schemas.topics import Quality
+from hearthlog.schemas.topics import Quality
 
 METADATA = "rosbag2"
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import LogError
-from schemas.layout import Layout, Leaf, Messages, MessageType, message_type
-from schemas.messages import NANOSECONDS
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import Layout, Leaf, Messages, MessageType, message_type
+from hearthlog.schemas.messages import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]

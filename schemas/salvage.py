@@ -20,9 +20,9 @@ import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
 
-from schemas.damage import Damage, Stretch, lost_in, read_index
-from schemas.errors import LogError
-from schemas.intact import (
+from hearthlog.schemas.damage import Damage, Stretch, lost_in, read_index
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.intact import (
     SHORTEST,
     Found,
     FoundAttachment,
@@ -30,7 +30,7 @@ from schemas.intact import (
     IntactReader,
     messages_of,
 )
-from schemas.records import HEAD, LIMIT, MAGIC, McapError
+from hearthlog.schemas.records import HEAD, LIMIT, MAGIC, McapError
 
 _VAIN = 8
 _HELD = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep

@@ -8,11 +8,11 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.ahead import map_ahead
-from schemas.chunks import RawMessages, read_chunks
-from schemas.logfile import LogFile, time_span
-from schemas.ranges import map_logs
-from schemas.records import LIMIT
+from hearthlog.schemas.ahead import map_ahead
+from hearthlog.schemas.chunks import RawMessages, read_chunks
+from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.ranges import map_logs
+from hearthlog.schemas.records import LIMIT
 
 _BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
 _READERS = 2  # threads: more than these wait for each other's Python

@@ -3,7 +3,7 @@
 import re
 from datetime import UTC, datetime, timedelta
 
-from schemas.messages import NANOSECONDS
+from hearthlog.schemas.messages import NANOSECONDS
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")

@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from schemas import messages
-from schemas.errors import LogError
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
 
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from schemas.content import (
+from hearthlog.schemas.content import (
     ENCODING,
     METADATA,
     PROFILE,
@@ -16,9 +16,9 @@ from schemas.content import (
     LogContent,
     Rows,
 )
-from schemas.errors import LogError
-from schemas.files import active_path, sync_folder
-from schemas.topics import Topic
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import active_path, sync_folder
+from hearthlog.schemas.topics import Topic
 
 __all__ = ["ENCODING", "METADATA", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
 

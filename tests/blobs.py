@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from analyzer.dataset import Dataset
-from analyzer.scenario import Scenario
+from hearthlog.analyzer.dataset import Dataset
+from hearthlog.analyzer.scenario import Scenario
 
 SOURCES = 6
 

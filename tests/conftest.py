@@ -14,15 +14,15 @@ from realday import write_real_day
 from spliced import record_logs
 from stores import bucket, in_memory, s3_account
 
-from analyzer.dataset import build_dataset
-from analyzer.hmm import LAG_SECONDS, default_transitions
-from analyzer.manifest import read_manifest
-from analyzer.scenario import load_scenario
-from analyzer.train import train_model
-from models.modelfile import Smoothing, load_model, save_model
-from recorder.features import FRAME_SAMPLES
-from recorder.sources.files import read_audio
-from tools.home.simulate import write_day, write_training_set
+from hearthlog.analyzer.dataset import build_dataset
+from hearthlog.analyzer.hmm import LAG_SECONDS, default_transitions
+from hearthlog.analyzer.manifest import read_manifest
+from hearthlog.analyzer.scenario import load_scenario
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.modelfile import Smoothing, load_model, save_model
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
     "bucket",
@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
-HEARTHLOG = [sys.executable, "-m", "tools.cli.main"]
+HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
 
 @pytest.fixture(scope="session")

@@ -45,8 +45,8 @@ class Victim:
 
 
 def _serve(pipe, folder: Path) -> None:
-    from analyzer.doctor import examine  # noqa: PLC0415
-    from schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
+    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
 
     assert examine
     assert LogReader
@@ -58,7 +58,7 @@ def _serve(pipe, folder: Path) -> None:
 
 
 def _try(reader, path: Path, folder: Path) -> str:
-    from schemas.errors import HearthlogError  # noqa: PLC0415
+    from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
 
     try:
         reader(path, folder)
@@ -70,33 +70,33 @@ def _try(reader, path: Path, folder: Path) -> str:
 
 
 def message_by_message(path: Path, _folder: Path) -> None:
-    from schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
 
     for item in LogReader(path).messages():
         item.decode()
 
 
 def as_columns(path: Path, _folder: Path) -> None:
-    from schemas.columns import read_columns  # noqa: PLC0415
+    from hearthlog.schemas.columns import read_columns  # noqa: PLC0415
 
     read_columns([path])
 
 
 def as_columns_between(path: Path, _folder: Path) -> None:
-    from schemas.columns import read_columns  # noqa: PLC0415
+    from hearthlog.schemas.columns import read_columns  # noqa: PLC0415
 
     middle = 1_772_348_410_000_000_000
     read_columns([path], ["/mic/features", "/mic/gap"], middle, middle + 5_000_000_000)
 
 
 def summarised(path: Path, _folder: Path) -> None:
-    from analyzer.summary import summarise  # noqa: PLC0415
+    from hearthlog.analyzer.summary import summarise  # noqa: PLC0415
 
     summarise([path])
 
 
 def examined(path: Path, _folder: Path) -> None:
-    from analyzer.doctor import examine  # noqa: PLC0415
+    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
 
     for findings in examine(path):
         assert all(str(finding).isprintable() for finding in findings.shown)
@@ -104,10 +104,10 @@ def examined(path: Path, _folder: Path) -> None:
 
 def recovered(path: Path, folder: Path) -> None:
     """What is recovered can be read, and breaks no rule of MCAP."""
-    from analyzer.doctor import examine  # noqa: PLC0415
-    from recorder.recovery import recover_log  # noqa: PLC0415
-    from schemas.errors import HearthlogError  # noqa: PLC0415
-    from schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
+    from hearthlog.recorder.recovery import recover_log  # noqa: PLC0415
+    from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
+    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
 
     copy = folder / "recovered.mcap"
     recover_log(path, copy, copy.name)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from recorder.features import FEATURE_NAMES
-from schemas import messages
-from schemas.content import Attachment, Rows
-from schemas.files import log_path
-from schemas.messages import NANOSECONDS, duration_message, encode, header, message
-from schemas.topics import DIAGNOSTICS, topics_of
-from schemas.writer import LogWriter
+from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.schemas import messages
+from hearthlog.schemas.content import Attachment, Rows
+from hearthlog.schemas.files import log_path
+from hearthlog.schemas.messages import NANOSECONDS, duration_message, encode, header, message
+from hearthlog.schemas.topics import DIAGNOSTICS, topics_of
+from hearthlog.schemas.writer import LogWriter
 
 GENERAL = [
     "silence",

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from models.inputs import input_width
-from models.modelfile import Model, Smoothing, load_model, save_model
+from hearthlog.models.inputs import input_width
+from hearthlog.models.modelfile import Model, Smoothing, load_model, save_model
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recorder.features import FEATURE_NAMES
-from schemas.files import find_logs
-from schemas.messages import nanoseconds
-from schemas.reader import LogReader
+from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import nanoseconds
+from hearthlog.schemas.reader import LogReader
 
 
 def read(path: Path, kind: str) -> list:

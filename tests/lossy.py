@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from threading import Event as Flag
 
-from recorder.service import Source
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.recorder.service import Source
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
 
 
 class LossySource:

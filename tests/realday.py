@@ -9,17 +9,17 @@ import numpy as np
 import soundfile
 from lossy import LossySource
 
-from analyzer.dataset import build_dataset
-from analyzer.manifest import Clip, read_manifest
-from analyzer.recipe import RECIPES
-from analyzer.scenario import Scenario
-from analyzer.train import train_model
-from models.modelfile import save_model
-from recorder.config import Settings
-from recorder.features import SAMPLE_RATE
-from recorder.service import record
-from recorder.sources.files import read_audio
-from recorder.sources.replayed import FileSource
+from hearthlog.analyzer.dataset import build_dataset
+from hearthlog.analyzer.manifest import Clip, read_manifest
+from hearthlog.analyzer.recipe import RECIPES
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.modelfile import save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.sources.replayed import FileSource
 
 ZONE = "Europe/Vienna"
 START = 1_772_319_600_000_000_000  # the midnight there at which 2026-03-01 begins

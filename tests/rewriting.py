@@ -29,9 +29,9 @@ from mcap.records import (
 )
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from schemas import rosbag2
-from schemas.messages import decode, encode
-from schemas.records import MAGIC
+from hearthlog.schemas import rosbag2
+from hearthlog.schemas.messages import decode, encode
+from hearthlog.schemas.records import MAGIC
 
 HEAD = struct.Struct("<BQ")
 

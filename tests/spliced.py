@@ -13,14 +13,14 @@ import pytest
 from lossy import LossySource
 from mcap.reader import make_reader
 
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from schemas import rosbag2
-from schemas.chunkwriter import ChunkWriter
-from schemas.messages import definition, encode, type_hash
-from schemas.topics import Quality
-from tools.cli.main import main
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas import rosbag2
+from hearthlog.schemas.chunkwriter import ChunkWriter
+from hearthlog.schemas.messages import definition, encode, type_hash
+from hearthlog.schemas.topics import Quality
+from hearthlog.tools.cli.main import main
 
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 40}

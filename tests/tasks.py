@@ -6,7 +6,7 @@ import threading
 import time
 from pathlib import Path
 
-from schemas.errors import LogError
+from hearthlog.schemas.errors import LogError
 
 
 class PickyError(Exception):

@@ -8,14 +8,14 @@ import pytest
 import soundfile
 from blobs import blobs, ignore_progress
 
-from analyzer.adaptation import CORRECTED, adaptation_curve
-from analyzer.augment import augmented
-from analyzer.dataset import Recording, cut_recordings
-from analyzer.errors import DataError
-from analyzer.evaluation.folds import KINDS, evaluate_recipe
-from analyzer.home import home_recordings, home_sequences
-from analyzer.marks import Mark, write_marks
-from analyzer.recipe import (
+from hearthlog.analyzer.adaptation import CORRECTED, adaptation_curve
+from hearthlog.analyzer.augment import augmented
+from hearthlog.analyzer.dataset import Recording, cut_recordings
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.folds import KINDS, evaluate_recipe
+from hearthlog.analyzer.home import home_recordings, home_sequences
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.recipe import (
     RECIPES,
     decide_with_home,
     fit,
@@ -23,14 +23,14 @@ from analyzer.recipe import (
     prepare,
     softmax,
 )
-from analyzer.scenario import Scenario
-from analyzer.train import adapt_model, train_model
-from models.classifier import HOME_VOTE, Classifier, home_votes
-from models.inputs import bands_of, window_inputs
-from models.modelfile import load_model, save_model
-from recorder.features import FeatureExtractor
-from schemas.columns import read_columns
-from schemas.files import find_logs
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.analyzer.train import adapt_model, train_model
+from hearthlog.models.classifier import HOME_VOTE, Classifier, home_votes
+from hearthlog.models.inputs import bands_of, window_inputs
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.files import find_logs
 
 RATE = 16_000
 BANDS = RECIPES["bands"]

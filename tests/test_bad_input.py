@@ -11,8 +11,8 @@ import soundfile
 from logs import features
 from spliced import small_disk
 
-from models.modelfile import load_model, save_model
-from schemas.reader import LogReader
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.schemas.reader import LogReader
 
 
 @pytest.fixture

@@ -7,17 +7,17 @@ import sys
 import numpy as np
 import pytest
 
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from tools.bench import features, reading, timing, writing
-from tools.bench.labmic import make_microphone
-from tools.bench.table import Row, Table, Target
-from tools.bench.workload import Workload
-from tools.home.simulate import write_training_set
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.tools.bench import features, reading, timing, writing
+from hearthlog.tools.bench.labmic import make_microphone
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.workload import Workload
+from hearthlog.tools.home.simulate import write_training_set
 
 
 def bench(*arguments):
     return subprocess.run(
-        [sys.executable, "-m", "tools.bench", *map(str, arguments)],
+        [sys.executable, "-m", "hearthlog.tools.bench", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=120,

@@ -10,8 +10,8 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features, read
 
-from recorder.features import FRAME_SAMPLES, FeatureExtractor
-from schemas.messages import nanoseconds
+from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.schemas.messages import nanoseconds
 
 RATE = 16_000
 FRAME = 50_000_000

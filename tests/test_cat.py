@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spliced import run, write_log
 
-from analyzer.lines import in_order, json_lines, printable, text_lines
-from analyzer.pieces import pieces
-from schemas.chunkwriter import ChunkWriter
-from schemas.files import find_logs
-from schemas.messages import (
+from hearthlog.analyzer.lines import in_order, json_lines, printable, text_lines
+from hearthlog.analyzer.pieces import pieces
+from hearthlog.schemas.chunkwriter import ChunkWriter
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import (
     FEATURES,
     NANOSECONDS,
     decode,
@@ -31,11 +31,11 @@ from schemas.messages import (
     nanoseconds,
     time_message,
 )
-from schemas.reader import LogReader
-from schemas.series import iterate_messages
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
-from tools.cli.times import parse_time
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.series import iterate_messages
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.tools.cli.times import parse_time
 
 
 @pytest.fixture
@@ -411,7 +411,8 @@ def test_messages_that_are_not_of_ros_2_are_refused(hearthlog, tmp_path):
 
 
 def test_printing_needs_nothing_but_the_recorder(long):
-    code = "import sys\nsys.modules['pyarrow'] = None\nfrom tools.cli.main import main\nmain()"
+    code = "import sys\nsys.modules['pyarrow'] = None\n"
+    code += "from hearthlog.tools.cli.main import main\nmain()"
     for form in ("text", "ndjson"):
         command = [HEARTHLOG[0], "-c", code, "cat", str(long), "--format", form]
         result = subprocess.run(command, capture_output=True, check=True, env=os.environ)

@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from spliced import record_logs, run
 from stores import put
 
-from analyzer.catalog import (
+from hearthlog.analyzer.catalog import (
     DAMAGED,
     FINISHED,
     LOG,
@@ -29,21 +29,21 @@ from analyzer.catalog import (
     read_catalog,
     write_catalog,
 )
-from analyzer.catalog.file import SCHEMA, sealed
-from analyzer.catalog.fleet import heard, homes
-from analyzer.errors import DataError
-from analyzer.marks import Mark, write_marks
-from analyzer.selection import select
-from recorder.config import Microphone, Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from schemas import messages
-from schemas.errors import LogError
-from schemas.files import CATALOG, active_path, find_logs
-from schemas.logfile import FOOTER_SIZE, time_span
-from schemas.messages import NANOSECONDS, nanoseconds
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.analyzer.catalog.file import SCHEMA, sealed
+from hearthlog.analyzer.catalog.fleet import heard, homes
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.selection import select
+from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import CATALOG, active_path, find_logs
+from hearthlog.schemas.logfile import FOOTER_SIZE, time_span
+from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 SECOND = NANOSECONDS
 START = 1_772_352_000_000_000_000  # a full hour

@@ -12,10 +12,10 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from analyzer.recipe import RECIPES, decide, softmax
-from analyzer.train import train_model
-from models.classifier import Classifier
-from models.inputs import window_inputs
+from hearthlog.analyzer.recipe import RECIPES, decide, softmax
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import window_inputs
 
 ROWS = 600
 

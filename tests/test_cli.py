@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import HEARTHLOG
 from mcap.writer import Writer as McapWriter
 
-from schemas import messages
-from schemas.messages import NANOSECONDS
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.schemas import messages
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
@@ -20,7 +21,7 @@ HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory, day, model_file):
     folder = tmp_path_factory.mktemp("logs")
-    command = [sys.executable, "-m", "tools.cli.main", "record", day, "--model", model_file]
+    command = [*HEARTHLOG, "record", day, "--model", model_file]
     options = ["-o", folder, "--start", "2026-03-01T06:59:00", "--node", "flat", "--name", "hall"]
     subprocess.run([*map(str, command + options)], check=True, capture_output=True)
     return folder
@@ -172,7 +173,7 @@ def test_info_sends_nothing_of_a_file_to_the_terminal_that_would_steer_it(hearth
 def test_recording_with_labels_imports_nothing_of_the_analyzer(day, model_file, tmp_path):
     code = (
         "import sys\n"
-        "from tools.cli.main import main\n"
+        "from hearthlog.tools.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(*sys.modules)\n"
     )

@@ -22,25 +22,25 @@ from logs import read
 from lossy import LossySource
 from spliced import raw_messages, small_disk
 
-from analyzer.dataset import build_dataset
-from analyzer.manifest import read_manifest
-from analyzer.scenario import load_scenario
-from analyzer.train import train_model
-from models.inputs import WINDOW_FRAMES
-from models.modelfile import Description, load_model, save_model
-from recorder.cliplog import ClipLog
-from recorder.clips import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
-from recorder.config import Settings, load_settings
-from recorder.errors import ConfigurationError
-from recorder.features import FRAME_SAMPLES
-from recorder.retention import Retention
-from recorder.service import record, record_files
-from recorder.sources.files import read_audio
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
-from schemas.files import audio_path, find_logs, is_layer
-from schemas.messages import nanoseconds
-from schemas.reader import LogReader
+from hearthlog.analyzer.dataset import build_dataset
+from hearthlog.analyzer.manifest import read_manifest
+from hearthlog.analyzer.scenario import load_scenario
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.models.modelfile import Description, load_model, save_model
+from hearthlog.recorder.cliplog import ClipLog
+from hearthlog.recorder.clips import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
+from hearthlog.recorder.config import Settings, load_settings
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.retention import Retention
+from hearthlog.recorder.service import record, record_files
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.schemas.files import audio_path, find_logs, is_layer
+from hearthlog.schemas.messages import nanoseconds
+from hearthlog.schemas.reader import LogReader
 
 SECOND = 1_000_000_000
 HOUR, DAY = 3600 * SECOND, 86_400 * SECOND

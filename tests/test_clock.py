@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorder.clock import SampleClock
-from recorder.features import FRAME_SAMPLES
-from recorder.sources.framing import Block, Framer
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.clock import SampleClock
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.sources.framing import Block, Framer
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
 
 RATE = 16_000
 BLOCK = 8_000

@@ -17,20 +17,20 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from recorder.config import load_settings
-from recorder.service import record_files
-from recorder.sources.replayed import FileSource
-from schemas import messages
-from schemas.chunks import read_chunks
-from schemas.chunkwriter import ChunkWriter, StoredChunk
-from schemas.columns import iterate_columns, read_columns
-from schemas.errors import LogError
-from schemas.files import active_path
-from schemas.logfile import LogFile
-from schemas.messages import NANOSECONDS, definition, encode, header, message, typestore
-from schemas.reader import LogReader
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.service import record_files
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.chunkwriter import ChunkWriter, StoredChunk
+from hearthlog.schemas.columns import iterate_columns, read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import active_path
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import NANOSECONDS, definition, encode, header, message, typestore
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 SECOND = NANOSECONDS
 
@@ -366,7 +366,7 @@ def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
     writer.finish()
     code = f"""
 from pathlib import Path
-from schemas.columns import iterate_columns
+from hearthlog.schemas.columns import iterate_columns
 def peak():
     status = open("/proc/self/status").read()
     return int(status.partition("VmHWM:")[2].split()[0])

@@ -9,20 +9,20 @@ import pytest
 from kept import keep_models
 from spliced import run
 
-from analyzer.compare import clip_recordings, compare_models
-from analyzer.dataset import cut_recordings
-from analyzer.errors import DataError
-from analyzer.evaluation.clips import scenario_of
-from analyzer.home import home_recordings
-from analyzer.manifest import read_manifest
-from analyzer.marks import Mark, write_marks
-from analyzer.scenario import load_scenario
-from analyzer.train import adapt_model
-from models.modelfile import load_model, save_model
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from tools.home.simulate import write_day, write_training_set
+from hearthlog.analyzer.compare import clip_recordings, compare_models
+from hearthlog.analyzer.dataset import cut_recordings
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.clips import scenario_of
+from hearthlog.analyzer.home import home_recordings
+from hearthlog.analyzer.manifest import read_manifest
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.scenario import load_scenario
+from hearthlog.analyzer.train import adapt_model
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.tools.home.simulate import write_day, write_training_set
 
 SECOND = 1_000_000_000
 DAY = 86_400 * SECOND

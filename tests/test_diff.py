@@ -14,26 +14,26 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 from spliced import record_logs, run
 from stores import put
 
-from analyzer.diff.difference import compare_sides
-from analyzer.diff.doubt import uncertainty
-from analyzer.diff.listing import REASONS, Span, read_list, write_list
-from analyzer.diff.queue import make_queue
-from analyzer.diff.sources import Side, find_sources
-from analyzer.diff.windows import other_labels, windows_of
-from analyzer.errors import DataError
-from analyzer.evaluation.events import Events
-from analyzer.evaluation.reference import Labelling
-from analyzer.export.names import names_of
-from analyzer.marks import Mark, read_marks, write_marks
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.columns import read_columns
-from schemas.errors import LogError
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
-from schemas.times import read_time, time_text
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.analyzer.diff.difference import compare_sides
+from hearthlog.analyzer.diff.doubt import uncertainty
+from hearthlog.analyzer.diff.listing import REASONS, Span, read_list, write_list
+from hearthlog.analyzer.diff.queue import make_queue
+from hearthlog.analyzer.diff.sources import Side, find_sources
+from hearthlog.analyzer.diff.windows import other_labels, windows_of
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import Events
+from hearthlog.analyzer.evaluation.reference import Labelling
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import read_time, time_text
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 CLASSES = ("silence", "speech", "coughing")
 MIDNIGHT = read_time("2026-03-02T00:00:00")

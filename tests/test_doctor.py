@@ -37,17 +37,17 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from analyzer.doctor import examine
-from recorder.config import Settings
-from recorder.log import RollingLog
-from recorder.pipeline import Pipeline
-from recorder.recovery import recover_active
-from recorder.service import _describe, record
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Gap
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
-from schemas.records import MAGIC
+from hearthlog.analyzer.doctor import examine
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.log import RollingLog
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.recovery import recover_active
+from hearthlog.recorder.service import _describe, record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Gap
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.records import MAGIC
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 NAME = "home_20260301T070000Z.mcap"

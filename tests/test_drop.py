@@ -9,9 +9,9 @@ import pytest
 from lossy import LossySource
 from viewers import shown, viewer
 
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
 
 __all__ = ["viewer"]  # a fixture
 

@@ -12,15 +12,15 @@ import soundfile
 from conftest import HEARTHLOG
 from spliced import run
 
-from analyzer.enrol import enrol_file
-from analyzer.heard import find_heard
-from analyzer.marks import read_marks
-from recorder.features import FRAME_SAMPLES, FeatureExtractor
-from recorder.sources.files import read_audio
-from schemas.columns import read_columns
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.enrol import enrol_file
+from hearthlog.analyzer.heard import find_heard
+from hearthlog.analyzer.marks import read_marks
+from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 RATE = 16_000
 FEATURES = topic("mic", "features")

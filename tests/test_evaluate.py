@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
-from analyzer.errors import DataError
-from analyzer.evaluation.events import (
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import (
     Events,
     common,
     event_based,
@@ -18,12 +18,18 @@ from analyzer.evaluation.events import (
     segment_based,
     total,
 )
-from analyzer.evaluation.reference import Labelling, compare
-from analyzer.evaluation.scores import Bin, calibration_error, difference, reliability, score
-from analyzer.evaluation.table import class_table, confusion_table
-from analyzer.hmm import default_transitions
-from models.modelfile import Smoothing, load_model, save_model
-from tools.home.simulate import write_training_set
+from hearthlog.analyzer.evaluation.reference import Labelling, compare
+from hearthlog.analyzer.evaluation.scores import (
+    Bin,
+    calibration_error,
+    difference,
+    reliability,
+    score,
+)
+from hearthlog.analyzer.evaluation.table import class_table, confusion_table
+from hearthlog.analyzer.hmm import default_transitions
+from hearthlog.models.modelfile import Smoothing, load_model, save_model
+from hearthlog.tools.home.simulate import write_training_set
 
 SECOND = 1_000_000_000
 FRAME = SECOND // 20

@@ -14,13 +14,13 @@ from pyannote.core import Annotation, Segment
 from pyannote.database.util import load_rttm
 from spliced import run
 
-from analyzer.errors import DataError
-from analyzer.exchange import SUFFIXES, new_marks, read_labels, write_labels
-from analyzer.exchange.labels import seconds_text
-from analyzer.heard import Heard, find_heard
-from analyzer.marks import LATEST, ROUNDING, Mark, read_marks
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange import SUFFIXES, new_marks, read_labels, write_labels
+from hearthlog.analyzer.exchange.labels import seconds_text
+from hearthlog.analyzer.heard import Heard, find_heard
+from hearthlog.analyzer.marks import LATEST, ROUNDING, Mark, read_marks
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS
 
 SECOND = NANOSECONDS
 MILLISECOND = SECOND // 1000

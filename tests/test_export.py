@@ -16,13 +16,13 @@ from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from spliced import raw_messages, run, small_disk, write_log
 
-from recorder.sources.files import read_audio
-from schemas import messages
-from schemas.chunkwriter import ChunkWriter
-from schemas.columns import read_columns
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS, header, message, nanoseconds, time_message
-from schemas.reader import LogReader
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunkwriter import ChunkWriter
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS, header, message, nanoseconds, time_message
+from hearthlog.schemas.reader import LogReader
 
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pyAudioAnalysis import ShortTermFeatures
 from scipy.fftpack import fft
 
-from recorder.features import (
+from hearthlog.recorder.features import (
     FEATURE_NAMES,
     FRAME_SAMPLES,
     MFCC_COUNT,

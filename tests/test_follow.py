@@ -11,12 +11,12 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features
 
-from schemas import messages
-from schemas.errors import LogError
-from schemas.files import find_logs
-from schemas.follow import follow
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.follow import follow
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 TOPIC = "/mic/features"
 

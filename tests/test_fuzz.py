@@ -16,10 +16,10 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from rewriting import HEAD, Raw, as_raw, joined, parsed, split
 
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas.messages import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 NUMBERS = st.one_of(

@@ -10,10 +10,10 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
-from recorder.statistics import WINDOW_FRAMES, RollingStatistics
-from tools.home.simulate import _perform, _plan_day, write_day, write_training_set
-from tools.home.sounds import LABELS, SimulationError, synthesize
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from hearthlog.tools.home.simulate import _perform, _plan_day, write_day, write_training_set
+from hearthlog.tools.home.sounds import LABELS, SimulationError, synthesize
 
 GENERAL = {
     "silence",

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.inputs import InputStream, bands_of, dct_weights, input_width, window_inputs
-from recorder.statistics import RollingStatistics
+from hearthlog.models.inputs import InputStream, bands_of, dct_weights, input_width, window_inputs
+from hearthlog.recorder.statistics import RollingStatistics
 
 KINDS = ["statistics", "bands"]
 

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
-from schemas import messages
-from schemas.errors import LogError
-from schemas.layout import message_type
-from schemas.messages import NANOSECONDS, definition, typestore
-from schemas.rows import decode_rows
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.messages import NANOSECONDS, definition, typestore
+from hearthlog.schemas.rows import decode_rows
 
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",

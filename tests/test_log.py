@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from logs import features
 
-from recorder.log import LogDescription, RollingLog
-from recorder.pipeline import Pipeline
-from recorder.service import Settings, _describe
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.files import find_logs
-from schemas.messages import NANOSECONDS, nanoseconds
-from schemas.reader import LogReader
+from hearthlog.recorder.log import LogDescription, RollingLog
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.service import Settings, _describe
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
+from hearthlog.schemas.reader import LogReader
 
 HOUR = 3600 * NANOSECONDS
 START = 490_000 * HOUR

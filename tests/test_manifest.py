@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analyzer.errors import DataError
-from analyzer.manifest import read_manifest
-from analyzer.scenario import BUILTIN, LABELS, load_scenario
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.manifest import read_manifest
+from hearthlog.analyzer.scenario import BUILTIN, LABELS, load_scenario
 
 HEADER = "path,label,source_group,source,licence\n"
 

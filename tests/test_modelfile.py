@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
-from analyzer.train import train_model
-from models.errors import ModelError
-from models.modelfile import load_model, save_model
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile import load_model, save_model
 
 ARRAYS = (
     "scaler_mean",

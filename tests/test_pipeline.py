@@ -3,14 +3,22 @@
 import numpy as np
 import pytest
 
-from models.classifier import Classifier
-from models.modelfile import load_model
-from recorder import lines
-from recorder.features import FRAME_SAMPLES
-from recorder.pipeline import Pipeline, opening
-from recorder.sources.files import read_audio
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
-from schemas.messages import LOG, SEGMENT, STREAM_INFO, decode, header, message, nanoseconds
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.modelfile import load_model
+from hearthlog.recorder import lines
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.pipeline import Pipeline, opening
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.schemas.messages import (
+    LOG,
+    SEGMENT,
+    STREAM_INFO,
+    decode,
+    header,
+    message,
+    nanoseconds,
+)
 
 START = 1_772_348_370_123_456_789
 LOST = 40

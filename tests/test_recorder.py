@@ -13,15 +13,15 @@ import soundfile
 from conftest import HEARTHLOG
 from logs import features, read
 
-from models.classifier import Classifier
-from models.modelfile import load_model
-from recorder.features import FRAME_SAMPLES, FeatureExtractor
-from recorder.pipeline import Pipeline
-from recorder.sources.files import read_audio
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
-from schemas.messages import nanoseconds
-from schemas.reader import LogReader
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.modelfile import load_model
+from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.schemas.messages import nanoseconds
+from hearthlog.schemas.reader import LogReader
 
 START = int(datetime(2026, 3, 1, 7, tzinfo=UTC).timestamp()) * 1_000_000_000
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from logs import features
 
-from recorder.config import load_settings
-from recorder.recovery import recover_active
-from recorder.service import record_files
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.errors import LogError
-from schemas.files import active_path
-from schemas.reader import LogReader
-from schemas.topics import topics_of
-from schemas.writer import LogWriter
+from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.recovery import recover_active
+from hearthlog.recorder.service import record_files
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import active_path
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import topics_of
+from hearthlog.schemas.writer import LogWriter
 
 CHUNK = 0x06
 

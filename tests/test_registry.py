@@ -10,9 +10,9 @@ import pytest
 from kept import keep_models, put_by_hand
 from spliced import run
 
-from models.errors import ModelError
-from models.modelfile import load_model
-from models.registry import list_models, load, promote, rollback, target
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import list_models, load, promote, rollback, target
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ PROMOTING = """
 import sys
 from itertools import cycle
 from pathlib import Path
-from models.registry import promote, rollback
+from hearthlog.models.registry import promote, rollback
 folder = Path(sys.argv[1])
 for number, name in enumerate(cycle(["two", "bands", "one"])):
     promote(folder, name)

@@ -19,27 +19,27 @@ from conftest import HEARTHLOG
 from logs import features, read
 from lossy import LossySource
 
-from analyzer.replay.player import Wanted
-from analyzer.replay.replay import LogSet, find_model
-from analyzer.replay.replay import replay as replay_logs
-from analyzer.train import train_model
-from models.modelfile import load_model, save_model
-from recorder.config import Settings
-from recorder.features import FEATURE_NAMES
-from recorder.recovery import recover_active
-from recorder.service import record
-from recorder.sources.files import read_audio
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
-from schemas import messages
-from schemas.errors import HearthlogError, LogError
-from schemas.files import find_logs
-from schemas.messages import encode, header, message, nanoseconds, time_message
-from schemas.reader import LogReader
-from schemas.topics import Topic, topics_of
-from schemas.writer import Attachment, LogWriter
-from tools.cli.replay import Source
-from tools.cli.replay import replay as verb
+from hearthlog.analyzer.replay.player import Wanted
+from hearthlog.analyzer.replay.replay import LogSet, find_model
+from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.recorder.recovery import recover_active
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import encode, header, message, nanoseconds, time_message
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import Topic, topics_of
+from hearthlog.schemas.writer import Attachment, LogWriter
+from hearthlog.tools.cli.replay import Source
+from hearthlog.tools.cli.replay import replay as verb
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND  # half past seven

@@ -15,22 +15,22 @@ from hypothesis import strategies as st
 from logs import read
 from PIL import Image
 
-from analyzer.colours import colour
-from analyzer.errors import DataError
-from analyzer.hometime import day_span, home_zone, local_time
-from analyzer.marks import Mark, write_marks
-from analyzer.relabel.layer import topics_of as layer_topics
-from analyzer.report.baseline import FEWEST, compared, usual
-from analyzer.report.figures import day_of, whole_home
-from analyzer.report.markup import paragraph
-from analyzer.report.reading import read_heard
-from analyzer.report.report import Period, make_report
-from analyzer.report.shelf import find_shelf
-from analyzer.report.spans import Spans, common, cut, joined, lengths, without
-from analyzer.report.values import Clock, Count, Minutes, exactly
-from schemas.content import Rows
-from schemas.messages import NANOSECONDS, nanoseconds
-from schemas.writer import LogWriter
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.hometime import day_span, home_zone, local_time
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.relabel.layer import topics_of as layer_topics
+from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
+from hearthlog.analyzer.report.figures import day_of, whole_home
+from hearthlog.analyzer.report.markup import paragraph
+from hearthlog.analyzer.report.reading import read_heard
+from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.analyzer.report.shelf import find_shelf
+from hearthlog.analyzer.report.spans import Spans, common, cut, joined, lengths, without
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
+from hearthlog.schemas.content import Rows
+from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
+from hearthlog.schemas.writer import LogWriter
 
 DAY = date(2026, 3, 1)
 UTC = ZoneInfo("UTC")

@@ -23,23 +23,23 @@ from lossy import LossySource
 from spliced import run
 from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
 
-from analyzer.diff.listing import Span as Listed
-from analyzer.diff.listing import write_list
-from analyzer.diff.sources import find_sources
-from analyzer.errors import DataError
-from analyzer.heard import Heard
-from analyzer.marks import Mark, read_marks, write_marks
-from analyzer.review.marking import Marking
-from analyzer.review.queue import queue_items
-from analyzer.review.session import Item, Session
-from analyzer.review.sound import sound_of
-from analyzer.timeline.contents import Clip
-from analyzer.timeline.reading import read_timeline
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.files import find_logs, is_layer
+from hearthlog.analyzer.diff.listing import Span as Listed
+from hearthlog.analyzer.diff.listing import write_list
+from hearthlog.analyzer.diff.sources import find_sources
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.review.marking import Marking
+from hearthlog.analyzer.review.queue import queue_items
+from hearthlog.analyzer.review.session import Item, Session
+from hearthlog.analyzer.review.sound import sound_of
+from hearthlog.analyzer.timeline.contents import Clip
+from hearthlog.analyzer.timeline.reading import read_timeline
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.files import find_logs, is_layer
 
 __all__ = ["display"]  # a fixture
 

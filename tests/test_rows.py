@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas import messages
-from schemas.messages import encode, header, message
-from schemas.rows import encode_rows
+from hearthlog.schemas import messages
+from hearthlog.schemas.messages import encode, header, message
+from hearthlog.schemas.rows import encode_rows
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
 

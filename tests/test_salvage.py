@@ -23,13 +23,13 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
-from recorder.config import load_settings
-from recorder.recovery import NothingWholeError, recover_log
-from recorder.service import record_files
-from recorder.sources.replayed import FileSource
-from schemas.reader import LogReader
-from schemas.topics import Topic
-from schemas.writer import LogWriter
+from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.recovery import NothingWholeError, recover_log
+from hearthlog.recorder.service import record_files
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter
 
 HEADER, MESSAGE, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END = 1, 5, 6, 7, 9, 12, 15
 MAGIC = b"\x89MCAP0\r\n"
@@ -562,7 +562,7 @@ LIES = {
 CHECK = """
 import resource, sys
 from pathlib import Path
-from recorder.recovery import recover_log
+from hearthlog.recorder.recovery import recover_log
 resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
 recovery = recover_log(Path(sys.argv[1]), Path(sys.argv[2]), "copy.mcap")
 most = next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]

@@ -13,15 +13,15 @@ from blobs import blobs, ignore_progress
 from clusters import running, scheduler_in, worker_of
 from joblib import delayed
 
-from analyzer.adaptation import adaptation_curve
-from analyzer.errors import DataError, WorkerError
-from analyzer.evaluation.folds import evaluate_recipe
-from analyzer.recipe import RECIPES, cross_validate, prepare
-from analyzer.search import around, search
-from analyzer.train import group_folds
-from analyzer.workers.parallel import in_parallel, joblib_on
-from models.modelfile import load_model
-from tools.home.simulate import write_training_set
+from hearthlog.analyzer.adaptation import adaptation_curve
+from hearthlog.analyzer.errors import DataError, WorkerError
+from hearthlog.analyzer.evaluation.folds import evaluate_recipe
+from hearthlog.analyzer.recipe import RECIPES, cross_validate, prepare
+from hearthlog.analyzer.search import around, search
+from hearthlog.analyzer.train import group_folds
+from hearthlog.analyzer.workers.parallel import in_parallel, joblib_on
+from hearthlog.models.modelfile import load_model
+from hearthlog.tools.home.simulate import write_training_set
 
 PAPER = RECIPES["paper"]
 
@@ -174,7 +174,7 @@ def test_wrong_use_is_one_line(words, line, tmp_path, hearthlog):
 
 _STEPS = """
 import time
-from tools.cli.progress import steps_done
+from hearthlog.tools.cli.progress import steps_done
 with steps_done("trying") as report:
     for done in range(1, 5):
         time.sleep(0.3)

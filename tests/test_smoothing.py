@@ -9,8 +9,8 @@ import pytest
 from lossy import LossySource
 from rewriting import Log
 
-from analyzer.doctor import examine
-from analyzer.hmm import (
+from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.hmm import (
     FRAME_SECONDS,
     LAG_SECONDS,
     default_transitions,
@@ -19,24 +19,24 @@ from analyzer.hmm import (
     transitions_from_sequences,
     viterbi,
 )
-from analyzer.replay.player import Wanted
-from analyzer.replay.replay import LogSet
-from analyzer.replay.replay import replay as replay_logs
-from models.classifier import Classifier
-from models.errors import ModelError
-from models.inputs import InputStream
-from models.modelfile import Smoothing, load_model, save_model
-from models.segments import Segmenter
-from models.smoothing import FixedLagSmoother
-from recorder.config import Settings
-from recorder.features import FRAME_SAMPLES, FeatureExtractor
-from recorder.pipeline import Pipeline
-from recorder.service import record
-from recorder.sources.files import read_audio
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS, Frames
-from schemas.files import find_logs
-from schemas.messages import (
+from hearthlog.analyzer.replay.player import Wanted
+from hearthlog.analyzer.replay.replay import LogSet
+from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.errors import ModelError
+from hearthlog.models.inputs import InputStream
+from hearthlog.models.modelfile import Smoothing, load_model, save_model
+from hearthlog.models.segments import Segmenter
+from hearthlog.models.smoothing import FixedLagSmoother
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import (
     LOG,
     SEGMENT,
     decode,
@@ -44,7 +44,7 @@ from schemas.messages import (
     nanoseconds,
     time_message,
 )
-from schemas.reader import LogReader
+from hearthlog.schemas.reader import LogReader
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND

@@ -11,14 +11,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from spliced import LOST, raw_messages, run, small_disk, write_log
 
-from analyzer.selection import select
-from analyzer.splice import splice
-from schemas import messages
-from schemas.files import find_logs
-from schemas.messages import message
-from schemas.reader import LogReader
-from schemas.topics import Quality, Topic
-from schemas.writer import Attachment, LogWriter, Rows
+from hearthlog.analyzer.selection import select
+from hearthlog.analyzer.splice import splice
+from hearthlog.schemas import messages
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import message
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import Quality, Topic
+from hearthlog.schemas.writer import Attachment, LogWriter, Rows
 
 INFO = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=1, transient_local=True))
 FEATURES = Topic("/mic/features", messages.FEATURES, array_names={"values": ["a", "b"]})

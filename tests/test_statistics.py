@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recorder.features import FeatureExtractor
-from recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.recorder.statistics import WINDOW_FRAMES, RollingStatistics
 
 
 def directly(features):

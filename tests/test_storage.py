@@ -18,20 +18,20 @@ from conftest import HEARTHLOG
 from spliced import raw_messages, run
 from stores import account, put
 
-from analyzer.replay.origin import read_origin
-from analyzer.selection import select
-from analyzer.storage import location
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from schemas.chunks import read_chunks
-from schemas.columns import read_columns
-from schemas.errors import LogError
-from schemas.files import check_new, find_logs, new_file, replaced_file
-from schemas.logfile import LogFile, time_span, topic_counts
-from schemas.messages import NANOSECONDS
-from schemas.reader import LogReader
-from schemas.series import iterate_messages
+from hearthlog.analyzer.replay.origin import read_origin
+from hearthlog.analyzer.selection import select
+from hearthlog.analyzer.storage import location
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_new, find_logs, new_file, replaced_file
+from hearthlog.schemas.logfile import LogFile, time_span, topic_counts
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.series import iterate_messages
 
 START = 1_772_352_000 * NANOSECONDS
 
@@ -220,7 +220,7 @@ def test_the_name_of_a_file_is_a_plain_path(tmp_path):
 
 def test_a_path_of_a_store_goes_to_other_processes(bucket, logs):
     log = find_logs(put(logs, bucket / "home"))[0]
-    count = "import pickle, sys; from schemas.logfile import topic_counts; "
+    count = "import pickle, sys; from hearthlog.schemas.logfile import topic_counts; "
     count += "print(topic_counts(pickle.load(sys.stdin.buffer))['/mic/label'])"
     command = [sys.executable, "-c", count]
     done = subprocess.run(command, input=pickle.dumps(log), capture_output=True, check=True)
@@ -228,9 +228,12 @@ def test_a_path_of_a_store_goes_to_other_processes(bucket, logs):
 
 
 def test_reading_and_recording_logs_of_this_machine_needs_no_store():
-    modules = "schemas.columns, schemas.files, schemas.reader, recorder.service, tools.cli.main"
+    modules = ("schemas.columns", "schemas.files", "schemas.reader", "recorder.service")
+    imports = "import " + ", ".join(
+        f"hearthlog.{module}" for module in (*modules, "tools.cli.main")
+    )
     check = "import sys; assert not {'fsspec', 'upath', 's3fs'} & sys.modules.keys()"
-    subprocess.run([sys.executable, "-c", f"import {modules}; {check}"], check=True)
+    subprocess.run([sys.executable, "-c", f"{imports}; {check}"], check=True)
 
 
 def test_a_file_is_put_in_a_store_when_it_is_written(empty):
@@ -287,7 +290,7 @@ def test_what_others_put_in_a_bucket_is_seen_at_once(bucket, logs):
     before = find_logs(home)
     assert home.is_dir()
     layer = before[0].with_name("other.mcap")
-    add = "import sys; from analyzer.storage import location; "
+    add = "import sys; from hearthlog.analyzer.storage import location; "
     add += "location(sys.argv[1]).write_bytes(b'x')"
     subprocess.run([sys.executable, "-c", add, str(layer)], check=True)
     assert layer.exists()

@@ -15,15 +15,15 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from analyzer.marks import Mark, write_marks
-from analyzer.summary import GapSummary, Health, summarise
-from models.modelfile import load_model
-from recorder.config import Microphone, Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from schemas import messages
-from schemas.files import active_path, find_logs
-from schemas.messages import (
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.summary import GapSummary, Health, summarise
+from hearthlog.models.modelfile import load_model
+from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas import messages
+from hearthlog.schemas.files import active_path, find_logs
+from hearthlog.schemas.messages import (
     NANOSECONDS,
     definition,
     encode,
@@ -32,9 +32,9 @@ from schemas.messages import (
     nanoseconds,
     typestore,
 )
-from schemas.reader import LogReader
-from schemas.topics import DIAGNOSTICS, Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import DIAGNOSTICS, Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 SECOND = NANOSECONDS
 START = 1_772_348_370_123_456_789

@@ -16,19 +16,19 @@ from kept import keep_models, put_by_hand
 from logs import features, read
 from spliced import run
 
-from models.classifier import Classifier
-from models.modelfile import load_model
-from models.registry import promote
-from recorder.config import Settings
-from recorder.features import FRAME_SAMPLES, FeatureExtractor
-from recorder.log import RollingLog
-from recorder.modelwatch import ModelWatch
-from recorder.pipeline import Pipeline
-from recorder.service import _attend, _describe
-from recorder.sources.files import read_audio
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
-from schemas.files import find_logs
-from schemas.reader import LogReader
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import promote
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.recorder.log import RollingLog
+from hearthlog.recorder.modelwatch import ModelWatch
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.service import _attend, _describe
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.reader import LogReader
 
 SECOND = 1_000_000_000
 START = 1_772_348_400 * SECOND
@@ -217,7 +217,7 @@ def test_a_file_that_is_written_over_in_its_place_is_taken_too(folder):
 
 
 def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
-    monkeypatch.setattr("recorder.modelwatch._LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.modelwatch._LOOK_SECONDS", 0.01)
     path = folder / "one.safetensors"
     watch = ModelWatch(path, SimpleQueue())
     (folder / "copy").write_bytes(path.read_bytes())
@@ -229,7 +229,7 @@ def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
 
 
 def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
-    monkeypatch.setattr("recorder.modelwatch._LOOK_SECONDS", 3600)
+    monkeypatch.setattr("hearthlog.recorder.modelwatch._LOOK_SECONDS", 3600)
     asked = SimpleQueue()
     watch = ModelWatch(folder / "champion.safetensors", asked)
     promote(folder, "two")

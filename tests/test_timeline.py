@@ -21,27 +21,27 @@ from rerun.chunk import RrdReader
 from spliced import run, write_log
 from viewers import rerun_home, shown, viewer
 
-from analyzer.colours import GAP, colour
-from analyzer.errors import DataError
-from analyzer.marks import Mark, write_marks
-from analyzer.timeline import reading
-from analyzer.timeline.contents import Labelling, Series, Spans, no_spans
-from analyzer.timeline.grid import Grid, Means, time_shares
-from analyzer.timeline.lanes import BLOCKS, changes, clock, disagreements, from_afar
-from analyzer.timeline.reading import SHARES, read_timeline
-from analyzer.train import train_model
-from analyzer.viewer.file import save_timeline
-from models.modelfile import load_model, save_model
-from recorder.config import Settings
-from recorder.service import record
-from recorder.sources.replayed import FileSource
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.errors import LogError
-from schemas.files import audio_path, find_logs
-from schemas.messages import header, message, nanoseconds
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.analyzer.colours import GAP, colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.timeline import reading
+from hearthlog.analyzer.timeline.contents import Labelling, Series, Spans, no_spans
+from hearthlog.analyzer.timeline.grid import Grid, Means, time_shares
+from hearthlog.analyzer.timeline.lanes import BLOCKS, changes, clock, disagreements, from_afar
+from hearthlog.analyzer.timeline.reading import SHARES, read_timeline
+from hearthlog.analyzer.train import train_model
+from hearthlog.analyzer.viewer.file import save_timeline
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.service import record
+from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import audio_path, find_logs
+from hearthlog.schemas.messages import header, message, nanoseconds
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 __all__ = ["viewer"]  # a fixture
 
@@ -798,9 +798,9 @@ def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path,
 
 _SAVE = """
 import pathlib, resource, sys
-from analyzer.errors import DataError
-from analyzer.timeline.reading import read_timeline
-from analyzer.viewer.file import save_timeline
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.timeline.reading import read_timeline
+from hearthlog.analyzer.viewer.file import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])
 if limit := int(sys.argv[3]): resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try: save_timeline(timeline, pathlib.Path(sys.argv[2]))

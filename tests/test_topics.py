@@ -5,11 +5,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
 
-from schemas import messages
-from schemas.errors import LogError
-from schemas.messages import encode, message, time_message, typestore
-from schemas.topics import Topic, check_microphone_name, topics_of
-from schemas.writer import LogWriter
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import encode, message, time_message, typestore
+from hearthlog.schemas.topics import Topic, check_microphone_name, topics_of
+from hearthlog.schemas.writer import LogWriter
 
 # The fields of `ros/src/foxglove_msgs/ros2/RawAudio.msg` in Foxglove's SDK.
 RAW_AUDIO = """

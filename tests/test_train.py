@@ -9,18 +9,18 @@ from blobs import SOURCES, blobs, ignore_progress
 from typer import Typer
 from typer.testing import CliRunner
 
-from analyzer.dataset import SEGMENTS_PER_GROUP, build_dataset
-from analyzer.errors import DataError
-from analyzer.manifest import Clip, read_manifest
-from analyzer.scenario import BUILTIN, LABELS, Scenario
-from analyzer.train import calibration_error, group_folds, train_model
-from models.classifier import Classifier
-from models.errors import ModelError
-from models.inputs import InputStream
-from models.modelfile import load_model
-from recorder.errors import SourceError
-from recorder.features import FeatureExtractor
-from tools.cli.train import train
+from hearthlog.analyzer.dataset import SEGMENTS_PER_GROUP, build_dataset
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.manifest import Clip, read_manifest
+from hearthlog.analyzer.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.train import calibration_error, group_folds, train_model
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.errors import ModelError
+from hearthlog.models.inputs import InputStream
+from hearthlog.models.modelfile import load_model
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.tools.cli.train import train
 
 RATE = 16_000
 TOML = '[classes]\nsilence = ["silence"]\nmusic = ["music"]\nspeech = ["speech"]\n'

@@ -13,10 +13,10 @@ import pytest
 from mcap.reader import make_reader
 from test_interoperability import TOPICS, chunks, logs, plain, recorded
 
-from schemas.messages import GAP, LABEL, duration_message, encode, header, message
-from schemas.reader import LogReader
-from schemas.topics import Topic
-from schemas.writer import LogWriter
+from hearthlog.schemas.messages import GAP, LABEL, duration_message, encode, header, message
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter
 
 __all__ = ["logs", "recorded"]  # fixtures
 

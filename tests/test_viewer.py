@@ -19,13 +19,13 @@ from viewers import (
     viewer,
 )
 
-from analyzer.colours import GAP, colour
-from analyzer.marks import Mark, write_marks
-from analyzer.timeline.lanes import from_afar
-from analyzer.timeline.reading import read_timeline
-from analyzer.viewer.file import save_timeline
-from analyzer.viewer.web import open_page
-from schemas.files import find_logs
+from hearthlog.analyzer.colours import GAP, colour
+from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.timeline.lanes import from_afar
+from hearthlog.analyzer.timeline.reading import read_timeline
+from hearthlog.analyzer.viewer.file import save_timeline
+from hearthlog.analyzer.viewer.web import open_page
+from hearthlog.schemas.files import find_logs
 
 __all__ = ["display", "viewer"]  # fixtures
 

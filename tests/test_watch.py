@@ -19,19 +19,27 @@ from conftest import HEARTHLOG
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from analyzer.colours import colour
-from analyzer.errors import DataError
-from analyzer.hometime import home_zone
-from analyzer.timeline.contents import Lines
-from analyzer.timeline.lanes import Changes
-from analyzer.timeline.live import GAP_LANE, LIVE_LANE, NOT_HEARD, Lane, Live, Means, last_time
-from analyzer.viewer.live import LiveServer
-from analyzer.viewer.process import Process, free_port
-from models.modelfile import load_model, save_model
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.columns import read_columns
-from schemas.files import find_logs
-from schemas.follow import follow_messages
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.hometime import home_zone
+from hearthlog.analyzer.timeline.contents import Lines
+from hearthlog.analyzer.timeline.lanes import Changes
+from hearthlog.analyzer.timeline.live import (
+    GAP_LANE,
+    LIVE_LANE,
+    NOT_HEARD,
+    Lane,
+    Live,
+    Means,
+    last_time,
+)
+from hearthlog.analyzer.viewer.live import LiveServer
+from hearthlog.analyzer.viewer.process import Process, free_port
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.columns import read_columns
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.follow import follow_messages
 
 SECOND = 1_000_000_000
 MINUTES = 3

@@ -14,10 +14,10 @@ import pytest
 import tasks
 from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
 
-import analyzer.workers.cluster
-from analyzer.errors import WorkerError
-from analyzer.workers import open_workers
-from schemas.errors import LogError
+import hearthlog.analyzer.workers.cluster
+from hearthlog.analyzer.errors import WorkerError
+from hearthlog.analyzer.workers import open_workers
+from hearthlog.schemas.errors import LogError
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def workers(request):
 
 @pytest.fixture
 def hurried(monkeypatch):
-    monkeypatch.setattr(analyzer.workers.cluster, "_CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(hearthlog.analyzer.workers.cluster, "_CONNECT_SECONDS", 0.5)
 
 
 def test_a_task_returns_what_its_function_returns(workers):
@@ -114,7 +114,7 @@ _PARENT = """
 import sys
 import tasks
 from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
-from analyzer.workers import open_workers
+from hearthlog.analyzer.workers import open_workers
 with open_workers(2) as workers:
     [workers.submit(tasks.write_slowly, sys.argv[1]) for _ in range(3)][0].result()
 """
@@ -196,7 +196,7 @@ def test_a_scheduler_that_goes_away_is_an_error_of_all_that_is_not_done(tmp_path
 _CLIENT = """
 import sys, time
 import tasks
-from analyzer.workers import open_workers
+from hearthlog.analyzer.workers import open_workers
 with open_workers(scheduler=sys.argv[1]) as workers:
     future = workers.submit(tasks.touch_and_nap, sys.argv[2], 30)
     workers._client._timeout = 0.5  # after which Dask says that it cannot connect again

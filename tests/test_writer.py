@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from schemas import messages
-from schemas.chunks import read_chunks
-from schemas.chunkwriter import Block, ChunkWriter, blocks_of
-from schemas.content import LogContent
-from schemas.files import find_logs
-from schemas.logfile import LogFile
-from schemas.messages import NANOSECONDS, encode, header, message
-from schemas.series import iterate_messages
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.chunkwriter import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.content import LogContent
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import NANOSECONDS, encode, header, message
+from hearthlog.schemas.series import iterate_messages
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
 
 LABELS = ["speech", "silence", "telephone_bell_ringing", ""]
 TOPICS = [

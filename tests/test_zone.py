@@ -2,10 +2,10 @@
 
 import pytest
 
-from recorder import zone
-from recorder.config import load_settings
-from recorder.errors import ConfigurationError
-from schemas.reader import LogReader
+from hearthlog.recorder import zone
+from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.reader import LogReader
 
 
 @pytest.fixture

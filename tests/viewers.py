@@ -24,7 +24,7 @@ from rerun.experimental import ViewerClient
 
 _WAIT_SECONDS = 120
 _DRAW_SECONDS = 2
-_COMMAND = [sys.executable, "-m", "tools.cli.main"]
+_COMMAND = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 _CHROMIUM = (
     "--headless=new",
     "--no-sandbox",

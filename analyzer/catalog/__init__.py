@@ -1,6 +1,6 @@
 """A catalogue of the logs in a folder: a Parquet file with one row for each of them."""
 
-from analyzer.catalog.catalog import (
+from hearthlog.analyzer.catalog.catalog import (
     DAMAGED,
     FINISHED,
     LOG,

@@ -10,13 +10,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from analyzer.catalog.contents import Contents, read_contents
-from analyzer.catalog.file import SCHEMA, read_table, table_of, without_times, write_table
-from analyzer.errors import DataError
-from schemas.errors import LogError
-from schemas.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
-from schemas.messages import NANOSECONDS
-from schemas.ranges import map_logs, store_errors
+from hearthlog.analyzer.catalog.contents import Contents, read_contents
+from hearthlog.analyzer.catalog.file import SCHEMA, read_table, table_of, without_times, write_table
+from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.ranges import map_logs, store_errors
 
 LOG, RELABEL, REVIEW = "log", "relabel", "review"
 FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"

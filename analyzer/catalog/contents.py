@@ -11,14 +11,14 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 from numpy.typing import NDArray
 
-from analyzer.known import decode_known, is_of_type
-from schemas import messages
-from schemas.chunks import read_chunks
-from schemas.columns import Columns
-from schemas.errors import LogError
-from schemas.logfile import LogFile, time_span
-from schemas.messages import NANOSECONDS
-from schemas.writer import METADATA
+from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.writer import METADATA
 
 _FEATURES: dict[str, Sequence[str]] = {messages.FEATURES: ("header.stamp", "frame")}
 _EVENTS: dict[str, Sequence[str]] = {

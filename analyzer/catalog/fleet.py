@@ -7,9 +7,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from analyzer.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.messages import NANOSECONDS
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames
 _FUNCTIONS = {"start": "min", "end": "max"}

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.diff.sources import Side
-from analyzer.errors import DataError
-from analyzer.evaluation.events import Events, Int64
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.diff.sources import Side
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import Events, Int64
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.messages import NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.diff.windows import Windows
-from analyzer.evaluation.events import Int64
-from analyzer.export.names import names_of
-from schemas.columns import Columns
+from hearthlog.analyzer.diff.windows import Windows
+from hearthlog.analyzer.evaluation.events import Int64
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.schemas.columns import Columns
 
 FIELDS = {"header.stamp", "novelty", "probabilities"}
 

@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from analyzer.diff.difference import Difference
-from analyzer.diff.queue import Queue
-from analyzer.errors import DataError
-from analyzer.textfile import csv_records, read_text
-from models.modelfile import CLASS_NAME
-from schemas.errors import LogError
-from schemas.files import new_file
-from schemas.times import read_time, time_text
-from schemas.topics import check_microphone_name
+from hearthlog.analyzer.diff.difference import Difference
+from hearthlog.analyzer.diff.queue import Queue
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.textfile import csv_records, read_text
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import new_file
+from hearthlog.schemas.times import read_time, time_text
+from hearthlog.schemas.topics import check_microphone_name
 
 MOST_SPANS = 100_000
 REASONS = ("uncertainty", "disagreement", "novelty")

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.diff.difference import DAY, events_of
-from analyzer.diff.doubt import FIELDS, Doubt
-from analyzer.diff.sources import Side, Sources, label_topic
-from analyzer.diff.windows import Windows, other_labels, windows_of, without
-from analyzer.errors import DataError
-from analyzer.evaluation.events import Int64
-from analyzer.evaluation.reference import Labelling
-from analyzer.selection import Progress
-from schemas.columns import iterate_columns
-from schemas.errors import LogError
+from hearthlog.analyzer.diff.difference import DAY, events_of
+from hearthlog.analyzer.diff.doubt import FIELDS, Doubt
+from hearthlog.analyzer.diff.sources import Side, Sources, label_topic
+from hearthlog.analyzer.diff.windows import Windows, other_labels, windows_of, without
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import Int64
+from hearthlog.analyzer.evaluation.reference import Labelling
+from hearthlog.analyzer.selection import Progress
+from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.errors import LogError
 
 Float64 = NDArray[np.float64]
 

@@ -8,19 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from analyzer.errors import DataError
-from analyzer.evaluation.labellings import FIELDS, all_classes, labelling_of, with_layers
-from analyzer.evaluation.reference import Labelling
-from analyzer.export.names import names_of
-from analyzer.known import is_of_type
-from analyzer.selection import Progress, Selection, select
-from models.modelfile import CLASS_NAME
-from schemas import messages
-from schemas.columns import Columns, join, read_columns
-from schemas.errors import LogError
-from schemas.files import find_logs
-from schemas.logfile import LogFile
-from schemas.ranges import map_logs
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.labellings import FIELDS, all_classes, labelling_of, with_layers
+from hearthlog.analyzer.evaluation.reference import Labelling
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.known import is_of_type
+from hearthlog.analyzer.selection import Progress, Selection, select
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns, join, read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.ranges import map_logs
 
 LIVE, REVIEW, RELABEL = "live", "review", "relabel"
 _TOPIC = re.compile(

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 
-from analyzer.diff.difference import Amounts, Difference
-from analyzer.diff.queue import Queue
-from analyzer.evaluation.table import WIDTH, shown
-from schemas.messages import NANOSECONDS
-from schemas.times import time_text
+from hearthlog.analyzer.diff.difference import Amounts, Difference
+from hearthlog.analyzer.diff.queue import Queue
+from hearthlog.analyzer.evaluation.table import WIDTH, shown
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import time_text
 
 _NAME = 18
 

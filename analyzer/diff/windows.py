@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.diff.difference import laid_over
-from analyzer.errors import DataError
-from analyzer.evaluation.events import Events, Int64
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.diff.difference import laid_over
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import Events, Int64
+from hearthlog.schemas.messages import NANOSECONDS
 
 SHORTEST = NANOSECONDS // 2
 LONGEST = 10 * NANOSECONDS

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from analyzer.doctor.check import Examined, examine_file
-from analyzer.doctor.findings import Finding, Findings, printable
-from analyzer.doctor.folder import check_leftovers, check_series
-from schemas.errors import LogError
-from schemas.files import find_logs
+from hearthlog.analyzer.doctor.check import Examined, examine_file
+from hearthlog.analyzer.doctor.findings import Finding, Findings, printable
+from hearthlog.analyzer.doctor.folder import check_leftovers, check_series
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs
 
 __all__ = ["Examined", "Finding", "Findings", "examine", "examine_file", "printable"]
 

@@ -9,15 +9,15 @@ from typing import Any
 
 from mcap.records import Channel
 
-from analyzer.doctor.contract import NAME, Contract, place_of, type_of
-from analyzer.doctor.data import ATTACHMENTS, Data
-from analyzer.doctor.findings import DISTRUST, Findings
-from models.inputs import WINDOW_FRAMES
-from recorder import features
-from schemas.messages import NANOSECONDS, definition, type_hash
-from schemas.rosbag2 import METADATA as ROSBAG2
-from schemas.topics import Topic, topics_of
-from schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
+from hearthlog.analyzer.doctor.contract import NAME, Contract, place_of, type_of
+from hearthlog.analyzer.doctor.data import ATTACHMENTS, Data
+from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.recorder import features
+from hearthlog.schemas.messages import NANOSECONDS, definition, type_hash
+from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.topics import Topic, topics_of
+from hearthlog.schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
 
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}

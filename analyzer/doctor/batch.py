@@ -7,8 +7,8 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from schemas.chunks import MESSAGE_HEAD, RawMessages
-from schemas.rows import Bytes, Int64, gather
+from hearthlog.schemas.chunks import MESSAGE_HEAD, RawMessages
+from hearthlog.schemas.rows import Bytes, Int64, gather
 
 BATCH_SIZE = 4 << 20  # bytes
 

@@ -9,21 +9,21 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Footer, Metadata
 
-from analyzer.doctor.about import About
-from analyzer.doctor.batch import Batch
-from analyzer.doctor.contract import ALWAYS, NAME, Contract, place_of
-from analyzer.doctor.data import Data
-from analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from analyzer.doctor.frames import Frames
-from analyzer.doctor.index import Summary
-from analyzer.doctor.source import Source
-from analyzer.doctor.walk import Walk
-from schemas.columns import decode
-from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX
-from schemas.logfile import FOOTER_SIZE, LogFile
-from schemas.records import HEAD, MAGIC, parse
-from schemas.writer import METADATA
+from hearthlog.analyzer.doctor.about import About
+from hearthlog.analyzer.doctor.batch import Batch
+from hearthlog.analyzer.doctor.contract import ALWAYS, NAME, Contract, place_of
+from hearthlog.analyzer.doctor.data import Data
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.frames import Frames
+from hearthlog.analyzer.doctor.index import Summary
+from hearthlog.analyzer.doctor.source import Source
+from hearthlog.analyzer.doctor.walk import Walk
+from hearthlog.schemas.columns import decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import ACTIVE_SUFFIX
+from hearthlog.schemas.logfile import FOOTER_SIZE, LogFile
+from hearthlog.schemas.records import HEAD, MAGIC, parse
+from hearthlog.schemas.writer import METADATA
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")

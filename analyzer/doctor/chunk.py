@@ -9,13 +9,13 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from analyzer.doctor.batch import heads_at
-from analyzer.doctor.definitions import Definitions, name_of
-from analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from analyzer.doctor.walk import Record
-from schemas.chunks import MESSAGE_HEAD
-from schemas.records import HEAD, ChunkHead, McapError, chunk_head, decompress
-from schemas.rows import Int64
+from hearthlog.analyzer.doctor.batch import heads_at
+from hearthlog.analyzer.doctor.definitions import Definitions, name_of
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.walk import Record
+from hearthlog.schemas.chunks import MESSAGE_HEAD
+from hearthlog.schemas.records import HEAD, ChunkHead, McapError, chunk_head, decompress
+from hearthlog.schemas.rows import Int64
 
 _ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 _INDEX_HEAD = struct.Struct("<HI")

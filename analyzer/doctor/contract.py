@@ -10,17 +10,17 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from analyzer.doctor.batch import Batch
-from analyzer.doctor.data import Data
-from analyzer.doctor.findings import DISTRUST, Findings
-from analyzer.doctor.frames import FEATURES, GAP, LABEL, SEGMENT, STATISTICS, Frames
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.columns import Columns, decode
-from schemas.errors import LogError
-from schemas.messages import definition
-from schemas.rows import Int64
-from schemas.topics import DIAGNOSTICS, ROSOUT
+from hearthlog.analyzer.doctor.batch import Batch
+from hearthlog.analyzer.doctor.data import Data
+from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.analyzer.doctor.frames import FEATURES, GAP, LABEL, SEGMENT, STATISTICS, Frames
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns, decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import definition
+from hearthlog.schemas.rows import Int64
+from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT
 
 TYPES = {
     "info": messages.STREAM_INFO,

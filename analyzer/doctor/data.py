@@ -11,16 +11,16 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Header, Metadata
 from numpy.typing import NDArray
 
-from analyzer.doctor.batch import BATCH_SIZE, Batch, batches, heads_at
-from analyzer.doctor.chunk import Chunk, Content, check_channels
-from analyzer.doctor.definitions import Definitions, name_of, parse_strictly
-from analyzer.doctor.findings import RECOVER, Findings
-from analyzer.doctor.walk import Record
-from schemas.chunks import MESSAGE_HEAD
-from schemas.records import HEAD
-from schemas.rosbag2 import METADATA as ROSBAG2
-from schemas.rows import Int64
-from schemas.writer import METADATA
+from hearthlog.analyzer.doctor.batch import BATCH_SIZE, Batch, batches, heads_at
+from hearthlog.analyzer.doctor.chunk import Chunk, Content, check_channels
+from hearthlog.analyzer.doctor.definitions import Definitions, name_of, parse_strictly
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.analyzer.doctor.walk import Record
+from hearthlog.schemas.chunks import MESSAGE_HEAD
+from hearthlog.schemas.records import HEAD
+from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.rows import Int64
+from hearthlog.schemas.writer import METADATA
 
 ATTACHMENTS = ("configuration.json", "model_card.md")
 _NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept

@@ -6,10 +6,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 
-from analyzer.doctor.findings import RECOVER, Findings
-from schemas.errors import LogError
-from schemas.layout import message_type
-from schemas.records import McapError, parse
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.records import McapError, parse
 
 PROFILE = "ros2"
 _ENCODINGS = ("ros2msg", "ros2idl")

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from analyzer.doctor.check import Examined
-from analyzer.doctor.findings import Findings, time_text
-from analyzer.doctor.frames import Frames
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.files import SUFFIX
+from hearthlog.analyzer.doctor.check import Examined
+from hearthlog.analyzer.doctor.findings import Findings, time_text
+from hearthlog.analyzer.doctor.frames import Frames
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.files import SUFFIX
 
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
 _LEFT = {

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.doctor.findings import DISTRUST, Findings
-from models.inputs import WINDOW_FRAMES
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.rows import Int64
+from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.rows import Int64
 
 # Behind a sound server stamps are steered by when blocks arrive, at first by up to 45 % (ns).
 _STEP_TOLERANCE = FRAME_NANOSECONDS // 2

@@ -8,11 +8,11 @@ from typing import Any
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Schema, Statistics, SummaryOffset
 
-from analyzer.doctor.data import Data
-from analyzer.doctor.definitions import name_of, parse_strictly
-from analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from analyzer.doctor.walk import Record
-from schemas.records import HEAD, parse
+from hearthlog.analyzer.doctor.data import Data
+from hearthlog.analyzer.doctor.definitions import name_of, parse_strictly
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.walk import Record
+from hearthlog.schemas.records import HEAD, parse
 
 _ALLOWED = {
     Opcode.SCHEMA,

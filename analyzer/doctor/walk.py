@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from analyzer.doctor.findings import RECOVER, Findings
-from analyzer.doctor.source import Source
-from schemas.records import HEAD, LIMIT, MAGIC
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.analyzer.doctor.source import Source
+from hearthlog.schemas.records import HEAD, LIMIT, MAGIC
 
 _CHUNK = re.compile(
     rb"\x06.{36}(?:\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\x00lz4.{8}\x04\x22\x4d\x18)",

@@ -6,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.dataset import Progress, Recording, clip_features, cut_recordings
-from analyzer.errors import DataError
-from analyzer.evaluation.events import Detections, Events, detect
-from analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
-from analyzer.manifest import Clip
-from analyzer.scenario import Scenario
-from models.classifier import Classifier
-from models.inputs import InputStream, window_inputs
-from models.modelfile import Model
-from models.segments import Segmenter
-from recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.dataset import Progress, Recording, clip_features, cut_recordings
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import Detections, Events, detect
+from hearthlog.analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
+from hearthlog.analyzer.manifest import Clip
+from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import InputStream, window_inputs
+from hearthlog.models.modelfile import Model
+from hearthlog.models.segments import Segmenter
+from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.messages import NANOSECONDS
 
 _FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 

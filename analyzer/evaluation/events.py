@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from analyzer.errors import DataError
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.messages import NANOSECONDS
 
 COLLAR = NANOSECONDS // 5
 _PART_OF_LENGTH = 0.5

@@ -5,11 +5,18 @@ from typing import Literal, get_args
 
 from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 
-from analyzer.dataset import Dataset, Progress
-from analyzer.errors import DataError
-from analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
-from analyzer.recipe import Fold, Recipe, cross_validate, inverse_temperature, prepare, softmax
-from analyzer.train import MOST_FOLDS, check_varied, group_folds
+from hearthlog.analyzer.dataset import Dataset, Progress
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
+from hearthlog.analyzer.recipe import (
+    Fold,
+    Recipe,
+    cross_validate,
+    inverse_temperature,
+    prepare,
+    softmax,
+)
+from hearthlog.analyzer.train import MOST_FOLDS, check_varied, group_folds
 
 Kind = Literal["segment", "source", "collection"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -6,18 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from analyzer.errors import DataError
-from analyzer.evaluation.reference import Labelling
-from analyzer.exchange import read_lines
-from analyzer.export.names import names_of
-from analyzer.heard import find_heard
-from analyzer.known import is_of_type
-from analyzer.marks import read_marks
-from analyzer.selection import Selection, select
-from schemas import messages
-from schemas.columns import Columns, read_columns
-from schemas.errors import LogError
-from schemas.files import SUFFIX, find_logs, stem
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.reference import Labelling
+from hearthlog.analyzer.exchange import read_lines
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.heard import find_heard
+from hearthlog.analyzer.known import is_of_type
+from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.selection import Selection, select
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns, read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import SUFFIX, find_logs, stem
 
 REVIEW = "review"
 FIELDS = {"header.stamp", "duration", "label"}
@@ -118,7 +118,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
     Parameters
     ----------
     source : str
-        A label file as `analyzer.exchange` reads it, or `review` for the review layers.
+        A label file as `hearthlog.analyzer.exchange` reads it, or `review` for the review layers.
     path : Path
         The log, or folder of logs.
     microphone : str

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.errors import DataError
-from analyzer.evaluation.events import (
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.events import (
     Detections,
     Events,
     Int64,
@@ -17,9 +17,9 @@ from analyzer.evaluation.events import (
     merged,
     total,
 )
-from analyzer.evaluation.scores import Scores, score
-from recorder.stream import FRAME_NANOSECONDS
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.evaluation.scores import Scores, score
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.messages import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS
 _MOST_BLOCKS = 1000

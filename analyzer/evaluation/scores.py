@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError
 
 RESAMPLES = 1000
 _BINS = 15

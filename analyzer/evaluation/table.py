@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from analyzer.evaluation.events import Detections
-from analyzer.evaluation.scores import Bin, Interval, Scores
+from hearthlog.analyzer.evaluation.events import Detections
+from hearthlog.analyzer.evaluation.scores import Bin, Interval, Scores
 
 if TYPE_CHECKING:
-    from analyzer.search import Tried  # which imports scikit-learn
+    from hearthlog.analyzer.search import Tried  # which imports scikit-learn
 
 WIDTH = 100
 _NAME = 16  # objects_activity

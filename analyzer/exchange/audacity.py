@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from analyzer.errors import DataError
-from analyzer.exchange.labels import Label, seconds_text
-from analyzer.heard import Heard
-from analyzer.marks import Mark
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange.labels import Label, seconds_text
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
 
 
 def read(path: Path, text: str) -> Iterator[Label]:

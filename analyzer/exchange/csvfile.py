@@ -5,12 +5,12 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from analyzer.errors import DataError
-from analyzer.exchange.labels import Label, made_text
-from analyzer.heard import Heard
-from analyzer.marks import Mark
-from analyzer.textfile import csv_records
-from schemas.times import time_text
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange.labels import Label, made_text
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
+from hearthlog.analyzer.textfile import csv_records
+from hearthlog.schemas.times import time_text
 
 _REQUIRED = ("start", "end", "label")
 _COLUMNS = (*_REQUIRED, "microphone", "reviewer", "made", "corrects")

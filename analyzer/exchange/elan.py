@@ -16,11 +16,11 @@ from xml.sax.xmlreader import AttributesImpl, Locator
 from defusedxml.common import DefusedXmlException
 from defusedxml.sax import parseString
 
-from analyzer.errors import DataError
-from analyzer.exchange.labels import Label, made_text, seconds_text
-from analyzer.heard import Heard
-from analyzer.marks import Mark
-from schemas.times import time_text
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
+from hearthlog.schemas.times import time_text
 
 _MILLISECOND = 1_000_000  # ns
 _START = "hearthlog:start"  # the property that says when the document begins

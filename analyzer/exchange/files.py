@@ -4,13 +4,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from analyzer.errors import DataError
-from analyzer.exchange import audacity, csvfile, elan, labelstudio, raven, rttm
-from analyzer.exchange.labels import Label, LabelLine, at, check_overlaps, mark_of
-from analyzer.heard import Heard
-from analyzer.marks import Mark
-from analyzer.textfile import read_text
-from schemas.files import new_file
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange import audacity, csvfile, elan, labelstudio, raven, rttm
+from hearthlog.analyzer.exchange.labels import Label, LabelLine, at, check_overlaps, mark_of
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
+from hearthlog.analyzer.textfile import read_text
+from hearthlog.schemas.files import new_file
 
 _SIZE_LIMIT = 16 << 20  # a hundred thousand labels, or more; what is larger is something else
 _XML_LIMIT = 64 << 20  # as many

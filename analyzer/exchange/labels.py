@@ -7,12 +7,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from analyzer.errors import DataError
-from analyzer.heard import Heard
-from analyzer.marks import LATEST, NAME, Mark
-from models.modelfile import CLASS_NAME
-from schemas.messages import NANOSECONDS
-from schemas.times import read_time, time_text
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import LATEST, NAME, Mark
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import read_time, time_text
 
 _SECONDS = re.compile(r"[-+]?[0-9]{1,10}(\.[0-9]{0,18})?([eE][-+]?[0-9]{1,2})?")
 _OTHER_SOUND = NANOSECONDS  # what a recording and the logs of it may differ in length

@@ -6,11 +6,11 @@ from json import dumps
 from pathlib import Path
 from typing import Any
 
-from analyzer.errors import DataError
-from analyzer.exchange.labels import Label, made_text, seconds_text
-from analyzer.heard import Heard
-from analyzer.marks import Mark
-from schemas.times import time_text
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
+from hearthlog.schemas.times import time_text
 
 _TYPE = "labels"
 

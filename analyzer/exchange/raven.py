@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from analyzer.errors import DataError
-from analyzer.exchange.labels import Label, made_text, seconds_text
-from analyzer.heard import Heard
-from analyzer.marks import Mark
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.exchange.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark
 
 SUFFIX = ".selections.txt"
 _BAND = ("0.000", "8000.000")  # Hz; of the sound that is listened to

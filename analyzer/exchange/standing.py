@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 
-from analyzer.marks import ROUNDING, Mark
+from hearthlog.analyzer.marks import ROUNDING, Mark
 
 
 def new_marks(marks: Iterable[Mark], standing: Sequence[Mark]) -> list[Mark]:

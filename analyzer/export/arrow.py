@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from analyzer.pieces import DURATION, TIME, Field, Piece
-from analyzer.selection import Selection
-from schemas.errors import LogError
+from hearthlog.analyzer.pieces import DURATION, TIME, Field, Piece
+from hearthlog.analyzer.selection import Selection
+from hearthlog.schemas.errors import LogError
 
 _MOMENT = pa.timestamp("ns", "UTC")
 _TYPES = {

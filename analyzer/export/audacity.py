@@ -2,12 +2,12 @@
 
 from typing import BinaryIO
 
-from analyzer.pieces import Piece
-from analyzer.selection import Selection
-from schemas.columns import iterate_columns
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic as topic_of
+from hearthlog.analyzer.pieces import Piece
+from hearthlog.analyzer.selection import Selection
+from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic as topic_of
 
 _FIELDS = {"header.stamp", "duration", "label"}
 

@@ -8,13 +8,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from analyzer.export.arrow import array_of, column_name, type_of
-from analyzer.export.names import names_of
-from analyzer.lines import json_texts
-from analyzer.pieces import DURATION, Field, Piece
-from analyzer.selection import Selection
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.lines import json_texts
+from hearthlog.analyzer.pieces import DURATION, Field, Piece
+from hearthlog.analyzer.selection import Selection
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
 
 _OPTIONS = csv.WriteOptions(quoting_style="needed")
 

@@ -5,9 +5,9 @@ from typing import BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from analyzer.export.arrow import batch_of, schema_of
-from analyzer.pieces import Piece
-from analyzer.selection import Selection
+from hearthlog.analyzer.export.arrow import batch_of, schema_of
+from hearthlog.analyzer.pieces import Piece
+from hearthlog.analyzer.selection import Selection
 
 _ROW_GROUP = 32 << 20  # bytes
 

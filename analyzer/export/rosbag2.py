@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from analyzer.selection import Progress, Selection
-from analyzer.splice import write_log
-from schemas.errors import LogError
+from hearthlog.analyzer.selection import Progress, Selection
+from hearthlog.analyzer.splice import write_log
+from hearthlog.schemas.errors import LogError
 
 
 def save_rosbag2(folder: Path, name: str, selection: Selection, progress: Progress) -> None:

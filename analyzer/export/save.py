@@ -9,20 +9,20 @@ from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from analyzer.export.audacity import LabelTrack
-from analyzer.export.csvfile import CsvFile
-from analyzer.export.names import file_stem, unused
-from analyzer.export.npz import save_npz
-from analyzer.export.parquet import ParquetFile
-from analyzer.export.rosbag1 import save_rosbag1
-from analyzer.export.rosbag2 import save_rosbag2
-from analyzer.export.wav import WavFiles
-from analyzer.pieces import Piece, pieces
-from analyzer.selection import Progress, Selection
-from schemas import messages
-from schemas.errors import LogError
-from schemas.files import check_new, new_file, sync_folder
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.export.audacity import LabelTrack
+from hearthlog.analyzer.export.csvfile import CsvFile
+from hearthlog.analyzer.export.names import file_stem, unused
+from hearthlog.analyzer.export.npz import save_npz
+from hearthlog.analyzer.export.parquet import ParquetFile
+from hearthlog.analyzer.export.rosbag1 import save_rosbag1
+from hearthlog.analyzer.export.rosbag2 import save_rosbag2
+from hearthlog.analyzer.export.wav import WavFiles
+from hearthlog.analyzer.pieces import Piece, pieces
+from hearthlog.analyzer.selection import Progress, Selection
+from hearthlog.schemas import messages
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_new, new_file, sync_folder
+from hearthlog.schemas.messages import NANOSECONDS
 
 
 class Format(StrEnum):

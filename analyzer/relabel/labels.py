@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from analyzer.relabel.layer import (
+from hearthlog.analyzer.relabel.layer import (
     About,
     Source,
     delete_parts,
@@ -20,7 +20,7 @@ from analyzer.relabel.layer import (
     read_about,
     topics_of,
 )
-from analyzer.relabel.reading import (
+from hearthlog.analyzer.relabel.reading import (
     UnreadableError,
     heard,
     is_followed,
@@ -28,15 +28,15 @@ from analyzer.relabel.reading import (
     recovered,
     warmed_up,
 )
-from analyzer.replay.origin import Origin
-from models.classifier import Classifier
-from models.errors import ModelError
-from models.modelfile import Model, load_model
-from models.segments import Run, Segment
-from schemas.content import METADATA, LogContent, Rows
-from schemas.errors import LogError
-from schemas.files import new_file, replaced_file, stem
-from schemas.rows import Column
+from hearthlog.analyzer.replay.origin import Origin
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile import Model, load_model
+from hearthlog.models.segments import Run, Segment
+from hearthlog.schemas.content import METADATA, LogContent, Rows
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import new_file, replaced_file, stem
+from hearthlog.schemas.rows import Column
 
 
 class Job(NamedTuple):

@@ -8,20 +8,20 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from models.segments import Run
-from schemas import messages
-from schemas.content import METADATA
-from schemas.errors import LogError
-from schemas.files import SUFFIX, stem
-from schemas.logfile import LogFile
-from schemas.topics import Topic, topic
+from hearthlog import __version__
+from hearthlog.models.segments import Run
+from hearthlog.schemas import messages
+from hearthlog.schemas.content import METADATA
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import SUFFIX, stem
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.topics import Topic, topic
 
 _TAIL = 1 << 16  # bytes
 _NO_TOPIC = re.compile("[^A-Za-z0-9_]")
@@ -137,7 +137,7 @@ def delete_parts(layer: Path) -> None:
 def metadata_of(about: About, log: str, node: str, more: Mapping[str, str]) -> dict[str, str]:
     """Make the `hearthlog` record of a layer."""
     return {
-        "version": version("hearthlog"),
+        "version": __version__,
         "node": node,
         "log": log,
         **more,

@@ -6,9 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from schemas.errors import LogError
-from schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs, is_layer, stem
-from schemas.logfile import time_span
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs, is_layer, stem
+from hearthlog.schemas.logfile import time_span
 
 _NAMED = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z.*)")
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")

@@ -7,16 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from analyzer.relabel.neighbours import is_active
-from analyzer.relabel.stream import Stream
-from analyzer.replay.origin import Origin, read_origin
-from analyzer.replay.recorded import Features, read_recorded
-from models.classifier import Classifier
-from recorder.recovery import recover_log
-from recorder.stream import Gap
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
-from schemas.ranges import is_local
+from hearthlog.analyzer.relabel.neighbours import is_active
+from hearthlog.analyzer.relabel.stream import Stream
+from hearthlog.analyzer.replay.origin import Origin, read_origin
+from hearthlog.analyzer.replay.recorded import Features, read_recorded
+from hearthlog.models.classifier import Classifier
+from hearthlog.recorder.recovery import recover_log
+from hearthlog.recorder.stream import Gap
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.ranges import is_local
 
 _WARM_UP = 30 * NANOSECONDS
 _EVER = (1 << 63) - 1

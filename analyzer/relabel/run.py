@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
-from analyzer.relabel.layer import About, digest, layer_path, read_about
-from analyzer.relabel.neighbours import Chain, find_chains, is_active
-from analyzer.workers import Workers
-from models.modelfile import Model
-from models.segments import Run
-from schemas.errors import HearthlogError, LogError
-from schemas.files import stem
-from schemas.ranges import map_logs
+from hearthlog.analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
+from hearthlog.analyzer.relabel.layer import About, digest, layer_path, read_about
+from hearthlog.analyzer.relabel.neighbours import Chain, find_chains, is_active
+from hearthlog.analyzer.workers import Workers
+from hearthlog.models.modelfile import Model
+from hearthlog.models.segments import Run
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.files import stem
+from hearthlog.schemas.ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
 

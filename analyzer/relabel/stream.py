@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.replay.recorded import Features
-from models.classifier import Classifier
-from models.inputs import InputStream
-from models.segments import Run, Segment, Segmenter
-from recorder.stream import FRAME_NANOSECONDS, Gap
-from schemas.content import Rows
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.replay.recorded import Features
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import InputStream
+from hearthlog.models.segments import Run, Segment, Segmenter
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Gap
+from hearthlog.schemas.content import Rows
+from hearthlog.schemas.messages import NANOSECONDS
 
 _FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
 _STEP = NANOSECONDS // 5  # what the line through a sound card's times may jump by

@@ -7,12 +7,12 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
-from schemas import messages
-from schemas.columns import Columns, iterate_columns
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns, iterate_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
 
 _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from recorder.pipeline import Record
-from schemas import messages
-from schemas.chunks import RawMessages
-from schemas.columns import decode
-from schemas.layout import message_type
-from schemas.rows import decode_rows
+from hearthlog.recorder.pipeline import Record
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.columns import decode
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.rows import decode_rows
 
 
 @dataclass

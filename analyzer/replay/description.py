@@ -2,16 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 
-from analyzer.replay.origin import Origin
-from models.modelfile import Model
-from recorder import features
-from recorder.log import LogDescription
-from recorder.pipeline import stream_info
-from schemas.topics import topics_of
-from schemas.writer import Attachment
+from hearthlog import __version__
+from hearthlog.analyzer.replay.origin import Origin
+from hearthlog.models.modelfile import Model
+from hearthlog.recorder import features
+from hearthlog.recorder.log import LogDescription
+from hearthlog.recorder.pipeline import stream_info
+from hearthlog.schemas.topics import topics_of
+from hearthlog.schemas.writer import Attachment
 
 MODEL_CARD = "model_card.md"
 
@@ -47,7 +47,7 @@ def describe(
         info=info,
         metadata={
             **origin.metadata,
-            "version": version("hearthlog"),
+            "version": __version__,
             "node": origin.node,
             "feature_set": features.NAME,
             "model": info.model,

@@ -9,14 +9,14 @@ from typing import Any
 from mcap import records
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from analyzer.known import decode_known, is_of_type
-from schemas import messages
-from schemas.chunks import read_chunks
-from schemas.errors import LogError
-from schemas.files import check_node_name
-from schemas.logfile import LogFile
-from schemas.topics import check_microphone_name, topic
-from schemas.writer import METADATA, Attachment
+from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import read_chunks
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_node_name
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.topics import check_microphone_name, topic
+from hearthlog.schemas.writer import METADATA, Attachment
 
 CONFIGURATION = "configuration.json"
 TYPES = {"features": messages.FEATURES, "audio": messages.RAW_AUDIO}

@@ -7,20 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event as Flag
 
-from analyzer.replay.comparison import Comparison
-from analyzer.replay.description import describe
-from analyzer.replay.origin import Origin
-from analyzer.replay.recorded import Features, Piece
-from models.classifier import Classifier
-from models.inputs import WINDOW_FRAMES
-from models.modelfile import Model
-from recorder import features
-from recorder.log import LogDescription, RollingLog
-from recorder.pipeline import Pipeline, Record
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
-from schemas.errors import LogError
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.replay.comparison import Comparison
+from hearthlog.analyzer.replay.description import describe
+from hearthlog.analyzer.replay.origin import Origin
+from hearthlog.analyzer.replay.recorded import Features, Piece
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import WINDOW_FRAMES
+from hearthlog.models.modelfile import Model
+from hearthlog.recorder import features
+from hearthlog.recorder.log import LogDescription, RollingLog
+from hearthlog.recorder.pipeline import Pipeline, Record
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 _FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
 _PACED_FRAMES = 10  # 0.5 s

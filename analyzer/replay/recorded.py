@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.known import is_of_type
-from analyzer.replay.origin import Origin
-from recorder.features import FEATURE_NAMES
-from recorder.stream import Gap, Health
-from schemas import messages
-from schemas.chunks import RawMessages
-from schemas.columns import Columns, decode
-from schemas.errors import LogError
-from schemas.rows import Fields
-from schemas.series import iterate_messages
-from schemas.topics import DIAGNOSTICS, topic
+from hearthlog.analyzer.known import is_of_type
+from hearthlog.analyzer.replay.origin import Origin
+from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.recorder.stream import Gap, Health
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.columns import Columns, decode
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.rows import Fields
+from hearthlog.schemas.series import iterate_messages
+from hearthlog.schemas.topics import DIAGNOSTICS, topic
 
 _HEARD = {"features": messages.FEATURES, "gap": messages.GAP}
 _TYPES = _HEARD | {"label": messages.LABEL, "segment": messages.SEGMENT}

@@ -6,17 +6,17 @@ from threading import Event as Flag
 
 import numpy as np
 
-from analyzer.replay.clips import ClipFramer, read_clips
-from analyzer.replay.origin import Origin, read_origin
-from analyzer.replay.player import Player, Replay, Wanted
-from analyzer.replay.recorded import read_recorded
-from models.errors import ModelError
-from models.modelfile import SUFFIX, Model, load_model
-from recorder.stream import Frames, Gap
-from schemas.errors import LogError
-from schemas.logfile import time_span
-from schemas.messages import NANOSECONDS
-from schemas.topics import topic
+from hearthlog.analyzer.replay.clips import ClipFramer, read_clips
+from hearthlog.analyzer.replay.origin import Origin, read_origin
+from hearthlog.analyzer.replay.player import Player, Replay, Wanted
+from hearthlog.analyzer.replay.recorded import read_recorded
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile import SUFFIX, Model, load_model
+from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logfile import time_span
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import topic
 
 _REWOUND = 60 * NANOSECONDS
 _EVER = (1 << 63) - 1

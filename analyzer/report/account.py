@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import tzinfo
 
-from analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
-from analyzer.report.figures import Day
-from analyzer.report.sections import Figure
-from analyzer.report.trouble import Trouble
-from analyzer.report.values import Clock, Count, Minutes, Value
-from analyzer.report.words import listed
+from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
+from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.sections import Figure
+from hearthlog.analyzer.report.trouble import Trouble
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
+from hearthlog.analyzer.report.words import listed
 
 _CHANGES = {
     (Clock, 1): "later",

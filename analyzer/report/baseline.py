@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from analyzer.report.values import Value, whole
+from hearthlog.analyzer.report.values import Value, whole
 
 DAYS = 28
 FEWEST = 7

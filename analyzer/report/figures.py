@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.hometime import at_hour, day_span, local_time
-from analyzer.report.reading import Heard, Segments
-from analyzer.report.spans import (
+from hearthlog.analyzer.hometime import at_hour, day_span, local_time
+from hearthlog.analyzer.report.reading import Heard, Segments
+from hearthlog.analyzer.report.spans import (
     NONE,
     Int64,
     Spans,
@@ -21,9 +21,9 @@ from analyzer.report.spans import (
     one,
     without,
 )
-from analyzer.report.values import Clock, Count, Minutes, exactly
-from analyzer.report.words import QUIET
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
+from hearthlog.analyzer.report.words import QUIET
+from hearthlog.schemas.messages import NANOSECONDS
 
 EVENING, MORNING = 22, 7  # of the clock: between them is the night
 _RISING = 4  # of the clock: what is heard before is of the night

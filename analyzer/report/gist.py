@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from analyzer.hometime import local_time
-from analyzer.report import words
-from analyzer.report.account import Account
-from analyzer.report.figures import HOUR, Day
-from analyzer.report.sections import Figure, events_of, sections
-from analyzer.report.spans import joined, without
-from analyzer.report.trouble import Trouble
-from analyzer.report.values import Minutes
-from analyzer.report.words import QUIET, clock_text, in_words, listed, short_day
+from hearthlog.analyzer.hometime import local_time
+from hearthlog.analyzer.report import words
+from hearthlog.analyzer.report.account import Account
+from hearthlog.analyzer.report.figures import HOUR, Day
+from hearthlog.analyzer.report.sections import Figure, events_of, sections
+from hearthlog.analyzer.report.spans import joined, without
+from hearthlog.analyzer.report.trouble import Trouble
+from hearthlog.analyzer.report.values import Minutes
+from hearthlog.analyzer.report.words import QUIET, clock_text, in_words, listed, short_day
 
 _SHOWN = 4  # changes in one sentence
 _MOST = 6  # kinds of gaps, or of trouble

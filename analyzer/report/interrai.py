@@ -7,9 +7,9 @@ whose text is licensed. Most questions of the form are about the last three days
 from collections.abc import Callable
 from typing import NamedTuple
 
-from analyzer.report import words
-from analyzer.report.figures import Day
-from analyzer.report.values import Count, Minutes
+from hearthlog.analyzer.report import words
+from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.values import Count, Minutes
 
 DAYS = 3
 

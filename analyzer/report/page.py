@@ -4,12 +4,12 @@ import re
 from collections.abc import Iterator, Sequence
 from html import escape
 
-from analyzer.colours import colour
-from analyzer.report import interrai, words
-from analyzer.report.account import Account
-from analyzer.report.baseline import DAYS
-from analyzer.report.figures import Day
-from analyzer.report.gist import (
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.report import interrai, words
+from hearthlog.analyzer.report.account import Account
+from hearthlog.analyzer.report.baseline import DAYS
+from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.gist import (
     gist_of_day,
     gist_of_week,
     longest_quiet,
@@ -18,11 +18,11 @@ from analyzer.report.gist import (
     percent,
     plain,
 )
-from analyzer.report.markup import box, figure, heading, page, paragraph, swatch, table
-from analyzer.report.reading import LIVE
-from analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
-from analyzer.report.values import Count, Minutes, Value
-from analyzer.report.words import QUIET, clock_text, in_words, listed, times_in_words
+from hearthlog.analyzer.report.markup import box, figure, heading, page, paragraph, swatch, table
+from hearthlog.analyzer.report.reading import LIVE
+from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
+from hearthlog.analyzer.report.values import Count, Minutes, Value
+from hearthlog.analyzer.report.words import QUIET, clock_text, in_words, listed, times_in_words
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95

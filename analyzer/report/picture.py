@@ -9,13 +9,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analyzer.colours import colour
-from analyzer.hometime import local_time
-from analyzer.report.baseline import Usual, usual
-from analyzer.report.figures import EVENING, HOUR, MORNING, Day
-from analyzer.report.spans import Int64, Spans, lengths, without
-from analyzer.report.values import Minutes
-from analyzer.report.words import QUIET, in_words, short_day
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.hometime import local_time
+from hearthlog.analyzer.report.baseline import Usual, usual
+from hearthlog.analyzer.report.figures import EVENING, HOUR, MORNING, Day
+from hearthlog.analyzer.report.spans import Int64, Spans, lengths, without
+from hearthlog.analyzer.report.values import Minutes
+from hearthlog.analyzer.report.words import QUIET, in_words, short_day
 
 _DAY_BINS, _WEEK_BINS = 20, 6  # an hour
 _LEAST = 0.35  # of a lane's height, for what is short: a cough has to be seen

@@ -11,23 +11,23 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment
 from numpy.typing import NDArray
 
-from analyzer.errors import DataError
-from analyzer.export.names import names_of
-from analyzer.known import is_of_type
-from analyzer.marks import Mark, read_marks
-from analyzer.report.shelf import RELABEL, REVIEW, Entry, Shelf
-from analyzer.report.spans import NONE, Int64, Spans, common, joined, without
-from analyzer.report.trouble import Status, Trouble, gaps_of, statuses_of, troubles_of
-from analyzer.report.words import ALIASES
-from analyzer.selection import Selection, select
-from models.modelfile import CLASS_NAME
-from schemas import messages
-from schemas.columns import Columns, read_columns
-from schemas.errors import LogError
-from schemas.files import SUFFIX, stem
-from schemas.logfile import LogFile
-from schemas.messages import NANOSECONDS
-from schemas.topics import DIAGNOSTICS
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.export.names import names_of
+from hearthlog.analyzer.known import is_of_type
+from hearthlog.analyzer.marks import Mark, read_marks
+from hearthlog.analyzer.report.shelf import RELABEL, REVIEW, Entry, Shelf
+from hearthlog.analyzer.report.spans import NONE, Int64, Spans, common, joined, without
+from hearthlog.analyzer.report.trouble import Status, Trouble, gaps_of, statuses_of, troubles_of
+from hearthlog.analyzer.report.words import ALIASES
+from hearthlog.analyzer.selection import Selection, select
+from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns, read_columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import SUFFIX, stem
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.topics import DIAGNOSTICS
 
 LIVE = "live"
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late

@@ -6,19 +6,19 @@ from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
-from analyzer.hometime import day_span, midnight
-from analyzer.report.account import Account
-from analyzer.report.baseline import DAYS
-from analyzer.report.figures import HOUR, day_of, whole_home
-from analyzer.report.interrai import DAYS as ASSESSED
-from analyzer.report.page import day_page, week_page
-from analyzer.report.picture import save_day, save_week
-from analyzer.report.reading import LIVE, Heard, read_heard
-from analyzer.report.shelf import Shelf, check_day
-from analyzer.report.spans import common, one
-from analyzer.report.trouble import Trouble
-from schemas.errors import LogError
-from schemas.files import check_new, new_file
+from hearthlog.analyzer.hometime import day_span, midnight
+from hearthlog.analyzer.report.account import Account
+from hearthlog.analyzer.report.baseline import DAYS
+from hearthlog.analyzer.report.figures import HOUR, day_of, whole_home
+from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
+from hearthlog.analyzer.report.page import day_page, week_page
+from hearthlog.analyzer.report.picture import save_day, save_week
+from hearthlog.analyzer.report.reading import LIVE, Heard, read_heard
+from hearthlog.analyzer.report.shelf import Shelf, check_day
+from hearthlog.analyzer.report.spans import common, one
+from hearthlog.analyzer.report.trouble import Trouble
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_new, new_file
 
 WEEK = 7
 Progress = Callable[[float], None]

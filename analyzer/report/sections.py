@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from analyzer.report import words
-from analyzer.report.figures import Day
-from analyzer.report.values import Value
+from hearthlog.analyzer.report import words
+from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.values import Value
 
 BATHROOM = (words.FLUSH, words.SHOWER, words.TAP)
 

@@ -11,14 +11,14 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from analyzer.errors import DataError
-from analyzer.evaluation.labellings import with_layers
-from analyzer.hometime import day_span, local_time
-from schemas.errors import LogError
-from schemas.files import find_logs, is_layer, stem
-from schemas.logfile import LogFile, time_span
-from schemas.messages import NANOSECONDS
-from schemas.writer import METADATA
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.labellings import with_layers
+from hearthlog.analyzer.hometime import day_span, local_time
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs, is_layer, stem
+from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.writer import METADATA
 
 REVIEW, RELABEL = "review", "relabel-"
 _NAME = re.compile(

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from schemas.columns import Columns
+from hearthlog.schemas.columns import Columns
 
 
 class Trouble(NamedTuple):

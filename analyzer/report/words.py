@@ -4,8 +4,8 @@ from datetime import date, tzinfo
 
 import numpy as np
 
-from analyzer.hometime import local_time
-from analyzer.report.spans import Int64
+from hearthlog.analyzer.hometime import local_time
+from hearthlog.analyzer.report.spans import Int64
 
 QUIET = "silence"
 FLUSH, SHOWER, TAP = "flushing_water", "shower", "tap_water"

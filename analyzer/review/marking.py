@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from analyzer.errors import DataError
-from analyzer.heard import Heard
-from analyzer.marks import Mark, Span, read_marks, write_marks
-from analyzer.timeline.contents import Spans
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.marks import Mark, Span, read_marks, write_marks
+from hearthlog.analyzer.timeline.contents import Spans
 
 UNKNOWN = "unknown"
 

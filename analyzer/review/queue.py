@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from analyzer.diff.listing import Span, queued, read_list
-from analyzer.diff.queue import RANKINGS, make_queue
-from analyzer.diff.sources import REVIEW, Sources
-from analyzer.errors import DataError
-from analyzer.review.session import Item
+from hearthlog.analyzer.diff.listing import Span, queued, read_list
+from hearthlog.analyzer.diff.queue import RANKINGS, make_queue
+from hearthlog.analyzer.diff.sources import REVIEW, Sources
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.session import Item
 
 Limits = tuple[int | None, int | None]
 

@@ -8,13 +8,13 @@ from datetime import tzinfo
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol
 
-from analyzer.errors import DataError
-from analyzer.hometime import local_time
-from analyzer.marks import Mark
-from analyzer.review.marking import UNKNOWN, Marking
-from analyzer.timeline.contents import Spans
-from schemas.errors import HearthlogError
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.hometime import local_time
+from hearthlog.analyzer.marks import Mark
+from hearthlog.analyzer.review.marking import UNKNOWN, Marking
+from hearthlog.analyzer.timeline.contents import Spans
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.messages import NANOSECONDS
 
 _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.timeline.contents import Clip
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.timeline.contents import Clip
+from hearthlog.schemas.messages import NANOSECONDS
 
 Float32 = NDArray[np.float32]
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.heard import Heard
-from analyzer.timeline.grid import Float64, Grid, Int64
+from hearthlog.analyzer.heard import Heard
+from hearthlog.analyzer.timeline.grid import Float64, Grid, Int64
 
 Float32 = NDArray[np.float32]
 LIVE, REVIEW = "live", "review"

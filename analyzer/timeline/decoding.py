@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from analyzer.timeline.contents import Clip, Frames, Spans, no_spans
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.columns import Columns
-from schemas.errors import LogError
+from hearthlog.analyzer.timeline.contents import Clip, Frames, Spans, no_spans
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
 
 TOPIC = re.compile(
     r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"

@@ -10,11 +10,11 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from analyzer.hometime import home_zone
-from schemas.errors import LogError
-from schemas.files import find_logs, is_layer, stem
-from schemas.logfile import LogFile, time_span
-from schemas.writer import METADATA
+from hearthlog.analyzer.hometime import home_zone
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs, is_layer, stem
+from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.writer import METADATA
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from analyzer.hometime import local_time
-from analyzer.timeline.contents import Labelling, Spans, no_spans
-from analyzer.timeline.grid import Float64, Grid, Int64, time_shares
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.hometime import local_time
+from hearthlog.analyzer.timeline.contents import Labelling, Spans, no_spans
+from hearthlog.analyzer.timeline.grid import Float64, Grid, Int64, time_shares
+from hearthlog.schemas.messages import NANOSECONDS
 
 BLOCKS = 420  # of a lane seen from afar: what is narrower than four pixels would be drawn grey
 _QUIET = "silence"

@@ -9,19 +9,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analyzer.known import decode_known
-from analyzer.timeline.contents import Lines, Spans
-from analyzer.timeline.decoding import FIELDS, TOPIC, decibel, spans_of, value_names
-from analyzer.timeline.grid import Float64, Grid, Int64
-from analyzer.timeline.lanes import Changes, changes, clock
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.chunks import RawMessages
-from schemas.columns import Columns
-from schemas.errors import LogError
-from schemas.files import find_logs, is_layer
-from schemas.logfile import time_span
-from schemas.messages import NANOSECONDS
+from hearthlog.analyzer.known import decode_known
+from hearthlog.analyzer.timeline.contents import Lines, Spans
+from hearthlog.analyzer.timeline.decoding import FIELDS, TOPIC, decibel, spans_of, value_names
+from hearthlog.analyzer.timeline.grid import Float64, Grid, Int64
+from hearthlog.analyzer.timeline.lanes import Changes, changes, clock
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.chunks import RawMessages
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.schemas.logfile import time_span
+from hearthlog.schemas.messages import NANOSECONDS
 
 LIVE_LANE, GAP_LANE, TROUBLE_LANE = "live", "not heard", "trouble"
 NOT_HEARD = "not heard"

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from analyzer.errors import DataError
-from analyzer.heard import heard_in
-from analyzer.hometime import home_zone
-from analyzer.known import decode_known
-from analyzer.marks import read_marks
-from analyzer.replay.clips import read_clips
-from analyzer.timeline.contents import (
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.heard import heard_in
+from hearthlog.analyzer.hometime import home_zone
+from hearthlog.analyzer.known import decode_known
+from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.replay.clips import read_clips
+from hearthlog.analyzer.timeline.contents import (
     LIVE,
     REVIEW,
     Clip,
@@ -28,7 +28,7 @@ from analyzer.timeline.contents import (
     Timeline,
     no_spans,
 )
-from analyzer.timeline.decoding import (
+from hearthlog.analyzer.timeline.decoding import (
     FIELDS,
     TOPIC,
     chained,
@@ -38,14 +38,14 @@ from analyzer.timeline.decoding import (
     spans_of,
     value_names,
 )
-from analyzer.timeline.files import File, find_files, records_of
-from analyzer.timeline.grid import Grid, Means
-from recorder.stream import FRAME_NANOSECONDS
-from schemas import messages
-from schemas.columns import Columns
-from schemas.errors import LogError
-from schemas.logfile import LogFile
-from schemas.series import iterate_pieces
+from hearthlog.analyzer.timeline.files import File, find_files, records_of
+from hearthlog.analyzer.timeline.grid import Grid, Means
+from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import Columns
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.series import iterate_pieces
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame

@@ -9,9 +9,9 @@ import rerun as rr
 import soundfile
 from numpy.typing import NDArray
 
-from analyzer.colours import Colour
-from analyzer.timeline.contents import Clip, Frames, Lines
-from analyzer.timeline.grid import Float64, Int64
+from hearthlog.analyzer.colours import Colour
+from hearthlog.analyzer.timeline.contents import Clip, Frames, Lines
+from hearthlog.analyzer.timeline.grid import Float64, Int64
 
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough

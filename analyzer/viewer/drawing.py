@@ -7,12 +7,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from analyzer.colours import GAP, Colour, colour
-from analyzer.hometime import home_zone
-from analyzer.timeline.contents import REVIEW, Frames, Microphone, Timeline, no_spans
-from analyzer.timeline.grid import Int64
-from analyzer.timeline.lanes import changes, clock, disagreements, from_afar
-from analyzer.viewer.canvas import TIMELINE, Canvas
+from hearthlog.analyzer.colours import GAP, Colour, colour
+from hearthlog.analyzer.hometime import home_zone
+from hearthlog.analyzer.timeline.contents import REVIEW, Frames, Microphone, Timeline, no_spans
+from hearthlog.analyzer.timeline.grid import Int64
+from hearthlog.analyzer.timeline.lanes import changes, clock, disagreements, from_afar
+from hearthlog.analyzer.viewer.canvas import TIMELINE, Canvas
 
 APPLICATION = "hearthlog"
 AFAR, EXACT = "lanes", "exact"

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import rerun as rr
 
-from analyzer.errors import DataError
-from analyzer.timeline.contents import Timeline
-from analyzer.viewer.canvas import Canvas
-from analyzer.viewer.drawing import APPLICATION, Layout, draw, draw_frames
-from schemas.errors import LogError
-from schemas.files import check_new, new_file
-from schemas.times import time_text
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.timeline.contents import Timeline
+from hearthlog.analyzer.viewer.canvas import Canvas
+from hearthlog.analyzer.viewer.drawing import APPLICATION, Layout, draw, draw_frames
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.files import check_new, new_file
+from hearthlog.schemas.times import time_text
 
 SUFFIX = ".rrd"
 

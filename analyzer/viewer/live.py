@@ -8,10 +8,10 @@ from typing import Self
 import rerun as rr
 import rerun.blueprint as rrb
 
-from analyzer.colours import GAP, Colour, colour
-from analyzer.errors import DataError
-from analyzer.timeline.contents import Lines
-from analyzer.timeline.live import (
+from hearthlog.analyzer.colours import GAP, Colour, colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.timeline.contents import Lines
+from hearthlog.analyzer.timeline.live import (
     GAP_LANE,
     LIVE_LANE,
     NOT_HEARD,
@@ -21,9 +21,9 @@ from analyzer.timeline.live import (
     Means,
     News,
 )
-from analyzer.viewer.canvas import TIMELINE, Canvas
-from analyzer.viewer.drawing import AFAR, SHARED_AXIS, lane
-from analyzer.viewer.process import HOST
+from hearthlog.analyzer.viewer.canvas import TIMELINE, Canvas
+from hearthlog.analyzer.viewer.drawing import AFAR, SHARED_AXIS, lane
+from hearthlog.analyzer.viewer.process import HOST
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
 _APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each

@@ -6,7 +6,7 @@ its kind of value; then the value.
 
 from collections.abc import Iterator
 
-from analyzer.viewer.canvas import TIMELINE
+from hearthlog.analyzer.viewer.canvas import TIMELINE
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _SIZES = {_FIXED64: 8, _FIXED32: 4}

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Self
 
-from analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError
 
 HOST = "127.0.0.1"
 _WAIT_SECONDS = 60

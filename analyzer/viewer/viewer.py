@@ -7,12 +7,12 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 import rerun as rr
 
-from analyzer.colours import colour
-from analyzer.errors import DataError
-from analyzer.timeline.contents import Spans, Timeline
-from analyzer.timeline.lanes import changes
-from analyzer.viewer.canvas import Canvas
-from analyzer.viewer.drawing import (
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.timeline.contents import Spans, Timeline
+from hearthlog.analyzer.timeline.lanes import changes
+from hearthlog.analyzer.viewer.canvas import Canvas
+from hearthlog.analyzer.viewer.drawing import (
     APPLICATION,
     SHARED_AXIS,
     Layout,
@@ -21,8 +21,8 @@ from analyzer.viewer.drawing import (
     draw_frames,
     review_lanes,
 )
-from analyzer.viewer.file import name_recording
-from analyzer.viewer.process import Process
+from hearthlog.analyzer.viewer.file import name_recording
+from hearthlog.analyzer.viewer.process import Process
 
 _PANEL = "/time_panel"
 _WAIT_SECONDS = 60

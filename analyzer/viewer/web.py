@@ -14,9 +14,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, cast
 
-from analyzer.viewer import messages
-from analyzer.viewer.process import HOST, Process, free_port
-from analyzer.viewer.viewer import Blueprint, State, Viewer
+from hearthlog.analyzer.viewer import messages
+from hearthlog.analyzer.viewer.process import HOST, Process, free_port
+from hearthlog.analyzer.viewer.viewer import Blueprint, State, Viewer
 
 _POLL_SECONDS = 20.0
 _ANSWER_SECONDS = 15.0
@@ -115,7 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Hand out the page, the viewer's files, and what is asked next."""
         name = self._name()
         if name == "":
-            page = files("analyzer.viewer").joinpath("page.html").read_bytes()
+            page = files("hearthlog.analyzer.viewer").joinpath("page.html").read_bytes()
             self._send(
                 page, "text/html; charset=utf-8", {"Content-Security-Policy": self._policy()}
             )

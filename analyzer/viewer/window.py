@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from analyzer.viewer.canvas import TIMELINE
-from analyzer.viewer.process import Process, check_display, free_port
-from analyzer.viewer.viewer import Blueprint, State, Viewer
+from hearthlog.analyzer.viewer.canvas import TIMELINE
+from hearthlog.analyzer.viewer.process import Process, check_display, free_port
+from hearthlog.analyzer.viewer.viewer import Blueprint, State, Viewer
 
 _MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
 

@@ -1,5 +1,5 @@
 """What runs tasks: this process, several processes of this machine, or a Dask cluster."""
 
-from analyzer.workers.workers import Workers, open_workers
+from hearthlog.analyzer.workers.workers import Workers, open_workers
 
 __all__ = ["Workers", "open_workers"]

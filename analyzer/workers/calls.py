@@ -5,8 +5,8 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from analyzer.errors import WorkerError
-from schemas.errors import HearthlogError
+from hearthlog.analyzer.errors import WorkerError
+from hearthlog.schemas.errors import HearthlogError
 
 
 def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:

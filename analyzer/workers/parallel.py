@@ -7,8 +7,8 @@ from typing import Any
 
 import joblib
 
-from analyzer.workers.cluster import connected, gone, raise_if_killed
-from schemas.errors import HearthlogError
+from hearthlog.analyzer.workers.cluster import connected, gone, raise_if_killed
+from hearthlog.schemas.errors import HearthlogError
 
 _MOST_THREADS = 4
 

@@ -12,12 +12,17 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
-from analyzer.errors import WorkerError
-from analyzer.workers.calls import attempt, pack_call, read_reply
+from hearthlog.analyzer.errors import WorkerError
+from hearthlog.analyzer.workers.calls import attempt, pack_call, read_reply
 
 LIVES = 3  # workers that a task may cost
 _TIDY_SECONDS = 3.0  # to remove what is half-written
-_SERVE = [sys.executable, "-P", "-c", "from analyzer.workers.processes import serve; serve()"]
+_SERVE = [
+    sys.executable,
+    "-P",
+    "-c",
+    "from hearthlog.analyzer.workers.processes import serve; serve()",
+]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 P = ParamSpec("P")

@@ -5,8 +5,8 @@ from concurrent.futures import Future
 from contextlib import closing, contextmanager
 from typing import ParamSpec, Protocol, TypeVar
 
-from analyzer.workers.cluster import Cluster, connected
-from analyzer.workers.processes import Processes
+from hearthlog.analyzer.workers.cluster import Cluster, connected
+from hearthlog.analyzer.workers.processes import Processes
 
 P = ParamSpec("P")
 T = TypeVar("T")

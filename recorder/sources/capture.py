@@ -18,8 +18,8 @@ from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
 
-from recorder.errors import SourceError
-from recorder.sources.devices import Device, find_device, list_devices, load_portaudio
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.devices import Device, find_device, list_devices, load_portaudio
 
 # index of the first sample, samples, flags of PortAudio, time of the first sample by the ADC
 # (s, on a clock of the driver's choice), now by CLOCK_MONOTONIC (s)

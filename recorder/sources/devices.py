@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from recorder.errors import SourceError
+from hearthlog.recorder.errors import SourceError
 
 _CARD_NUMBER = re.compile(r" ?\((hw|plughw):\d+,\d+\)$")
 

@@ -6,10 +6,10 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from recorder.clock import SampleClock
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from recorder.stream import FRAME_NANOSECONDS, Frames, Gap
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.clock import SampleClock
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.schemas.messages import NANOSECONDS
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on no clock we know
 _LOSS_SECONDS = 0.010

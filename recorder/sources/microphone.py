@@ -8,11 +8,11 @@ from threading import Event as Flag
 
 import numpy as np
 
-from recorder.errors import SourceError
-from recorder.sources.framing import Framer
-from recorder.sources.process import CaptureProcess
-from recorder.stream import Event, Frames, Gap, Health
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.framing import Framer
+from hearthlog.recorder.sources.process import CaptureProcess
+from hearthlog.recorder.stream import Event, Frames, Gap, Health
+from hearthlog.schemas.messages import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _STALE_SECONDS = 3.0

@@ -8,11 +8,11 @@ from threading import Event as Flag
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.errors import SourceError
-from recorder.features import FRAME_SAMPLES
-from recorder.sources.files import audio_seconds, read_audio
-from recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
-from schemas.messages import NANOSECONDS
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.recorder.sources.files import audio_seconds, read_audio
+from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
+from hearthlog.schemas.messages import NANOSECONDS
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s

@@ -1,4 +1,4 @@
-"""`python -m tools.bench [NAME ...]`: measure, side by side and in one run."""
+"""`python -m hearthlog.tools.bench [NAME ...]`: measure, side by side and in one run."""
 
 import os
 
@@ -16,8 +16,8 @@ from typing import Annotated
 
 import typer
 
-from schemas.errors import HearthlogError
-from tools.bench import (
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.bench import (
     features,
     inference,
     live,
@@ -28,7 +28,7 @@ from tools.bench import (
     size,
     writing,
 )
-from tools.bench.workload import Workload
+from hearthlog.tools.bench.workload import Workload
 
 MEASUREMENTS = {
     module.__name__.rpartition(".")[2]: module.measure

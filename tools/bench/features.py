@@ -6,10 +6,10 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import best_of
-from tools.bench.workload import Workload
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import best_of
+from hearthlog.tools.bench.workload import Workload
 
 _SECONDS = 120.0
 _SINGLE_FRAMES = 2000

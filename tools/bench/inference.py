@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
-from analyzer.dataset import Dataset
-from analyzer.recipe import RECIPES, decide, fit, prepare, softmax
-from models.classifier import Classifier
-from models.inputs import InputStream
-from recorder.features import FeatureExtractor
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import best_of
-from tools.bench.workload import Workload
+from hearthlog.analyzer.dataset import Dataset
+from hearthlog.analyzer.recipe import RECIPES, decide, fit, prepare, softmax
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.inputs import InputStream
+from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import best_of
+from hearthlog.tools.bench.workload import Workload
 
 _SECONDS = 200.0
 _BLOCK = 10  # frames, as from a microphone
@@ -54,7 +54,7 @@ def measure(work: Workload) -> Table:
 
 
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
-    """Fit what `analyzer.train` does, and calibrate it as scikit-learn does."""
+    """Fit what `hearthlog.analyzer.train` does, and calibrate it as scikit-learn does."""
     recipe = RECIPES["bands"]
     examples = prepare(recipe, data)
     machine = fit(recipe, examples)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.features import SAMPLE_RATE
-from tools.bench.timing import BenchError
+from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.tools.bench.timing import BenchError
 
 DEVICE = "labmic"
 _SOURCE = Path(__file__).parents[2] / "tests" / "labmic" / "labmic.c"

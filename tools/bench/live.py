@@ -8,12 +8,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from recorder.features import SAMPLE_RATE
-from recorder.sources import capture
-from tools.bench.labmic import DEVICE, make_microphone
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import HEARTHLOG, BenchError
-from tools.bench.workload import Workload
+from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.recorder.sources import capture
+from hearthlog.tools.bench.labmic import DEVICE, make_microphone
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import HEARTHLOG, BenchError
+from hearthlog.tools.bench.workload import Workload
 
 _SECONDS = 60.0
 _SETTLE_SECONDS = 5.0
@@ -39,7 +39,7 @@ sys.stdin.read()
 _TELLING_MODULES = """
 import atexit, sys
 atexit.register(lambda: print(*sys.modules, file=sys.stderr))
-from tools.cli.main import main
+from hearthlog.tools.cli.main import main
 main()
 """
 

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import best_of_processes
-from tools.bench.workload import Workload
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import best_of_processes
+from hearthlog.tools.bench.workload import Workload
 
 _REPEATS = 3
 _FAST = Target(1_000)

@@ -12,17 +12,17 @@ import numpy as np
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from analyzer.dataset import Dataset
-from analyzer.hmm import viterbi
-from analyzer.train import train_model
-from models.inputs import InputStream
-from models.modelfile import Model, save_model
-from schemas.files import find_logs
-from schemas.messages import LABEL, definition, encode, header, message, nanoseconds
-from tools.bench.inference import fit_scikit_learn
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import HEARTHLOG, BenchError, hearthlog
-from tools.bench.workload import Workload
+from hearthlog.analyzer.dataset import Dataset
+from hearthlog.analyzer.hmm import viterbi
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.inputs import InputStream
+from hearthlog.models.modelfile import Model, save_model
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import LABEL, definition, encode, header, message, nanoseconds
+from hearthlog.tools.bench.inference import fit_scikit_learn
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import HEARTHLOG, BenchError, hearthlog
+from hearthlog.tools.bench.workload import Workload
 
 _HOURS = 24
 _MIDNIGHT = "2026-03-01T00:00"

@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from schemas.files import find_logs
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import BenchError, hearthlog
-from tools.bench.workload import Workload
+from hearthlog.schemas.files import find_logs
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import BenchError, hearthlog
+from hearthlog.tools.bench.workload import Workload
 
 _HOURS, _DAYS = 24, 31
 _MIDNIGHT = "2026-03-01T00:00"
@@ -19,9 +19,9 @@ _RUN = """
 import json, resource, sys, time
 began = float(sys.argv[1])
 from pathlib import Path
-from analyzer.viewer.window import open_hidden
+from hearthlog.analyzer.viewer.window import open_hidden
 with open_hidden() as viewer:
-    from analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.timeline.reading import read_timeline
     timeline = read_timeline([Path(sys.argv[2])])
     viewer.draw(timeline, close_up=False)
     viewer.wait_until_drawn()

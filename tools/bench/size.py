@@ -8,9 +8,9 @@ import zstandard
 from mcap.records import Channel, Chunk, Message, MessageIndex
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from tools.bench.table import Row, Table
-from tools.bench.timing import hearthlog
-from tools.bench.workload import Workload
+from hearthlog.tools.bench.table import Row, Table
+from hearthlog.tools.bench.timing import hearthlog
+from hearthlog.tools.bench.workload import Workload
 
 _DAY = 86_400
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time

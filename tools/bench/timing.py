@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError
 
 _TURN_SECONDS = 0.5
-HEARTHLOG = [sys.executable, "-m", "tools.cli.main"]
+HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
 
 class BenchError(HearthlogError):

@@ -9,16 +9,16 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from analyzer.dataset import Dataset, build_dataset
-from analyzer.manifest import read_manifest
-from analyzer.scenario import BUILTIN, Scenario
-from analyzer.train import train_model
-from models.modelfile import Model, save_model
-from recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from recorder.sources.files import read_audio
-from tools.bench.timing import BenchError
-from tools.home.simulate import write_day, write_training_set
-from tools.home.sounds import LABELS
+from hearthlog.analyzer.dataset import Dataset, build_dataset
+from hearthlog.analyzer.manifest import read_manifest
+from hearthlog.analyzer.scenario import BUILTIN, Scenario
+from hearthlog.analyzer.train import train_model
+from hearthlog.models.modelfile import Model, save_model
+from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.recorder.sources.files import read_audio
+from hearthlog.tools.bench.timing import BenchError
+from hearthlog.tools.home.simulate import write_day, write_training_set
+from hearthlog.tools.home.sounds import LABELS
 
 _MOST_SECONDS = 3600
 _SEED = 1

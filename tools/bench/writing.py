@@ -9,14 +9,14 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from schemas.columns import Columns, read_columns
-from schemas.files import find_logs
-from schemas.messages import definition, encode, message, time_message
-from schemas.topics import Topic
-from schemas.writer import LogWriter, Rows
-from tools.bench.table import Row, Table, Target
-from tools.bench.timing import best_of, hearthlog
-from tools.bench.workload import Workload
+from hearthlog.schemas.columns import Columns, read_columns
+from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.messages import definition, encode, message, time_message
+from hearthlog.schemas.topics import Topic
+from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.tools.bench.table import Row, Table, Target
+from hearthlog.tools.bench.timing import best_of, hearthlog
+from hearthlog.tools.bench.workload import Workload
 
 _KINDS = ("/mic/features", "/mic/statistics", "/mic/label")
 _AT_ONCE = 7_200  # frames

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
+from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from analyzer.selection import Selection
+    from hearthlog.analyzer.selection import Selection
 
 
 class Format(StrEnum):
@@ -36,7 +36,7 @@ def cat(
 
     Exit status 3: a log is unfinished.
     """
-    from analyzer.selection import select
+    from hearthlog.analyzer.selection import select
 
     selection = select(logs, topics or [], *parse_span(start, end))
     if output_format is Format.csv and len(selection.channels) > 1:
@@ -55,8 +55,8 @@ def cat(
 
 
 def _print_lines(selection: "Selection", output_format: Format) -> None:
-    from analyzer.lines import in_order, json_lines, text_lines
-    from analyzer.pieces import pieces
+    from hearthlog.analyzer.lines import in_order, json_lines, text_lines
+    from hearthlog.analyzer.pieces import pieces
 
     lines = json_lines if output_format is Format.ndjson else text_lines
     for batch in selection.messages():
@@ -64,8 +64,8 @@ def _print_lines(selection: "Selection", output_format: Format) -> None:
 
 
 def _print_table(selection: "Selection") -> None:
-    from analyzer.export.csvfile import CsvFile
-    from analyzer.pieces import pieces
+    from hearthlog.analyzer.export.csvfile import CsvFile
+    from hearthlog.analyzer.pieces import pieces
 
     for topic in selection.channels:
         table = CsvFile(sys.stdout.buffer, topic, selection)

@@ -5,8 +5,15 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.selection import End, Logs, Start, Topics, check_log_name, report_unfinished
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.selection import (
+    End,
+    Logs,
+    Start,
+    Topics,
+    check_log_name,
+    report_unfinished,
+)
+from hearthlog.tools.cli.times import parse_span
 
 
 def cut(
@@ -22,9 +29,9 @@ def cut(
     It begins with what describes the streams (`/mic/info`) as it was at the start of the span.
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from analyzer.selection import select
-    from analyzer.splice import splice
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.selection import select
+    from hearthlog.analyzer.splice import splice
+    from hearthlog.tools.cli.progress import share_done
 
     check_log_name(output)
     selection = select(logs, topics or [], *parse_span(start, end))

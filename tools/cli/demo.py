@@ -20,17 +20,17 @@ def demo(
     ] = 24,
 ) -> None:
     """Simulate a home, learn its sounds, record and label a day of it, and draw the result."""
-    from analyzer.timeline.reading import read_timeline
-    from analyzer.viewer.file import save_timeline
-    from recorder.config import load_settings
-    from recorder.service import record_files
-    from recorder.sources.replayed import FileSource
-    from schemas.errors import HearthlogError
-    from tools.cli.info import info
-    from tools.cli.record import start_time
-    from tools.cli.train import train
-    from tools.home.simulate import write_day, write_training_set
-    from tools.home.sounds import LABELS
+    from hearthlog.analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.viewer.file import save_timeline
+    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.service import record_files
+    from hearthlog.recorder.sources.replayed import FileSource
+    from hearthlog.schemas.errors import HearthlogError
+    from hearthlog.tools.cli.info import info
+    from hearthlog.tools.cli.record import start_time
+    from hearthlog.tools.cli.train import train
+    from hearthlog.tools.home.simulate import write_day, write_training_set
+    from hearthlog.tools.home.sounds import LABELS
 
     if output.exists():
         raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
@@ -71,9 +71,9 @@ def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) ->
     """Share of the labels that the simulation meant in the middle of their window."""
     import numpy as np
 
-    from schemas import messages
-    from schemas.messages import nanoseconds
-    from schemas.reader import LogReader
+    from hearthlog.schemas import messages
+    from hearthlog.schemas.messages import nanoseconds
+    from hearthlog.schemas.reader import LogReader
 
     found = [
         item.decode()

@@ -11,7 +11,7 @@ def devices(
     *, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
 ) -> None:
     """List the microphones by the names that `hearthlog record --device` takes."""
-    from recorder.sources.process import query_devices
+    from hearthlog.recorder.sources.process import query_devices
 
     found = query_devices()
     if as_json:

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from tools.cli.progress import share_done
-from tools.cli.selection import End, Start, log_location, wrong_use
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.selection import End, Start, log_location, wrong_use
+from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from analyzer.diff.listing import Span
-    from analyzer.diff.sources import Side, Sources
+    from hearthlog.analyzer.diff.listing import Span
+    from hearthlog.analyzer.diff.sources import Side, Sources
 
 _SHOWN, _QUEUED = 10, 60
 
@@ -56,7 +56,7 @@ def diff(
 
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
-    from analyzer.diff.sources import find_sources, segment_topic
+    from hearthlog.analyzer.diff.sources import find_sources, segment_topic
 
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
@@ -90,9 +90,9 @@ class _Result(NamedTuple):
 
 
 def _difference(microphone: str, sides: "list[Side]", shown: int) -> _Result:
-    from analyzer.diff.difference import compare_sides
-    from analyzer.diff.listing import disagreements
-    from analyzer.diff.table import difference_table
+    from hearthlog.analyzer.diff.difference import compare_sides
+    from hearthlog.analyzer.diff.listing import disagreements
+    from hearthlog.analyzer.diff.table import difference_table
 
     found = compare_sides(*sides)
     about = {"microphone": microphone, **asdict(found)}
@@ -108,10 +108,10 @@ def _queue(
     limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:
-    from analyzer.diff.listing import queued
-    from analyzer.diff.queue import make_queue
-    from analyzer.diff.sources import REVIEW
-    from analyzer.diff.table import queue_table
+    from hearthlog.analyzer.diff.listing import queued
+    from hearthlog.analyzer.diff.queue import make_queue
+    from hearthlog.analyzer.diff.sources import REVIEW
+    from hearthlog.analyzer.diff.table import queue_table
 
     names = [side.name for side in sides]
     if REVIEW in names:
@@ -137,7 +137,7 @@ def _queue(
 
 
 def _write_list(path: Path, spans: "list[Span]") -> None:
-    from analyzer.diff.listing import write_list
+    from hearthlog.analyzer.diff.listing import write_list
 
     write_list(path, spans)
     typer.echo(f"hearthlog: {len(spans)} spans are listed in {path}", err=True)
@@ -156,7 +156,7 @@ def _report_losses(sources: "Sources", topics: list[str]) -> None:
 
 
 def _check_list(path: Path | None) -> None:
-    from schemas.files import check_new
+    from hearthlog.schemas.files import check_new
 
     if path is None:
         return

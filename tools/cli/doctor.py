@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from analyzer.doctor import Findings
+    from hearthlog.analyzer.doctor import Findings
 
 
 def doctor(
@@ -21,8 +21,8 @@ def doctor(
     Exit status 1: a log is damaged, or not as hearthlog writes them; 3: one has gaps, or is
     unfinished.
     """
-    from analyzer.doctor import examine
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.doctor import examine
+    from hearthlog.tools.cli.progress import share_done
 
     with share_done("reading logs") as progress:
         files = examine(path, progress)
@@ -36,7 +36,7 @@ def doctor(
 
 
 def _print(files: "list[Findings]") -> None:
-    from analyzer.doctor import printable
+    from hearthlog.analyzer.doctor import printable
 
     errors, warnings = _count(files, "error"), _count(files, "warning")
     for findings in files:

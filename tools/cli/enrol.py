@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.selection import wrong_use
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.times import parse_span
 
 
 def enrol(
@@ -37,7 +37,7 @@ def enrol(
 
     Features are kept, and no sound: a log in the folder `enrolled` of the home, all of it marked.
     """
-    from analyzer import enrol as enrolment
+    from hearthlog.analyzer import enrol as enrolment
 
     least, most = enrolment.LEAST_SECONDS, enrolment.MOST_SECONDS
     if sum(given is not None for given in (file, log, microphone)) != 1:

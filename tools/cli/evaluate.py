@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.cli.progress import steps_done
-from tools.cli.recipe import chosen_recipe
-from tools.cli.selection import wrong_use
+from hearthlog.tools.cli.progress import steps_done
+from hearthlog.tools.cli.recipe import chosen_recipe
+from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.dataset import Dataset
-    from analyzer.evaluation.events import Detections
-    from analyzer.evaluation.folds import Kind
-    from analyzer.evaluation.scores import Bin, Scores
+    from hearthlog.analyzer.dataset import Dataset
+    from hearthlog.analyzer.evaluation.events import Detections
+    from hearthlog.analyzer.evaluation.folds import Kind
+    from hearthlog.analyzer.evaluation.scores import Bin, Scores
 
 
 def evaluate(
@@ -78,7 +78,7 @@ def evaluate(
     """
     of_log, of_model = (log, reference), (model, data)
     if folds is not None or adaptation or search:
-        from analyzer.workers.parallel import joblib_on
+        from hearthlog.analyzer.workers.parallel import joblib_on
 
         if not data or not scenario or any((*of_log, topic, model)):
             wrong_use("--folds, --adaptation or --search goes with --data and --scenario alone")
@@ -114,11 +114,11 @@ def evaluate(
 def _evaluate_model(
     path: Path, data: Path, scenario: str | None, plot: Path | None, *, as_json: bool
 ) -> None:
-    from analyzer.evaluation.clips import check_classes, evaluate_model, scenario_of
-    from analyzer.evaluation.table import reliability_table
-    from analyzer.manifest import read_manifest
-    from analyzer.scenario import load_scenario
-    from models.modelfile import load_model
+    from hearthlog.analyzer.evaluation.clips import check_classes, evaluate_model, scenario_of
+    from hearthlog.analyzer.evaluation.table import reliability_table
+    from hearthlog.analyzer.manifest import read_manifest
+    from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.models.modelfile import load_model
 
     model = load_model(path)
     chosen = scenario_of(model) if scenario is None else load_scenario(scenario)
@@ -164,8 +164,8 @@ def _evaluate_model(
 def _evaluate_recipe(
     data: Path, scenario: str, folds: str, method: str, plot: Path | None, *, as_json: bool
 ) -> None:
-    from analyzer.evaluation.folds import evaluate_recipe
-    from analyzer.evaluation.table import reliability_table
+    from hearthlog.analyzer.evaluation.folds import evaluate_recipe
+    from hearthlog.analyzer.evaluation.table import reliability_table
 
     recipe, kind = chosen_recipe(method), _kind(folds)
     segments = _segments(data, scenario)
@@ -197,8 +197,8 @@ def _evaluate_recipe(
 
 
 def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool) -> None:
-    from analyzer.evaluation.table import search_table
-    from analyzer.search import around, search
+    from hearthlog.analyzer.evaluation.table import search_table
+    from hearthlog.analyzer.search import around, search
 
     recipes, kind = around(chosen_recipe(method)), _kind(folds)
     segments = _segments(data, scenario)
@@ -220,7 +220,7 @@ def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool
 
 
 def _kind(folds: str) -> "Kind":
-    from analyzer.evaluation.folds import KINDS
+    from hearthlog.analyzer.evaluation.folds import KINDS
 
     kinds = [kind for kind in KINDS if kind == folds]
     if not kinds:
@@ -229,7 +229,7 @@ def _kind(folds: str) -> "Kind":
 
 
 def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: bool) -> None:
-    from analyzer.adaptation import adaptation_curve
+    from hearthlog.analyzer.adaptation import adaptation_curve
 
     recipe = chosen_recipe(method)
     segments = _segments(data, scenario)
@@ -246,9 +246,9 @@ def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: boo
 
 
 def _segments(data: Path, scenario: str) -> "Dataset":
-    from analyzer.dataset import build_dataset
-    from analyzer.manifest import read_manifest
-    from analyzer.scenario import load_scenario
+    from hearthlog.analyzer.dataset import build_dataset
+    from hearthlog.analyzer.manifest import read_manifest
+    from hearthlog.analyzer.scenario import load_scenario
 
     chosen = load_scenario(scenario)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
@@ -259,8 +259,8 @@ def _segments(data: Path, scenario: str) -> "Dataset":
 def _evaluate_log(
     log: Path, reference: str, topic: str | None, plot: Path | None, *, as_json: bool
 ) -> None:
-    from analyzer.evaluation.labellings import read_labelled, read_reference
-    from analyzer.evaluation.reference import compare
+    from hearthlog.analyzer.evaluation.labellings import read_labelled, read_reference
+    from hearthlog.analyzer.evaluation.reference import compare
 
     labelled = read_labelled(log, topic)
     wanted = read_reference(reference, log, labelled.microphone)
@@ -299,7 +299,7 @@ def _evaluate_log(
 
 
 def _log_warnings(unfinished: tuple[Path, ...], unknown: Any) -> list[str]:
-    from analyzer.evaluation.table import shown
+    from hearthlog.analyzer.evaluation.table import shown
 
     lines = [f"unfinished, read up to the last whole chunk: {path}" for path in unfinished]
     if unknown:
@@ -311,7 +311,7 @@ def _log_warnings(unfinished: tuple[Path, ...], unknown: Any) -> list[str]:
 
 
 def _print_tables(scores: "Scores", detections: "Detections | None") -> None:
-    from analyzer.evaluation.table import class_table, confusion_table
+    from hearthlog.analyzer.evaluation.table import class_table, confusion_table
 
     print(*class_table(scores, detections), sep="\n")
     print()
@@ -323,7 +323,7 @@ def _print_json(result: dict[str, Any]) -> None:
 
 
 def _check_plot(path: Path | None) -> None:
-    from schemas.files import check_new
+    from hearthlog.schemas.files import check_new
 
     if path is None:
         return
@@ -333,6 +333,6 @@ def _check_plot(path: Path | None) -> None:
 
 
 def _save_plot(path: Path, title: str, scores: "Scores", bins: "list[Bin] | tuple[()]") -> None:
-    from analyzer.evaluation.plot import save_plot
+    from hearthlog.analyzer.evaluation.plot import save_plot
 
     save_plot(path, title, scores, bins)

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
+from hearthlog.tools.cli.times import parse_span
 
 _FORMATS = ("parquet", "csv", "npz", "wav", "txt", "bag", "rosbag2")
 
@@ -39,10 +39,10 @@ def export(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from analyzer.export.save import ONE_TOPIC, Format, fitting
-    from analyzer.export.save import export as save
-    from analyzer.selection import select
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.export.save import ONE_TOPIC, Format, fitting
+    from hearthlog.analyzer.export.save import export as save
+    from hearthlog.analyzer.selection import select
+    from hearthlog.tools.cli.progress import share_done
 
     one_file = output.suffix[1:] in _FORMATS[:-1]
     name = output_format or output.suffix[1:]

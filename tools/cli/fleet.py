@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tools.cli.progress import share_done
-from tools.cli.selection import wrong_use
-from tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
 
 if TYPE_CHECKING:
-    from analyzer.catalog import Catalog
-    from analyzer.catalog.fleet import Heard, Home
+    from hearthlog.analyzer.catalog import Catalog
+    from hearthlog.analyzer.catalog.fleet import Heard, Home
 
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
@@ -24,8 +24,8 @@ _COUNTS = "logs", "layers", "unfinished", "damaged"
 
 def make_catalog(folder: Path, *, as_json: bool) -> None:
     """Make the catalogue of a folder, and show what is in it."""
-    from analyzer.catalog import DAMAGED, UNFINISHED
-    from analyzer.catalog.fleet import heard, homes
+    from hearthlog.analyzer.catalog import DAMAGED, UNFINISHED
+    from hearthlog.analyzer.catalog.fleet import heard, homes
 
     if folder.is_file():
         wrong_use(f"--catalog: {folder} is a file; give the folder that holds the logs or homes")
@@ -51,8 +51,8 @@ def make_catalog(folder: Path, *, as_json: bool) -> None:
 
 
 def _written(folder: Path) -> "Catalog":
-    from analyzer.catalog import load_catalog, write_catalog
-    from analyzer.errors import DataError
+    from hearthlog.analyzer.catalog import load_catalog, write_catalog
+    from hearthlog.analyzer.errors import DataError
 
     known = None
     try:

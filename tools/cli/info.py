@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.cli.selection import log_location
-from tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
+from hearthlog.tools.cli.selection import log_location
+from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
 
 if TYPE_CHECKING:
-    from analyzer.summary import Summary
+    from hearthlog.analyzer.summary import Summary
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
 
@@ -43,13 +43,13 @@ def info(
     Exit status 3: a file is unfinished or damaged, or (without --catalog) sound is missing.
     """
     if catalog:
-        from tools.cli.fleet import make_catalog
+        from hearthlog.tools.cli.fleet import make_catalog
 
         make_catalog(path, as_json=as_json)
         return
-    from analyzer.summary import summarise
-    from schemas.files import find_logs
-    from tools.cli.progress import track
+    from hearthlog.analyzer.summary import summarise
+    from hearthlog.schemas.files import find_logs
+    from hearthlog.tools.cli.progress import track
 
     summary = summarise(track(find_logs(path), "reading logs"))
     for error in summary.damaged.values():

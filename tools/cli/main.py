@@ -9,28 +9,28 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from schemas.errors import HearthlogError
-from tools.cli.annotate import annotate
-from tools.cli.cat import cat
-from tools.cli.cut import cut
-from tools.cli.demo import demo
-from tools.cli.devices import devices
-from tools.cli.diff import diff
-from tools.cli.doctor import doctor
-from tools.cli.enrol import enrol
-from tools.cli.evaluate import evaluate
-from tools.cli.export import export
-from tools.cli.info import info
-from tools.cli.merge import merge
-from tools.cli.models import models
-from tools.cli.record import record
-from tools.cli.recover import recover
-from tools.cli.relabel import relabel
-from tools.cli.replay import replay
-from tools.cli.report import report
-from tools.cli.review import review
-from tools.cli.train import train
-from tools.cli.watch import watch
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.cli.annotate import annotate
+from hearthlog.tools.cli.cat import cat
+from hearthlog.tools.cli.cut import cut
+from hearthlog.tools.cli.demo import demo
+from hearthlog.tools.cli.devices import devices
+from hearthlog.tools.cli.diff import diff
+from hearthlog.tools.cli.doctor import doctor
+from hearthlog.tools.cli.enrol import enrol
+from hearthlog.tools.cli.evaluate import evaluate
+from hearthlog.tools.cli.export import export
+from hearthlog.tools.cli.info import info
+from hearthlog.tools.cli.merge import merge
+from hearthlog.tools.cli.models import models
+from hearthlog.tools.cli.record import record
+from hearthlog.tools.cli.recover import recover
+from hearthlog.tools.cli.relabel import relabel
+from hearthlog.tools.cli.replay import replay
+from hearthlog.tools.cli.report import report
+from hearthlog.tools.cli.review import review
+from hearthlog.tools.cli.train import train
+from hearthlog.tools.cli.watch import watch
 
 app = typer.Typer(
     no_args_is_help=True,

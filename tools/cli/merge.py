@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.selection import Logs, check_log_name, report_unfinished
+from hearthlog.tools.cli.selection import Logs, check_log_name, report_unfinished
 
 
 def merge(
@@ -17,9 +17,9 @@ def merge(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from analyzer.selection import select
-    from analyzer.splice import splice
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.selection import select
+    from hearthlog.analyzer.splice import splice
+    from hearthlog.tools.cli.progress import share_done
 
     check_log_name(output)
     selection = select(logs)

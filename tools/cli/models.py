@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from analyzer.compare import Comparison
-    from analyzer.dataset import Recording
-    from analyzer.scenario import Scenario
-    from models.registry import Entry
+    from hearthlog.analyzer.compare import Comparison
+    from hearthlog.analyzer.dataset import Recording
+    from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.models.registry import Entry
 
 models = typer.Typer(
     no_args_is_help=True, help="Keep models in a folder: compare them, and choose which speaks."
@@ -38,7 +38,7 @@ _Json = Annotated[bool, typer.Option("--json", help="Print it as JSON.")]
 @models.command("list")
 def list_(folder: _Folder = None, as_json: _Json = False) -> None:
     """List the models; exit status 3: one of them cannot be used."""
-    from models.registry import list_models
+    from hearthlog.models.registry import list_models
 
     found = list_models(_folder(folder))
     bad = [entry for entry in found if entry.model is None]
@@ -59,7 +59,7 @@ def show(
     as_json: _Json = False,
 ) -> None:
     """Print a model's card: what it tells apart, how well, and what it learned from."""
-    from models.registry import load
+    from hearthlog.models.registry import load
 
     model = load(_folder(folder), name)
     if as_json:
@@ -94,11 +94,11 @@ def compare(
 
     Sources that one of them has learned from are left out. Exit status 3: there are no others.
     """
-    from analyzer.compare import compare_models
-    from analyzer.evaluation.clips import scenario_of
-    from analyzer.scenario import load_scenario
-    from models.registry import load
-    from tools.cli.selection import wrong_use
+    from hearthlog.analyzer.compare import compare_models
+    from hearthlog.analyzer.evaluation.clips import scenario_of
+    from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.models.registry import load
+    from hearthlog.tools.cli.selection import wrong_use
 
     if (data is None) == (logs is None):
         wrong_use("give either --data or --logs")
@@ -126,7 +126,7 @@ def promote(
     to: Annotated[Alias, typer.Option(help="What it becomes.")] = Alias.champion,
 ) -> None:
     """Check a model, and make it the champion in one step; a recorder that runs takes it over."""
-    from models.registry import promote as promote_model
+    from hearthlog.models.registry import promote as promote_model
 
     place = _folder(folder)
     model, before = promote_model(place, name, to.value)
@@ -139,17 +139,17 @@ def promote(
 @models.command()
 def rollback(folder: _Folder = None) -> None:
     """Make the champion before the champion again."""
-    from models.registry import rollback as roll_back
+    from hearthlog.models.registry import rollback as roll_back
 
     model, before = roll_back(_folder(folder))
     print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
 
 
 def _recordings(data: Path | None, logs: Path | None, scenario: "Scenario") -> "list[Recording]":
-    from analyzer.compare import clip_recordings
-    from analyzer.home import home_recordings
-    from analyzer.manifest import read_manifest
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.compare import clip_recordings
+    from hearthlog.analyzer.home import home_recordings
+    from hearthlog.analyzer.manifest import read_manifest
+    from hearthlog.tools.cli.progress import share_done
 
     if logs is not None:
         return list(home_recordings(logs))
@@ -164,7 +164,7 @@ def _recordings(data: Path | None, logs: Path | None, scenario: "Scenario") -> "
 
 
 def _folder(given: Path | None) -> Path:
-    from recorder.config import load_settings
+    from hearthlog.recorder.config import load_settings
 
     if given is not None:
         return given

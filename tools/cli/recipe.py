@@ -2,15 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-from tools.cli.selection import wrong_use
+from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.recipe import Recipe
+    from hearthlog.analyzer.recipe import Recipe
 
 
 def chosen_recipe(method: str, cost: float | None = None, gamma: float | None = None) -> "Recipe":
     """Return a recipe, with another cost and gamma if they are given."""
-    from analyzer.recipe import RECIPES
+    from hearthlog.analyzer.recipe import RECIPES
 
     if method not in RECIPES:
         wrong_use(f"--method {method}: choose one of {', '.join(RECIPES)}")

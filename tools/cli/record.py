@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tools.cli.times import parse_time
+from hearthlog.tools.cli.times import parse_time
 
 if TYPE_CHECKING:
-    from recorder.service import Recording
+    from hearthlog.recorder.service import Recording
 
 
 def record(
@@ -67,10 +67,10 @@ def record(
     SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps, or a log
     left by an earlier recorder was damaged, or a new model was refused.
     """
-    from recorder.config import load_settings
-    from recorder.service import record_files, record_microphone
-    from recorder.sources.replayed import FileSource
-    from tools.cli.progress import share_done
+    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.service import record_files, record_microphone
+    from hearthlog.recorder.sources.replayed import FileSource
+    from hearthlog.tools.cli.progress import share_done
 
     given = {
         "output": output,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from recorder.recovery import Recovery
+    from hearthlog.recorder.recovery import Recovery
 
 
 def recover(
@@ -29,7 +29,7 @@ def recover(
 
     The log itself is not touched. Exit status 3: something was lost.
     """
-    from schemas.errors import LogError
+    from hearthlog.schemas.errors import LogError
 
     if output is not None and (len(logs) > 1 or in_place):
         raise typer.BadParameter("--output goes with one log, and not with --in-place")
@@ -56,9 +56,9 @@ def recover(
 
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
-    from recorder.recovery import recover_in_place, recover_log
-    from schemas.files import SUFFIX, new_file, stem
-    from tools.cli.progress import share_done
+    from hearthlog.recorder.recovery import recover_in_place, recover_log
+    from hearthlog.schemas.files import SUFFIX, new_file, stem
+    from hearthlog.tools.cli.progress import share_done
 
     with share_done(f"recovering {log.name}") as progress:
         if in_place:

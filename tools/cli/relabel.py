@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.selection import Logs, log_location
+from hearthlog.tools.cli.selection import Logs, log_location
 
 if TYPE_CHECKING:
-    from analyzer.relabel.run import Relabelled
+    from hearthlog.analyzer.relabel.run import Relabelled
 
 _SHOWN = 20  # of a list
 
@@ -38,10 +38,10 @@ def relabel(
 
     Exit status 3: a log is damaged, or was not relabelled; the others are done.
     """
-    from analyzer.relabel.run import relabel as run
-    from analyzer.workers import open_workers
-    from models.modelfile import load_model
-    from tools.cli.progress import steps_done
+    from hearthlog.analyzer.relabel.run import relabel as run
+    from hearthlog.analyzer.workers import open_workers
+    from hearthlog.models.modelfile import load_model
+    from hearthlog.tools.cli.progress import steps_done
 
     loaded = load_model(model)
     count = workers or os.cpu_count() or 1

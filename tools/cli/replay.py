@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.selection import wrong_use
+from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.replay.origin import Origin
-    from analyzer.replay.player import Replay, Wanted
-    from analyzer.replay.replay import LogSet
-    from models.modelfile import Model
+    from hearthlog.analyzer.replay.origin import Origin
+    from hearthlog.analyzer.replay.player import Replay, Wanted
+    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.models.modelfile import Model
 
 _MAX_RATE = "max"
 
@@ -74,9 +74,9 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from analyzer.replay.player import Wanted
-    from analyzer.replay.replay import LogSet
-    from schemas.files import find_logs
+    from hearthlog.analyzer.replay.player import Wanted
+    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.schemas.files import find_logs
 
     if not 0 <= start_offset < math.inf:
         wrong_use(f"--start-offset {start_offset}: not a number of seconds from 0")
@@ -125,7 +125,7 @@ class _Models:
     """
 
     def __init__(self, given: Path | None, folders: Sequence[Path]) -> None:
-        from models.modelfile import load_model
+        from hearthlog.models.modelfile import load_model
 
         self._given = None if given is None else load_model(given)
         self._folders = folders
@@ -135,7 +135,7 @@ class _Models:
 
     def __call__(self, origin: "Origin") -> "Model | None":
         """Return the model for what a recorder wrote."""
-        from analyzer.replay.replay import find_model
+        from hearthlog.analyzer.replay.replay import find_model
 
         if self._given is not None:
             return self._given
@@ -176,13 +176,13 @@ def _parse_rate(text: str) -> float | None:
 
 def _check_output(output: Path | None, source: Path) -> None:
     """Refuse an output that exists, or that would get among what is replayed."""
-    from schemas.errors import LogError
-    from schemas.files import check_new
+    from hearthlog.schemas.errors import LogError
+    from hearthlog.schemas.files import check_new
 
     if output is None:
         return
     if output.suffix == ".rrd":
-        from analyzer.viewer.file import check_output
+        from hearthlog.analyzer.viewer.file import check_output
 
         check_output(output)
         return
@@ -195,8 +195,8 @@ def _check_output(output: Path | None, source: Path) -> None:
 
 
 def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
-    from analyzer.replay.replay import replay as replay_logs
-    from tools.cli.progress import share_done
+    from hearthlog.analyzer.replay.replay import replay as replay_logs
+    from hearthlog.tools.cli.progress import share_done
 
     def run(wanted: "Wanted") -> "Replay":
         with share_done("replaying") as progress:
@@ -204,8 +204,8 @@ def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
 
     if wanted.output is None or wanted.output.suffix != ".rrd":
         return run(wanted)
-    from analyzer.timeline.reading import read_timeline
-    from analyzer.viewer.file import save_timeline
+    from hearthlog.analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.viewer.file import save_timeline
 
     output = wanted.output
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.progress import share_done
-from tools.cli.selection import Logs, wrong_use
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.selection import Logs, wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.report.shelf import Shelf
+    from hearthlog.analyzer.report.shelf import Shelf
 
 _YEARS = range(1970, 2200)
 
@@ -49,9 +49,9 @@ def report(
         wrong_use(f"--output {output}: a page is named *.html")
     first = None if day is None and week is None else _first_day(day, week)
 
-    from analyzer.hometime import home_zone
-    from analyzer.report.report import WEEK, Period, make_report
-    from analyzer.report.shelf import find_shelf
+    from hearthlog.analyzer.hometime import home_zone
+    from hearthlog.analyzer.report.report import WEEK, Period, make_report
+    from hearthlog.analyzer.report.shelf import find_shelf
 
     shelf = find_shelf(logs)
     zone = home_zone(timezone, shelf.records())

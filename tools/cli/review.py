@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from tools.cli.browser import show_page
-from tools.cli.keys import read_keys
-from tools.cli.progress import share_done
-from tools.cli.reviewer import reviewer_name
-from tools.cli.selection import wrong_use
-from tools.cli.times import parse_span
+from hearthlog.tools.cli.browser import show_page
+from hearthlog.tools.cli.keys import read_keys
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.reviewer import reviewer_name
+from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from analyzer.review.marking import Marking
-    from analyzer.review.session import Item
-    from analyzer.timeline.contents import Timeline
-    from analyzer.viewer.viewer import Viewer
+    from hearthlog.analyzer.review.marking import Marking
+    from hearthlog.analyzer.review.session import Item
+    from hearthlog.analyzer.timeline.contents import Timeline
+    from hearthlog.analyzer.viewer.viewer import Viewer
 
 _SPANS = 60
 _ALL_FRAMES = 3 * 3600 * 10**9  # ns: of more, the viewer would take a gigabyte
@@ -95,8 +95,8 @@ def _end(number: int, _frame: object) -> None:
 
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
     """Read the option --day: from midnight to midnight, at home."""
-    from analyzer.hometime import day_span
-    from analyzer.timeline.files import zone_of
+    from hearthlog.analyzer.hometime import day_span
+    from hearthlog.analyzer.timeline.files import zone_of
 
     zone = zone_of(logs, timezone)
     today = datetime.now(zone).date()
@@ -110,7 +110,7 @@ def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None,
 def _read(
     logs: list[Path], limits: tuple[int | None, int | None], timezone: str | None
 ) -> "Timeline":
-    from analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.timeline.reading import read_timeline
 
     with share_done("reading logs") as progress:
         return read_timeline(logs, *limits, zone=timezone, progress=progress)
@@ -122,7 +122,7 @@ def _save(
     timezone: str | None,
     output: Path,
 ) -> "Timeline":
-    from analyzer.viewer.file import check_output, save_timeline
+    from hearthlog.analyzer.viewer.file import check_output, save_timeline
 
     check_output(output)
     timeline = _read(logs, limits, timezone)
@@ -136,10 +136,10 @@ def _save(
 def _open(*, web: bool, port: int | None) -> "Viewer":
     """Start the viewer before logs are read: it takes its time as well."""
     if web:
-        from analyzer.viewer.web import open_page
+        from hearthlog.analyzer.viewer.web import open_page
 
         return open_page(port)
-    from analyzer.viewer.window import open_window
+    from hearthlog.analyzer.viewer.window import open_window
 
     return open_window(port)
 
@@ -157,10 +157,10 @@ class _Choice(NamedTuple):
 
 def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
     """Show a timeline until the reviewer is done."""
-    from analyzer.hometime import home_zone
-    from analyzer.review.session import Session
-    from analyzer.review.sound import listen
-    from analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.hometime import home_zone
+    from hearthlog.analyzer.review.session import Session
+    from hearthlog.analyzer.review.sound import listen
+    from hearthlog.analyzer.timeline.reading import read_timeline
 
     microphone = _microphone(timeline, choice.microphone)
     items, marking = _work(timeline, logs, choice, microphone)
@@ -206,10 +206,10 @@ def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[Item], Marking]":
     """Find what is to be gone through, and what is corrected."""
-    from analyzer.diff.sources import find_sources
-    from analyzer.review.marking import Marking
-    from analyzer.review.queue import queue_items
-    from analyzer.timeline.contents import LIVE, no_spans
+    from hearthlog.analyzer.diff.sources import find_sources
+    from hearthlog.analyzer.review.marking import Marking
+    from hearthlog.analyzer.review.queue import queue_items
+    from hearthlog.analyzer.timeline.contents import LIVE, no_spans
 
     known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 if TYPE_CHECKING:
-    from analyzer.selection import Selection
+    from hearthlog.analyzer.selection import Selection
 
 
 def log_location(text: str) -> Path:
     """Read the name of a log or a folder, which may be the URL of a store."""
     if "://" not in text:
         return Path(text)
-    from analyzer.storage import location
+    from hearthlog.analyzer.storage import location
 
     return location(text)
 

@@ -2,7 +2,7 @@
 
 import typer
 
-from schemas.times import read_time
+from hearthlog.schemas.times import read_time
 
 _LAST = (1 << 63) - 1  # log time
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.progress import steps_done
-from tools.cli.recipe import chosen_recipe
-from tools.cli.selection import wrong_use
+from hearthlog.tools.cli.progress import steps_done
+from hearthlog.tools.cli.recipe import chosen_recipe
+from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.dataset import Dataset, Recording
-    from analyzer.recipe import Recipe
-    from analyzer.scenario import Scenario
-    from models.modelfile import Model
+    from hearthlog.analyzer.dataset import Dataset, Recording
+    from hearthlog.analyzer.recipe import Recipe
+    from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.models.modelfile import Model
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -57,7 +57,7 @@ def train(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn a model from labelled sound, and measure it on sources it has not heard."""
-    from models.modelfile import check_output, load_model, save_model
+    from hearthlog.models.modelfile import check_output, load_model, save_model
 
     check_output(output)
     if base is not None:
@@ -67,7 +67,7 @@ def train(
     else:
         if not data or not scenario:
             wrong_use("give --data and --scenario, or --base and --home")
-        from analyzer.workers.parallel import joblib_on
+        from hearthlog.analyzer.workers.parallel import joblib_on
 
         recipe = chosen_recipe(method, cost, gamma)
         with joblib_on(scheduler):
@@ -86,10 +86,10 @@ def train(
 def _learned(
     data: list[Path], scenario: str, home: list[Path], recipe: "Recipe", smoothing: str
 ) -> tuple["Model", "Dataset"]:
-    from analyzer.dataset import build_dataset
-    from analyzer.manifest import read_manifest
-    from analyzer.scenario import load_scenario
-    from analyzer.train import SMOOTHINGS, train_model
+    from hearthlog.analyzer.dataset import build_dataset
+    from hearthlog.analyzer.manifest import read_manifest
+    from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.analyzer.train import SMOOTHINGS, train_model
 
     if smoothing not in SMOOTHINGS:
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
@@ -103,10 +103,10 @@ def _learned(
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
-    from analyzer.dataset import cut_recordings
-    from analyzer.home import home_sequences
-    from analyzer.train import adapt_model
-    from models.modelfile import load_model
+    from hearthlog.analyzer.dataset import cut_recordings
+    from hearthlog.analyzer.home import home_sequences
+    from hearthlog.analyzer.train import adapt_model
+    from hearthlog.models.modelfile import load_model
 
     model = load_model(base)
     segments = cut_recordings(_heard_at(home), _scenario(model))
@@ -116,7 +116,7 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
 
 
 def _scenario(model: "Model") -> "Scenario":
-    from analyzer.scenario import Scenario
+    from hearthlog.analyzer.scenario import Scenario
 
     about = model.description
     classes = {name: tuple(labels) for name, labels in about.scenario.items()}
@@ -129,7 +129,7 @@ def _manifest(path: Path) -> Path:
 
 def _heard_at(folders: list[Path]) -> Iterator["Recording"]:
     for folder in folders:
-        from analyzer.home import home_recordings
+        from hearthlog.analyzer.home import home_recordings
 
         yield from home_recordings(folder)
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tools.cli.browser import show_page
-from tools.cli.selection import wrong_use
+from hearthlog.tools.cli.browser import show_page
+from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from analyzer.viewer.live import LiveServer
-    from analyzer.viewer.viewer import Viewer
+    from hearthlog.analyzer.viewer.live import LiveServer
+    from hearthlog.analyzer.viewer.viewer import Viewer
 
 _LOOPBACK = "127.0.0.1"
 _POLL_SECONDS = 0.2
@@ -52,8 +52,8 @@ def watch(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
-    from analyzer.hometime import home_zone
-    from analyzer.timeline.live import last_time
+    from hearthlog.analyzer.hometime import home_zone
+    from hearthlog.analyzer.timeline.live import last_time
 
     newest = last_time(logs)
     home_zone(timezone)
@@ -76,8 +76,8 @@ def watch(
 
 
 def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool) -> "LiveServer":
-    from analyzer.viewer.live import PORT, LiveServer
-    from analyzer.viewer.process import free_port
+    from hearthlog.analyzer.viewer.live import PORT, LiveServer
+    from hearthlog.analyzer.viewer.process import free_port
 
     if serve:
         port = port or PORT
@@ -87,8 +87,8 @@ def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool
 
 
 def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
-    from analyzer.viewer.web import open_page
-    from analyzer.viewer.window import open_window
+    from hearthlog.analyzer.viewer.web import open_page
+    from hearthlog.analyzer.viewer.window import open_window
 
     if not web:
         return open_window(data=url)
@@ -117,10 +117,10 @@ def _follow(
     logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
-    from analyzer.timeline.files import zone_of
-    from analyzer.timeline.live import Live
-    from schemas.errors import LogError
-    from schemas.follow import follow_messages
+    from hearthlog.analyzer.timeline.files import zone_of
+    from hearthlog.analyzer.timeline.live import Live
+    from hearthlog.schemas.errors import LogError
+    from hearthlog.schemas.follow import follow_messages
 
     told: deque[str] = deque(maxlen=_MOST_TROUBLES)
 

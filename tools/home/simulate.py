@@ -9,8 +9,15 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from recorder.features import SAMPLE_RATE
-from tools.home.sounds import LABELS, RoomTone, SimulationError, dry_sound, generator, synthesize
+from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.tools.home.sounds import (
+    LABELS,
+    RoomTone,
+    SimulationError,
+    dry_sound,
+    generator,
+    synthesize,
+)
 
 _SOURCE = "hearthlog simulated home"
 _CLIP_SECONDS = (3.0, 5.0)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from recorder.features import SAMPLE_RATE
-from schemas.errors import HearthlogError
-from tools.home.waveforms import (
+from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.home.waveforms import (
     Range,
     Train,
     band_noise,
