@@ -181,9 +181,10 @@ def test_recording_with_labels_imports_nothing_of_the_analyzer(day, model_file, 
     result = subprocess.run(
         [*map(str, command), "-o", str(tmp_path)], capture_output=True, text=True, check=True
     )
-    loaded = {name.partition(".")[0] for name in result.stdout.split()}
-    assert "recorder" in loaded
-    assert not loaded & HEAVY
+    loaded = result.stdout.split()
+    assert "hearthlog.recorder.service" in loaded
+    assert not any(name.startswith("hearthlog.analyzer") for name in loaded)
+    assert not {name.partition(".")[0] for name in loaded} & HEAVY
 
 
 def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
