@@ -19,9 +19,10 @@ from hearthlog.analyzer.hmm import LAG_SECONDS, default_transitions
 from hearthlog.analyzer.manifest import read_manifest
 from hearthlog.analyzer.scenario import load_scenario
 from hearthlog.analyzer.train import train_model
-from hearthlog.models.modelfile import Smoothing, load_model, save_model
-from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.models.description import Smoothing
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.sources.files import read_audio
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
