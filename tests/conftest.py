@@ -73,12 +73,17 @@ def hearthlog():
 
 
 @pytest.fixture(scope="session")
-def model_file(tmp_path_factory) -> Path:
+def training_set(tmp_path_factory) -> Path:
+    """Simulated sounds of all labels, five clips each."""
+    return write_training_set(tmp_path_factory.mktemp("clips"), clips_per_class=5, seed=11)
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory, training_set) -> Path:
     """A model of the general scenario, trained on simulated sounds, that merges labels."""
     folder = tmp_path_factory.mktemp("model")
     scenario = load_scenario("general")
-    manifest = write_training_set(folder / "clips", clips_per_class=5, seed=11)
-    data = build_dataset(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
+    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, lambda *_: None)
     path = folder / "simulated.safetensors"
     save_model(train_model(data, scenario, lambda *_: None, smoothing="merge"), path)
     return path

@@ -145,7 +145,8 @@ def _evaluate_model(
     else:
         scores = found.scores
         print(
-            f"model {model.name}, scenario {chosen.name}: {scores.segments} segments of 1 s from "
+            f"model {model.name}, scenario {chosen.name}: {scores.segments} segments of "
+            f"{model.description.window_seconds:g} s from "
             f"{scores.groups} sources\n"
         )
         _print_tables(scores, found.detections)
@@ -189,7 +190,8 @@ def _evaluate_method(
         )
         return
     print(
-        f"method {method}, scenario {scenario}: {found.scores.segments} segments of 1 s from "
+        f"method {method}, scenario {scenario}: {found.scores.segments} segments of "
+        f"{chosen.features.window_seconds:g} s from "
         f"{found.scores.groups} sources, {found.folds} folds by {folds}\n"
     )
     _print_tables(found.scores, None)
@@ -210,7 +212,8 @@ def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool
         _print_json({"scenario": scenario, "method": method, "by": folds, "tried": found})
         return
     print(
-        f"method {method}, scenario {scenario}: {len(segments)} segments of 1 s, folds by {folds}\n"
+        f"method {method}, scenario {scenario}: {len(segments)} segments of "
+        f"{chosen.features.window_seconds:g} s, folds by {folds}\n"
     )
     print(*search_table(tried), sep="\n")
     best = tried[0].method.parameters
@@ -238,7 +241,8 @@ def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: boo
         _print_json({"scenario": scenario, "method": method} | found._asdict())
         return
     width = max(map(len, (*found.collections, "collection left out")))
-    print("macro F1 after so many corrected segments of 1 s\n")
+    window = f"{chosen.features.window_seconds:g} s"
+    print(f"macro F1 after so many corrected segments of {window}\n")
     print(f"{'collection left out':{width}}", *(f"{count:6}" for count in found.corrected))
     for name, row in (found.collections | {"mean": found.mean}).items():
         print(f"{name:{width}}", *(f"{value:6.3f}" for value in row))

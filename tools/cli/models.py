@@ -184,7 +184,7 @@ def _after(before: str | None) -> str:
 
 def _print_comparison(found: "Comparison") -> None:
     a, b = found.a, found.b
-    print(f"{a.scores.segments} segments of 1 s from {a.scores.groups} sources", end="")
+    print(f"{a.scores.segments} segments from {a.scores.groups} sources", end="")
     print(f"; {found.sources_left_out} sources left out that a model has learned from")
     for reason, count in found.skipped.items():
         print(f"{count} recordings left out: {reason}")
