@@ -14,7 +14,7 @@ from sklearn.metrics import f1_score
 from hearthlog.analyzer.dataset import Dataset, Progress
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.home import HOME_WEIGHT
-from hearthlog.analyzer.recipe import Examples, Recipe, decide_with_home, fit, prepare
+from hearthlog.analyzer.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
 
 CORRECTED = (0, 10, 30, 60)  # segments
@@ -42,13 +42,13 @@ class Curve(NamedTuple):
     mean: list[float]
 
 
-def adaptation_curve(data: Dataset, recipe: Recipe, progress: Progress) -> Curve:
+def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve:
     """Leave each collection out in turn and adapt to ever more of it.
 
     Parameters
     ----------
     data : Dataset
-    recipe : Recipe
+    method : Method
     progress : callable
         Told how many fits of how many are done.
 
@@ -64,9 +64,9 @@ def adaptation_curve(data: Dataset, recipe: Recipe, progress: Progress) -> Curve
             f"no collection has {_FEWEST_CLASSES} classes, {_FEWEST_GROUPS} source groups and "
             f"{2 * _FEWEST_SEGMENTS} segments: none can stand for a new home"
         )
-    examples = prepare(recipe, data)
+    examples = prepare(method, data)
     splits = [_split(data, number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
-    calls = (delayed(_scores)(recipe, len(data.classes), split, *examples) for split in splits)
+    calls = (delayed(_scores)(method, len(data.classes), split, *examples) for split in splits)
     scores = np.empty((len(splits), len(CORRECTED)))
     for place, found in enumerate(in_parallel(calls)):
         scores[place] = found
@@ -103,7 +103,7 @@ def _split(data: Dataset, number: int, shuffle: int) -> _Split:
     return _Split(others, pool, np.flatnonzero(inside & ~mine))
 
 
-def _scores(recipe: Recipe, classes: int, split: _Split, *arrays: Any) -> list[float]:
+def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[float]:
     examples = Examples(*arrays)
     inputs, target = examples.inputs[0], examples.target
     right = target[split.test]
@@ -113,10 +113,8 @@ def _scores(recipe: Recipe, classes: int, split: _Split, *arrays: Any) -> list[f
         weight = examples.weight.copy()
         weight[home] = HOME_WEIGHT
         seen = np.concatenate([split.others, home])
-        machine = fit(recipe, examples._replace(weight=weight), seen)
-        decision = decide_with_home(
-            machine, inputs[split.test], classes, inputs[home], target[home]
-        )
+        learned = method.fit(examples._replace(weight=weight), seen, home)
+        decision = learned.decide(inputs[split.test], classes)
         predicted, labels = decision.argmax(axis=1), np.unique(right)
         scores.append(f1_score(right, predicted, labels=labels, average="macro", zero_division=0))
     return scores

@@ -1,12 +1,12 @@
 """Two models on the same sound that neither has learned from: which is better, and how surely."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.dataset import Dataset, Progress, Recording, clip_features, cut_recordings
+from hearthlog.analyzer.dataset import Dataset, Recording, cut_recordings
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.clips import check_classes
 from hearthlog.analyzer.evaluation.scores import (
@@ -16,12 +16,9 @@ from hearthlog.analyzer.evaluation.scores import (
     difference,
     score,
 )
-from hearthlog.analyzer.manifest import Clip
 from hearthlog.analyzer.scenario import Scenario
-from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import window_inputs
-from hearthlog.models.modelfile import Model
-from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.models.classifier import Classifier, classifier_kind
+from hearthlog.models.model import Model
 
 Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -99,70 +96,61 @@ def compare_models(
     """
     check_classes(a, scenario)
     check_classes(b, scenario)
-    data = cut_recordings(recordings, scenario)
+    first, second = Classifier(a), Classifier(b)
+    features = first.feature_set
+    if features != second.feature_set:
+        raise DataError(
+            f"{a.name} is for feature set {features.name}, {b.name} for {second.feature_set.name}: "
+            "they cannot be compared on the same features; evaluate each of them on clips"
+        )
+    data = cut_recordings(recordings, scenario, features)
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
         raise DataError(f"there is no segment to compare on ({reasons[:300] or 'no marks'})")
-    heard = [_learned_sources(model, data) for model in (a, b)]
-    learned = np.isin(data.group, np.concatenate(heard))
+    inputs = [one.inputs.of_windows(data.windows) for one in (first, second)]
+    sources = [_learned_sources(m, i, data) for m, i in zip((a, b), inputs, strict=True)]
+    learned = np.isin(data.group, np.concatenate(sources))
     kept = np.ones(len(data), bool) if learned.all() else ~learned
     target, group = data.target[kept], data.group[kept]
-    first, second = (_probabilities(model, data.windows[kept], data.classes) for model in (a, b))
+    probabilities = [
+        _probabilities(one, i[kept], data.classes)
+        for one, i in zip((first, second), inputs, strict=True)
+    ]
     judged = [
         Judged(
             name=model.name,
             sha256=model.sha256,
-            scores=score(target, found.argmax(axis=1), group, data.classes),
-            expected_calibration_error=calibration_error(found, target),
-            sources_learned=len(sources),
+            scores=score(target, p.argmax(axis=1), group, data.classes),
+            expected_calibration_error=calibration_error(p, target),
+            sources_learned=len(learned_from),
         )
-        for model, found, sources in zip((a, b), (first, second), heard, strict=True)
+        for model, p, learned_from in zip((a, b), probabilities, sources, strict=True)
     ]
     return Comparison(
         a=judged[0],
         b=judged[1],
-        difference=difference(target, first, second, group, data.classes),
+        difference=difference(target, probabilities[0], probabilities[1], group, data.classes),
         sources_left_out=0 if learned.all() else len(np.unique(data.group[learned])),
         held_out=not learned.all(),
         skipped=data.skipped,
     )
 
 
-def clip_recordings(
-    clips: Sequence[Clip], scenario: Scenario, progress: Progress
-) -> Iterator[Recording]:
-    """Listen to the clips of a scenario's labels; of others the label is all that is told.
-
-    Raises
-    ------
-    SourceError
-        If a clip cannot be read.
-    """
-    for number, clip in enumerate(clips):
-        progress(number, len(clips))
-        features = np.empty((0, len(FEATURE_NAMES)), np.float32)
-        if clip.label in scenario.class_of:
-            features = clip_features(clip)
-        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
-    progress(len(clips), len(clips))
+def _probabilities(classifier: Classifier, inputs: Float32, classes: Sequence[str]) -> Float32:
+    order = [classifier.classes.index(name) for name in classes]
+    return classifier.probabilities(inputs)[:, order]
 
 
-def _probabilities(model: Model, windows: Float32, classes: Sequence[str]) -> Float32:
-    found = Classifier(model).probabilities(window_inputs(model.description.inputs, windows))
-    return found[:, [model.classes.index(name) for name in classes]]
-
-
-def _learned_sources(model: Model, data: Dataset) -> NDArray[np.intp]:
+def _learned_sources(model: Model, inputs: Float32, data: Dataset) -> NDArray[np.intp]:
     """Return the groups that a model has learned from: of which it has kept a segment."""
-    inputs = window_inputs(model.description.inputs, data.windows)
+    kept_inputs = classifier_kind(model.description.kind).kept_inputs(model)
     learned = np.zeros(len(data), bool)
-    for found, kept in (
-        (inputs, model.support_vectors),
-        (inputs, model.home_vectors),
+    for rows, kept in (
+        *((inputs, kept) for kept in kept_inputs),
         (data.windows, model.training_windows),
     ):
         if len(kept):
-            learned |= np.isin(_as_bytes(found), _as_bytes(kept))
+            learned |= np.isin(_as_bytes(rows), _as_bytes(kept))
     learned &= (data.windows != data.windows[:, :1]).any(axis=(1, 2))  # digital silence is alike
     return np.unique(data.group[learned])
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.manifest import Clip
 from hearthlog.analyzer.scenario import Scenario
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.files import read_audio
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
-_FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
-_ENERGY = FEATURE_NAMES.index("energy")
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 _UNGATED = "silence"
@@ -37,7 +36,7 @@ class Recording(NamedTuple):
     ----------
     label, group, collection, licence : str
         As in a manifest: of one group, nothing is both learned from and tested on.
-    features : np.ndarray [shape=(n, 21)], float32
+    features : np.ndarray [shape=(n, d)], float32
         Of successive frames.
     weight : float
         How much a segment of it counts.
@@ -66,8 +65,8 @@ class Dataset:
 
     Attributes
     ----------
-    windows : np.ndarray [shape=(n, 20, 21)], float32
-        Features of a second each.
+    windows : np.ndarray [shape=(n, window_frames, d)], float32
+        Features.
     target : np.ndarray [shape=(n,)], intp
         Index into `classes`.
     group, collection : np.ndarray [shape=(n,)], intp
@@ -125,6 +124,7 @@ def build_dataset(
     scenario: Scenario,
     progress: Progress,
     home: Iterable[Recording] = (),
+    features: FeatureSet = DEFAULT,
 ) -> Dataset:
     """Cut the clips of a scenario's labels into segments, as `cut_recordings` does.
 
@@ -136,6 +136,8 @@ def build_dataset(
         Told how many clips of how many are done.
     home : iterable of Recording
         More to learn from.
+    features : FeatureSet
+        What is computed from the clips.
 
     Raises
     ------
@@ -144,7 +146,8 @@ def build_dataset(
     SourceError
         If a clip cannot be read.
     """
-    data = cut_recordings(chain(_heard(clips, scenario, progress), home), scenario)
+    recordings = chain(clip_recordings(clips, scenario, progress, features), home)
+    data = cut_recordings(recordings, scenario, features)
     for name, amount in data.amounts.items():
         if not amount.segments:
             labels = ", ".join(scenario.classes[name])
@@ -152,17 +155,33 @@ def build_dataset(
     return data
 
 
-def _heard(clips: Sequence[Clip], scenario: Scenario, progress: Progress) -> Iterable[Recording]:
-    known = scenario.class_of
+def clip_recordings(
+    clips: Sequence[Clip],
+    scenario: Scenario,
+    progress: Progress,
+    features: FeatureSet = DEFAULT,
+) -> Iterator[Recording]:
+    """Listen to the clips of a scenario's labels; of others the label is all that is told.
+
+    Raises
+    ------
+    SourceError
+        If a clip cannot be read.
+    """
+    class_of = scenario.class_of
     for number, clip in enumerate(clips):
         progress(number, len(clips))
-        features = clip_features(clip) if clip.label in known else np.empty((0, 0), np.float32)
-        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
+        values = np.empty((0, features.width), np.float32)
+        if clip.label in class_of:
+            values = clip_features(clip, features)
+        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, values)
     progress(len(clips), len(clips))
 
 
-def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Dataset:
-    """Cut recordings into segments of a second, half a second apart.
+def cut_recordings(
+    recordings: Iterable[Recording], scenario: Scenario, features: FeatureSet = DEFAULT
+) -> Dataset:
+    """Cut recordings into segments of a window, half a second apart.
 
     A segment is kept if it is no more than 12 dB below its recording's mean level and above
     -60 dBFS; of silence all are. At most 24 segments, times their weight, evenly spaced, are kept
@@ -175,17 +194,17 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
     used: Counter[tuple[str, str]] = Counter()
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    windows = [np.empty((0, WINDOW_FRAMES, len(FEATURE_NAMES)), np.float32)]
+    windows = [np.empty((0, features.window_frames, features.width), np.float32)]
     weights = [np.empty(0)]
     rows = [np.empty((0, 3), np.intp)]
     for item in recordings:
-        reason, found = _segments(item, class_of)
+        reason, found = _segments(item, class_of, features)
         if reason:
             skipped[reason] += 1
             continue
         name = class_of[item.label]
         used[item.collection, item.licence] += 1
-        seconds[name] = seconds.get(name, 0.0) + len(item.features) * _FRAME_SECONDS
+        seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
         windows.append(found)
         weights.append(np.full(len(found), item.weight))
         group = groups.setdefault(item.group, len(groups))
@@ -208,41 +227,45 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
     )
 
 
-def clip_features(clip: Clip) -> Float32:
-    """Compute the features of a clip, shape (n, 21).
+def clip_features(clip: Clip, features: FeatureSet) -> Float32:
+    """Compute the features of a clip, shape (n, d).
 
     Raises
     ------
     SourceError
         If it cannot be read.
     """
-    extract = FeatureExtractor()
-    features = [np.empty((0, len(FEATURE_NAMES)), np.float32)]
+    extract = features.extractor()
+    values = [np.empty((0, features.width), np.float32)]
     rest = np.empty(0, np.float32)
     for block in read_audio(clip.path):
         samples = np.concatenate([rest, block])
         whole = len(samples) // FRAME_SAMPLES * FRAME_SAMPLES
-        features.append(extract(samples[:whole].reshape(-1, FRAME_SAMPLES)))
+        values.append(extract(samples[:whole].reshape(-1, FRAME_SAMPLES)))
         rest = samples[whole:]
-    return np.concatenate(features)
+    return np.concatenate(values)
 
 
-def _segments(recording: Recording, class_of: Mapping[str, str]) -> tuple[str, Float32]:
-    """Return why there are no segments, or those that are loud enough, shape (n, 20, 21)."""
-    features = recording.features
-    nothing = np.empty((0, WINDOW_FRAMES, len(FEATURE_NAMES)), np.float32)
+def _segments(
+    recording: Recording, class_of: Mapping[str, str], features: FeatureSet
+) -> tuple[str, Float32]:
+    """Return why there are no segments, or those that are loud enough."""
+    values, window = recording.features, features.window_frames
+    nothing = np.empty((0, window, features.width), np.float32)
     if recording.label not in class_of:
         return f"label {recording.label} is not in the scenario", nothing
-    if len(features) < WINDOW_FRAMES:  # the recorder labels whole windows only
-        return "shorter than a second", nothing
-    every = np.lib.stride_tricks.sliding_window_view(features, WINDOW_FRAMES, axis=0)
+    if values.shape[1] != features.width:
+        return f"its features are not {features.name}", nothing
+    if len(values) < window:  # the recorder labels whole windows only
+        return f"shorter than {features.window_seconds:g} s", nothing
+    every = np.lib.stride_tricks.sliding_window_view(values, window, axis=0)
     windows = every[::HOP_FRAMES].transpose(0, 2, 1)
     if recording.label == _UNGATED:
         return "", windows
-    energy = windows[:, :, _ENERGY].mean(axis=1, dtype=np.float64)
-    level = features[:, _ENERGY].mean(dtype=np.float64)
-    found = windows[energy > max(_FLOOR, level * _BELOW_CLIP)]
-    return ("" if len(found) else "nowhere above -60 dBFS"), found
+    power = features.power(windows).mean(axis=1, dtype=np.float64)
+    level = features.power(values).mean(dtype=np.float64)
+    loud = windows[power > max(_FLOOR, level * _BELOW_CLIP)]
+    return ("" if len(loud) else "nowhere above -60 dBFS"), loud
 
 
 def _thinned(key: Indices, weight: NDArray[np.float64]) -> Indices:

@@ -19,16 +19,17 @@ from hearthlog.analyzer.heard import find_heard
 from hearthlog.analyzer.marks import Mark, write_marks
 from hearthlog.analyzer.selection import select
 from hearthlog.analyzer.splice import splice
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.description import CLASS_NAME
 from hearthlog.recorder.config import Microphone, load_settings
 from hearthlog.recorder.service import Source, record
 from hearthlog.recorder.sources.files import audio_seconds
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames
+from hearthlog.recorder.stream import Event, Frames
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import SUFFIX, log_path, new_file
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import time_span
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
@@ -187,7 +188,7 @@ def _enrol(
             "statistics_every": 1,
         }
         settings = load_settings(None, asked, microphone.model_dump())
-        logs = record(settings, _First(source, seconds), stop).logs
+        logs = record(settings, microphone, _First(source, seconds), stop).logs
         heard = {log: _frames([log], microphone.name) for log in logs}
         _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in heard.values())]))
         enrolled = []

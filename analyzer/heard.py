@@ -9,9 +9,9 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.known import is_of_type
 from hearthlog.analyzer.marks import ROUNDING
 from hearthlog.analyzer.selection import select
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import time_span
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic

@@ -7,9 +7,8 @@ from hmmlearn.base import BaseHMM
 from numpy.typing import NDArray
 
 from hearthlog.models.smoothing import Float32, Float64, States, log_likelihoods
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SECONDS
 
-FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not
 
 # How long a sound goes on, in seconds, by the classes of the built-in scenarios.

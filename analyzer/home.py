@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.dataset import Recording
+from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.marks import Mark, read_marks
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.columns import Columns, read_columns
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 
@@ -21,16 +23,18 @@ HOME = "this home"
 Int64 = NDArray[np.int64]
 
 
-def home_recordings(folder: Path) -> Iterator[Recording]:
+def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:
     """Read the features of everything that is marked in the logs of a folder.
 
-    A mark shorter than a second is taken with what is around it. All marks of a day are of one
+    A mark shorter than a window is taken with what is around it. All marks of a day are of one
     source.
 
     Parameters
     ----------
     folder : Path
         Of logs, with review layers beside them.
+    features : FeatureSet
+        Of other features a recording has none.
 
     Raises
     ------
@@ -46,7 +50,7 @@ def home_recordings(folder: Path) -> Iterator[Recording]:
         for mark in marks:
             heard = columns.get(topic(mark.microphone, "features"))
             if heard is not None and len(heard):
-                yield from _recordings(heard, mark)
+                yield from _recordings(heard, mark, features)
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
@@ -88,14 +92,18 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
     return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
-def _recordings(heard: Columns, mark: Mark) -> Iterator[Recording]:
+def _recordings(heard: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
     """Return what was heard during a mark; in pieces where there are gaps in it."""
+    window, values = features.window_frames, heard["values"]
+    names = names_of(heard.metadata, "values")
+    if names and tuple(names) != features.feature_names:
+        values = np.empty((len(values), 0), np.float32)
     stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)
     first, last = np.searchsorted(stamps, [mark.start, mark.end]).tolist()
-    missing = max(WINDOW_FRAMES - (last - first), 0)
+    missing = max(window - (last - first), 0)
     first = max(first - missing // 2, 0)
-    last = min(max(last + missing - missing // 2, first + WINDOW_FRAMES), len(stamps))
+    last = min(max(last + missing - missing // 2, first + window), len(stamps))
     day = np.datetime64(mark.start // NANOSECONDS, "s").astype("datetime64[D]")
     breaks = np.flatnonzero(np.diff(frames[first:last]) != 1) + 1
-    for piece in np.split(heard["values"][first:last], breaks):
+    for piece in np.split(values[first:last], breaks):
         yield Recording(mark.label, f"{HOME} {day}", HOME, "", piece, HOME_WEIGHT)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.textfile import csv_records, read_text
-from hearthlog.models.modelfile import TEXT
+from hearthlog.models.description import TEXT
 
 REQUIRED = ("path", "label", "source_group")
 OPTIONAL = ("source", "licence")

@@ -17,7 +17,7 @@ from hearthlog import __version__
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.known import decode_known, is_of_type
 from hearthlog.analyzer.selection import select
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.description import CLASS_NAME
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.models.modelfile import CLASS_NAME, MOST_CLASSES, TEXT
+from hearthlog.models.description import CLASS_NAME, MOST_CLASSES, TEXT
 
 _SIZE_LIMIT = 1 << 20
 

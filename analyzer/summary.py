@@ -17,6 +17,7 @@ from hearthlog.schemas.chunks import read_chunks
 from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import is_layer
+from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logfile import LogFile, Place
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.records import HEAD
@@ -36,7 +37,6 @@ _FIELDS = {
     messages.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     messages.DIAGNOSTICS: ("status",),
 }
-_FRAME_SECONDS = 0.05  # where a layer does not say it
 _BATCH = 2 << 20  # bytes, before compression, that are read at once
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
@@ -295,7 +295,7 @@ def _read_through(file: LogFile, summary: Summary) -> None:
             _note(summary, frames, columns)
     lengths = {stream["microphone"]: stream["frame_seconds"] for stream in summary.streams}
     for microphone, counts in frames.items():
-        length = lengths.get(microphone.partition("/")[0], _FRAME_SECONDS)
+        length = lengths.get(microphone.partition("/")[0], FRAME_SECONDS)
         seconds = {label: round(count * length, 3) for label, count in counts.items()}
         summary.label_seconds[microphone] = Counter(seconds)
 

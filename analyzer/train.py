@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
-from sklearn.pipeline import Pipeline
 
 from hearthlog.analyzer.dataset import Dataset, Progress
 from hearthlog.analyzer.errors import DataError
@@ -19,29 +18,27 @@ from hearthlog.analyzer.hmm import (
     expected_durations,
     transitions_from_sequences,
 )
-from hearthlog.analyzer.recipe import (
-    RECIPES,
+from hearthlog.analyzer.method import (
     Fold,
-    Recipe,
+    Method,
     cross_validate,
-    fit,
     inverse_temperature,
     prepare,
     softmax,
 )
+from hearthlog.analyzer.methods import DEFAULT, method_named
 from hearthlog.analyzer.scenario import Scenario
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.models.modelfile import (
+from hearthlog.models.description import (
+    FORMAT,
     Amount,
     ClassMetrics,
     Collection,
     Description,
     Metrics,
-    Model,
     Smoothing,
     TrainingData,
 )
-from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, NAME, SAMPLE_RATE
+from hearthlog.models.model import Model
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")
@@ -55,7 +52,7 @@ def train_model(
     data: Dataset,
     scenario: Scenario,
     progress: Progress,
-    recipe: Recipe = RECIPES["bands"],
+    method: Method = DEFAULT,
     smoothing: str = "hmm",
 ) -> Model:
     """Learn from segments; calibrate and measure on folds that never split a source group.
@@ -67,7 +64,7 @@ def train_model(
         The one the data was built for.
     progress : callable
         Told how many fits of how many are done.
-    recipe : Recipe
+    method : Method
     smoothing : str
         How labels become segments: see `hearthlog.models.modelfile.Smoothing`.
 
@@ -78,29 +75,30 @@ def train_model(
     """
     check_varied(data)
     folds = group_folds(data)
-    examples = prepare(recipe, data)
+    examples = prepare(method, data)
 
     def report(done: int, _total: int) -> None:
         progress(done, len(folds) + 1)
 
-    [decisions] = cross_validate([recipe], examples, len(data.classes), folds, report)
+    [decisions] = cross_validate([method], examples, len(data.classes), folds, report)
     inverse = inverse_temperature(decisions, data.target)
-    machine = fit(recipe, examples)
+    learned = method.fit(examples)
     progress(len(folds) + 1, len(folds) + 1)
-    hidden = smoothing == "hmm"
+    features, hidden = method.features, smoothing == "hmm"
     about = Description(
-        format=2,
-        kind="svm-rbf",
+        format=FORMAT,
+        kind=method.kind,
+        parameters=learned.parameters(),
+        method=method.name,
         classes=list(data.classes),
-        feature_set=NAME,
-        feature_names=list(FEATURE_NAMES),
-        inputs=recipe.inputs,
-        window_seconds=WINDOW_FRAMES * FRAME_SAMPLES / SAMPLE_RATE,
+        feature_set=features.name,
+        feature_set_version=features.version,
+        feature_names=list(features.feature_names),
+        inputs=method.inputs,
+        window_seconds=features.window_seconds,
         scenario_name=scenario.name,
         scenario={name: list(labels) for name, labels in scenario.classes.items()},
-        cost=recipe.cost,
-        gamma=recipe.gamma / examples.inputs.shape[2],
-        copies=recipe.copies,
+        copies=method.copies,
         calibration="temperature",
         inverse_temperature=inverse,
         smoothing=Smoothing(
@@ -108,10 +106,11 @@ def train_model(
         ),
         training_data=_training_data(data),
         metrics=_metrics(data, decisions, inverse, len(folds)),
-        versions={name: version(name) for name in ("hearthlog", "numpy", "scikit-learn")},
+        versions={name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
     )
-    return replace(
-        _model(about, machine),
+    return Model(
+        about,
+        learned.arrays(),
         transitions=default_transitions(data.classes) if hidden else np.empty((0, 0)),
         training_windows=data.windows,
         training_target=data.target.astype(np.int64),
@@ -141,7 +140,8 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[NDArray[np.int64
     Raises
     ------
     DataError
-        If the base model has not kept what it was learned from, or the home has no segments.
+        If the base model has not kept what it was learned from, the home has no segments, or the
+        way in which the base model was learned is not installed.
     """
     about = base.description
     if not len(base.training_windows):
@@ -158,15 +158,14 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[NDArray[np.int64
         group=np.concatenate([base.training_group, home.group]),
         weight=np.concatenate([np.ones(len(base.training_windows)), home.weight]),
     )
-    recipe = Recipe(about.inputs, about.cost, about.gamma * base.scaler_mean.size, about.copies)
-    examples = prepare(recipe, joined)
-    machine = fit(recipe, examples)
+    method = method_named(about.method).as_of(about)
+    examples = prepare(method, joined)
+    learned = method.fit(examples, home=np.arange(len(base.training_windows), len(joined)))
     found = {name: Amount(**asdict(amount)) for name, amount in home.amounts.items()}
     training = about.training_data.model_copy(update={"home": found, "base_sha256": base.sha256})
-    return replace(
-        _model(about.model_copy(update={"training_data": training}), machine),
-        home_vectors=examples.inputs[0, len(base.training_windows) :],
-        home_target=home.target.astype(np.int64),
+    return Model(
+        about.model_copy(update={"training_data": training}),
+        learned.arrays(),
         transitions=(
             transitions_from_sequences(sequences, expected_durations(base.classes))
             if len(base.transitions) and len(sequences)
@@ -215,24 +214,6 @@ def group_folds(data: Dataset) -> list[Fold]:
     raise DataError(
         f"class {data.classes[fewest]} has {sources[fewest]} source groups, shared with other "
         "classes: no division into folds leaves every class something to learn from; add sources"
-    )
-
-
-def _model(about: Description, machine: Pipeline) -> Model:
-    """Put a fitted machine into a model."""
-    scaler, svc = machine
-    # scikit-learn turns the sign of two classes round; in the file all pairs are alike.
-    sign = -1.0 if len(about.classes) == 2 else 1.0
-    # The file keeps support vectors as they were before scaling, in float32.
-    support = svc.support_vectors_ * scaler.scale_ + scaler.mean_
-    return Model(
-        about,
-        scaler_mean=scaler.mean_,
-        scaler_scale=scaler.scale_,
-        support_vectors=support.astype(np.float32),
-        support_counts=svc.n_support_.astype(np.int64),
-        dual_coefficients=sign * svc.dual_coef_,
-        intercepts=sign * svc.intercept_,
     )
 
 

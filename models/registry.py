@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile import SUFFIX, Model, load_model
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import SUFFIX, load_model
 from hearthlog.schemas.files import sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.modelfile import Smoothing
+from hearthlog.models.description import Smoothing
 from hearthlog.models.smoothing import FixedLagSmoother
 
 Float32 = NDArray[np.float32]

@@ -9,13 +9,12 @@ from pathlib import Path
 from hearthlog import __version__
 from hearthlog.recorder.clips import PRIVATE_LIMIT, Sound
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.recorder.retention import find_clips
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.recorder.zone import time_zone
 from hearthlog.schemas import messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import audio_path
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS, encode, message, time_message
 from hearthlog.schemas.topics import audio_topic
@@ -38,13 +37,17 @@ class ClipLog:
     Parameters
     ----------
     settings : Settings
+    microphone : str
+        Whose sound it is.
     file_at : callable
         Gives the log that has a time, and when that ends, in nanoseconds of UTC.
     """
 
-    def __init__(self, settings: Settings, file_at: Callable[[int], tuple[Path, int]]) -> None:
+    def __init__(
+        self, settings: Settings, microphone: str, file_at: Callable[[int], tuple[Path, int]]
+    ) -> None:
         self._settings = settings
-        self._topic = audio_topic(settings.microphone[0].name)
+        self._topic = audio_topic(microphone)
         self._file_at = file_at
         self._zone = time_zone(settings.timezone)
         self._log: Path | None = None

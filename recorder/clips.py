@@ -7,9 +7,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.recorder.features import FRAME_SAMPLES
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames
+from hearthlog.recorder.stream import Frames
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
 
 Keep = Literal["off", "events", "unsure", "always"]
@@ -57,8 +56,8 @@ class Sound(NamedTuple):
 class ClipFinder:
     """Holds sound back until it is known whether it may be kept, and is wanted.
 
-    A label speaks of the 20 frames that end with its own. A frame may be kept if all 20 windows
-    with it were labelled, and none of them is likely to be of a class that is never kept. Frames
+    A label speaks of the window that ends with its frame. A frame may be kept if all windows with
+    it were labelled, and none of them is likely to be of a class that is never kept. Frames
     next to a gap are not in so many windows, and are not kept.
 
     Parameters
@@ -70,14 +69,19 @@ class ClipFinder:
         Classes that are never kept.
     pre_roll_frames : int
         Kept before the sound that is wanted.
+    window_frames : int
+        Of which a label speaks.
     """
 
-    def __init__(self, keep: Keep, never: Sequence[str], pre_roll_frames: int) -> None:
+    def __init__(
+        self, keep: Keep, never: Sequence[str], pre_roll_frames: int, window_frames: int
+    ) -> None:
+        self._window = window_frames
         self._keep = keep
         self._never = tuple(never)
         # So much sound before a label's frame is wanted because of it.
-        self._before = 0 if keep == "always" else WINDOW_FRAMES - 1 + pre_roll_frames
-        self._ahead = max(self._before, WINDOW_FRAMES - 1)
+        self._before = 0 if keep == "always" else self._window - 1 + pre_roll_frames
+        self._ahead = max(self._before, self._window - 1)
         self._begin()
 
     def _begin(self) -> None:
@@ -140,8 +144,8 @@ class ClipFinder:
         """Decide on the first frames that are held."""
         if count <= 0:
             return []
-        private = self._private[_BEHIND_FRAMES:][: count + WINDOW_FRAMES - 1]
-        kept = sliding_window_view(private, WINDOW_FRAMES).max(axis=1) < PRIVATE_LIMIT
+        private = self._private[_BEHIND_FRAMES:][: count + self._window - 1]
+        kept = sliding_window_view(private, self._window).max(axis=1) < PRIVATE_LIMIT
         if self._keep != "always":
             around = self._wanted[: _BEHIND_FRAMES + count + self._before]
             kept &= sliding_window_view(around, _BEHIND_FRAMES + self._before + 1).any(axis=1)

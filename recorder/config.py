@@ -45,6 +45,7 @@ class Settings(BaseSettings):
     node: Annotated[str, _checked(check_node_name)] = "home"
     output: Path = Path("logs")
     model: Path | None = None
+    feature_set: str = ""  # empty: that of the model, or the default one
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds a file
     flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
     sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut

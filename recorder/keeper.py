@@ -7,8 +7,10 @@ from hearthlog.recorder.cliplog import ClipLog
 from hearthlog.recorder.clips import ClipFinder, Labelled
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.retention import Retention
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.recorder.stream import Event, Frames, Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
 
@@ -20,8 +22,8 @@ class ClipKeeper:
     Parameters
     ----------
     settings : Settings
-    classes : sequence of str or None
-        Of the model that speaks.
+    pipeline : Pipeline
+        Of the microphone whose sound it is.
     file_at : callable
         Gives the log that has a time, and when that ends, in nanoseconds of UTC.
 
@@ -34,16 +36,18 @@ class ClipKeeper:
     def __init__(
         self,
         settings: Settings,
-        classes: Sequence[str] | None,
+        pipeline: Pipeline,
         file_at: Callable[[int], tuple[Path, int]],
     ) -> None:
         self._keep = settings.keep_audio
         self._never = settings.never_keep
         self._retention = Retention(settings.output, settings.node, settings.clip_retention_days)
         frames = round(settings.clip_pre_roll_seconds * NANOSECONDS / FRAME_NANOSECONDS)
-        self._finder = ClipFinder(self._keep, self._never, frames)
-        self._log = ClipLog(settings, file_at)
-        self._classes = classes
+        self._finder = ClipFinder(
+            self._keep, self._never, frames, pipeline.feature_set.window_frames
+        )
+        self._log = ClipLog(settings, pipeline.microphone, file_at)
+        self._classes: Sequence[str] | None = pipeline.classes
         self._reason = self._refusal()
         if self._reason:
             raise ConfigurationError(self._reason)

@@ -27,15 +27,14 @@ class LogDescription:
 
     Attributes
     ----------
-    info : message
-        `AudioStreamInfo` without its stamp.
+    infos : sequence of messages
+        The `AudioStreamInfo` of each microphone, without its stamp.
     """
 
     root: Path
     node: str
-    microphone: str
     topics: Sequence[Topic]
-    info: Any
+    infos: Sequence[Any]
     metadata: Mapping[str, str]
     attachments: Sequence[Attachment]
 
@@ -176,8 +175,9 @@ class RollingLog:
         self._begun.append((stamp, path))
         self._last = stamp
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
-        about.info.header = header(stamp, about.microphone)
-        for record in opening(about.info):
-            self._append(record)
+        for info in about.infos:
+            info.header = header(stamp, info.header.frame_id)
+            for record in opening(info):
+                self._append(record)
         self._writer.flush()  # the file now says what it is, whatever happens next
         self._flush_at = None

@@ -10,7 +10,8 @@ from threading import Thread
 from typing import NamedTuple
 
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.modelfile import Model, load_model
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import load_model
 
 _LOOK_SECONDS = 1.0
 
@@ -100,6 +101,10 @@ class ModelWatch:
         except Exception as error:  # noqa: BLE001  whatever is wrong with a file: the sound goes on
             if _identity(self._path) == self._seen:  # else it is still being written
                 self._refuse(str(error) or repr(error))
+            return
+        if loaded.classifier.feature_set != self.first.classifier.feature_set:
+            theirs, ours = (one.classifier.feature_set.name for one in (loaded, self.first))
+            self._refuse(f"it is for feature set {theirs}, not {ours}; start the recorder anew")
             return
         model = loaded.model
         if (model.name, model.sha256) != (self._last.name, self._last.sha256):

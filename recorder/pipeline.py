@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import WINDOW_FRAMES, InputStream
-from hearthlog.models.modelfile import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.model import Model
 from hearthlog.models.segments import Segment, Segmenter
-from hearthlog.recorder import features, lines
+from hearthlog.recorder import lines
 from hearthlog.recorder.clips import Labelled
-from hearthlog.recorder.features import FeatureExtractor
 from hearthlog.recorder.statistics import RollingStatistics
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap, Health
+from hearthlog.recorder.stream import Event, Frames, Gap, Health
 from hearthlog.schemas import messages
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import duration_message, encode, header, message, nanoseconds
 from hearthlog.schemas.rows import Column, encode_rows
 from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT, topic
@@ -24,7 +24,6 @@ from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT, topic
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
-_FRAME_SECONDS = features.FRAME_SAMPLES / features.SAMPLE_RATE
 _ROW_TYPES = {
     "features": messages.FEATURES,
     "statistics": messages.STATISTICS,
@@ -40,17 +39,17 @@ class Record(NamedTuple):
     data: bytes
 
 
-def stream_info(microphone: str, device: str, model: Model | None) -> Any:
+def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
     """Make the `AudioStreamInfo` of a microphone; its stamp is still zero."""
     return message(
         messages.STREAM_INFO,
         header=header(0, microphone),
         device=device,
-        sample_rate=features.SAMPLE_RATE,
-        frame_seconds=_FRAME_SECONDS,
-        window_seconds=_FRAME_SECONDS * WINDOW_FRAMES,
-        feature_set=features.NAME,
-        feature_names=list(features.FEATURE_NAMES),
+        sample_rate=SAMPLE_RATE,
+        frame_seconds=FRAME_SECONDS,
+        window_seconds=features.window_seconds,
+        feature_set=features.name,
+        feature_names=list(features.feature_names),
         model="" if model is None else model.name,
         model_sha256="" if model is None else model.sha256,
         labels=[] if model is None else list(model.classes),
@@ -73,13 +72,17 @@ class Pipeline:
     ----------
     microphone : str
         Its name, which begins the topics and is the `frame_id` of every message.
+    features : FeatureSet
+        What is computed from each frame.
     classifier : Classifier or None
-        Without one there are no labels.
+        Of this feature set. Without one there are no labels.
     statistics_every : int
         Frames from one statistics message to the next.
 
     Attributes
     ----------
+    microphone : str
+    feature_set : FeatureSet
     settled : bool
         Whether sound before the first frame would have left no trace in the segments to come.
     labelled : Labelled or None
@@ -87,17 +90,27 @@ class Pipeline:
     """
 
     def __init__(
-        self, microphone: str, classifier: Classifier | None = None, statistics_every: int = 1
+        self,
+        microphone: str,
+        features: FeatureSet,
+        classifier: Classifier | None = None,
+        statistics_every: int = 1,
     ) -> None:
         self.microphone = microphone
+        self.feature_set = features
         self.settled = False
         self.labelled: Labelled | None = None
         self._use(classifier)
         self._statistics_every = statistics_every
-        self._features = FeatureExtractor()
-        self._statistics = RollingStatistics()
+        self._features = features.extractor()
+        self._statistics = RollingStatistics(features.window_frames)
         self._end = 0
         self._level = 0
+
+    @property
+    def classes(self) -> tuple[str, ...] | None:
+        """What the model that speaks tells apart."""
+        return None if self._classifier is None else self._classifier.classes
 
     def push(self, event: Event) -> list[Record]:
         """Turn what a source handed on into messages, in the order of their log times."""
@@ -112,7 +125,7 @@ class Pipeline:
 
         Parameters
         ----------
-        features : np.ndarray [shape=(n, 21)], float32
+        features : np.ndarray [shape=(n, d)], float32
         first : int
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
@@ -129,7 +142,7 @@ class Pipeline:
             ),
         ]
         if self._inputs is not None:
-            inputs = self._inputs(features)  # at the last frames: labels are of a whole second
+            inputs = self._inputs(features)  # at the last frames: labels are of a whole window
             heard = slice(len(frames) - len(inputs), None)
             records += self._labels(inputs, frames[heard], stamps[heard])
         records.sort(key=itemgetter(0))
@@ -144,6 +157,8 @@ class Pipeline:
         self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
     ) -> tuple[list[Record], list[Record]]:
         """Let another model speak from a frame on; features and statistics go on.
+
+        It must be for the same feature set.
 
         Parameters
         ----------
@@ -174,7 +189,7 @@ class Pipeline:
 
     def _use(self, classifier: Classifier | None) -> None:
         self._classifier = classifier
-        self._inputs = None if classifier is None else InputStream(classifier.inputs)
+        self._inputs = None if classifier is None else classifier.inputs.stream()
         self._segmenter = None if classifier is None else _segmenter(classifier)
 
     def _push_gap(self, gap: Gap) -> list[Record]:
@@ -288,4 +303,4 @@ class Pipeline:
 
 
 def _segmenter(classifier: Classifier) -> Segmenter:
-    return Segmenter(classifier.smoothing, classifier.transitions, _FRAME_SECONDS)
+    return Segmenter(classifier.smoothing, classifier.transitions, FRAME_SECONDS)

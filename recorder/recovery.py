@@ -11,13 +11,13 @@ from typing import BinaryIO
 import numpy as np
 from mcap.records import Message
 
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages, rosbag2
 from hearthlog.schemas.chunks import read_chunks
 from hearthlog.schemas.chunkwriter import ChunkWriter
 from hearthlog.schemas.damage import Damage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, is_layer, stem, sync_folder
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.intact import FoundAttachment, FoundChunk
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.salvage import Definition, Piece, Salvage

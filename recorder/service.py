@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
-from typing import Protocol
+from typing import Any, Protocol
 
 from hearthlog import __version__
-from hearthlog.models.modelfile import Model
-from hearthlog.recorder import features
-from hearthlog.recorder.config import Settings
+from hearthlog.models.card import model_attachments
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.models.model import Model
+from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.keeper import ClipKeeper, time_of
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.modelwatch import ModelWatch
@@ -20,7 +24,8 @@ from hearthlog.recorder.pipeline import Pipeline, Record, stream_info
 from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.recorder.stream import Event, Frames, Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import Attachment
 
@@ -42,20 +47,26 @@ class Recording:
     """
 
     logs: list[Path]
-    recovered: Sequence[Recovered]
+    recovered: Sequence[Recovered] = ()
     frames_lost: int = 0
     gaps: int = 0
     models_refused: int = 0
 
 
 def record_files(
-    settings: Settings, source: FileSource, stop: Flag, asked: SimpleQueue[None] | None = None
+    settings: Settings,
+    microphone: Microphone,
+    source: FileSource,
+    stop: Flag,
+    asked: SimpleQueue[None] | None = None,
 ) -> Recording:
     """Record audio files as if a microphone had heard them.
 
     Parameters
     ----------
     settings : Settings
+    microphone : Microphone
+        The one that they stand in for.
     source : FileSource
     stop : threading.Event
         Once set, the log is completed.
@@ -68,17 +79,22 @@ def record_files(
         If one of them turns out to be damaged.
     ModelError
         If the model cannot be used.
+    ConfigurationError
+        If the model is for another feature set than the configured one, or sound is to be kept
+        and the model cannot tell what must not be.
     LogError
         If the log cannot be written; what was written stays, for the next start to complete.
     """
     recovered = recover_active(settings.output, settings.node)
-    return record(settings, source, stop, recovered, asked)
+    recording = record(settings, microphone, source, stop, asked)
+    recording.recovered = recovered
+    return recording
 
 
 def record_microphone(
-    settings: Settings, stop: Flag, asked: SimpleQueue[None] | None = None
+    settings: Settings, microphone: Microphone, stop: Flag, asked: SimpleQueue[None] | None = None
 ) -> Recording:
-    """Record the microphone until `stop` is set, whatever happens to it.
+    """Record a microphone until `stop` is set, whatever happens to it.
 
     Parameters are those of `record_files`.
 
@@ -86,15 +102,17 @@ def record_microphone(
     ------
     SourceError
         If it cannot be heard at the start.
-    ModelError, LogError
+    ModelError, ConfigurationError, LogError
         As `record_files`.
     """
-    source = MicrophoneSource(settings.microphone[0].device)
+    source = MicrophoneSource(microphone.device)
     with closing(source):  # it hears, and its pipe holds, while older logs are completed
         recovered = recover_active(settings.output, settings.node)
         end = max((log.end for log in recovered), default=0)
         heard = _AfterKill(source, end) if end else source
-        return record(settings, heard, stop, recovered, asked)
+        recording = record(settings, microphone, heard, stop, asked)
+    recording.recovered = recovered
+    return recording
 
 
 class _AfterKill:
@@ -117,35 +135,32 @@ class _AfterKill:
 
 def record(
     settings: Settings,
+    microphone: Microphone,
     source: Source,
     stop: Flag,
-    recovered: Sequence[Recovered] = (),
     asked: SimpleQueue[None] | None = None,
 ) -> Recording:
     """Record a source until it ends or `stop` is set; raises as `record_files`."""
-
-    def describe(model: Model | None) -> LogDescription:
-        return _describe(settings, source, model)
-
     with ExitStack() as stack:
         watch = None
         if settings.model is not None:
             watch = stack.enter_context(closing(ModelWatch(settings.model, asked or SimpleQueue())))
-        first = None if watch is None else watch.first
-        pipeline = Pipeline(
-            settings.microphone[0].name,
-            None if first is None else first.classifier,
-            settings.statistics_every,
-        )
+        model, classifier = (None, None) if watch is None else watch.first
+        features = _features(settings, classifier)
+        pipeline = Pipeline(microphone.name, features, classifier, settings.statistics_every)
+
+        def describe(model: Model | None) -> LogDescription:
+            info = stream_info(microphone.name, source.device, features, model)
+            return describe_log(settings, info, features, model)
+
         log = RollingLog(
-            describe(None if first is None else first.model),
+            describe(model),
             settings.max_bag_duration,
             settings.flush_seconds,
             settings.sync_seconds,
         )
-        classes = None if first is None else first.classifier.classes
-        clips = ClipKeeper(settings, classes, log.file_at)
-        recording = Recording(log.finished, recovered)
+        clips = ClipKeeper(settings, pipeline, log.file_at)
+        recording = Recording(log.finished)
         now = 0
         try:
             for event in source.events(stop):
@@ -194,29 +209,40 @@ def _attend(
     return len(refused)
 
 
-def _describe(settings: Settings, source: Source, model: Model | None) -> LogDescription:
-    microphone = settings.microphone[0].name
+def _features(settings: Settings, classifier: Classifier | None) -> FeatureSet:
+    """Return the feature set to compute: the one that is asked for, which must be the model's."""
+    if classifier is None:
+        return feature_set(settings.feature_set or DEFAULT.name)
+    name = classifier.feature_set.name
+    if settings.feature_set not in {"", name}:
+        raise ConfigurationError(
+            f"the model is for feature set {name}, not {settings.feature_set!r} as feature_set "
+            "says; leave that out, or take another model"
+        )
+    return classifier.feature_set
+
+
+def describe_log(
+    settings: Settings, info: Any, features: FeatureSet, model: Model | None
+) -> LogDescription:
+    """Say what every file of a recording says of itself; `info` is its `AudioStreamInfo`."""
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
-    attachments = [Attachment("configuration.json", "application/json", configuration)]
-    if model is not None:
-        attachments.append(Attachment("model_card.md", "text/markdown", model.card().encode()))
     classes = None if model is None else list(model.classes)
-    info = stream_info(microphone, source.device, model)
-    metadata = {
-        "version": __version__,
-        "node": settings.node,
-        "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
-        "feature_set": features.NAME,
-        "model": info.model,
-        "model_sha256": info.model_sha256,
-        "timezone": settings.timezone,
-    }
+    attachments = [Attachment("configuration.json", "application/json", configuration)]
     return LogDescription(
         root=settings.output,
         node=settings.node,
-        microphone=microphone,
-        topics=topics_of(microphone, features.FEATURE_NAMES, classes),
-        info=info,
-        metadata=metadata,
-        attachments=attachments,
+        topics=topics_of(info.header.frame_id, features.feature_names, classes),
+        infos=[info],
+        metadata={
+            "version": __version__,
+            "node": settings.node,
+            "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
+            "feature_set": features.name,
+            "feature_set_version": str(features.version),
+            "model": info.model,
+            "model_sha256": info.model_sha256,
+            "timezone": settings.timezone,
+        },
+        attachments=attachments if model is None else [*attachments, *model_attachments(model)],
     )

@@ -1,9 +1,9 @@
-"""Mean and standard deviation of the features over the last second, at every frame."""
+"""Mean and standard deviation of the features over the last window, at every frame."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.inputs import WINDOW_FRAMES, mean_and_std, successive
+from hearthlog.models.features.window_inputs import mean_and_std, successive
 
 _FRAMES_AT_ONCE = 256
 
@@ -11,12 +11,17 @@ Float32 = NDArray[np.float32]
 
 
 class RollingStatistics:
-    """Statistics of one stream of frames over its last 20 frames.
+    """Statistics of one stream of frames over its last frames.
 
     Every window is summed anew from its own frames: running sums would drift over months.
+
+    Parameters
+    ----------
+    window_frames : int
     """
 
-    def __init__(self) -> None:
+    def __init__(self, window_frames: int) -> None:
+        self._window = window_frames
         self._recent: Float32 | None = None
 
     @property
@@ -38,7 +43,7 @@ class RollingStatistics:
         Returns
         -------
         mean, std : np.ndarray [shape=(n, d)], float32
-            Over the last 20 frames, or over those heard since the start or the last restart if
+            Over the last window, or over those heard since the start or the last restart if
             they are fewer; the standard deviation divides by their number.
         """
         mean = np.empty_like(features)
@@ -51,10 +56,10 @@ class RollingStatistics:
     def _compute(self, features: Float32, mean: Float32, std: Float32) -> None:
         recent = features[:0] if self._recent is None else self._recent
         heard = np.concatenate([recent, features])
-        filling = min(max(WINDOW_FRAMES - 1 - len(recent), 0), len(features))
+        filling = min(max(self._window - 1 - len(recent), 0), len(features))
         for i in range(filling):
             frames = [*heard[: len(recent) + i + 1, np.newaxis]]
             mean[i : i + 1], std[i : i + 1] = mean_and_std(frames)
         if filling < len(features):
-            mean[filling:], std[filling:] = mean_and_std(successive(heard, WINDOW_FRAMES))
-        self._recent = heard[max(len(heard) - WINDOW_FRAMES + 1, 0) :].copy()
+            mean[filling:], std[filling:] = mean_and_std(successive(heard, self._window))
+        self._recent = heard[max(len(heard) - self._window + 1, 0) :].copy()

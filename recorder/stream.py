@@ -6,11 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.messages import NANOSECONDS
-
-FRAME_NANOSECONDS = NANOSECONDS * FRAME_SAMPLES // SAMPLE_RATE
-
 
 @dataclass(frozen=True)
 class Frames:

@@ -1,9 +1,12 @@
 """Segments of made-up features, to train on in no time."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from hearthlog.analyzer.dataset import Dataset
 from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.model import Model
 
 SOURCES = 6
 
@@ -32,6 +35,11 @@ def blobs(classes: int, count: int, *, spread: float = 1.5) -> tuple[Dataset, Sc
         skipped={},
     )
     return data, Scenario("blobs", {name: (name,) for name in names})
+
+
+def with_arrays(model: Model, **arrays: np.ndarray) -> Model:
+    """Return a model with other arrays of its classifier."""
+    return replace(model, arrays={**model.arrays, **arrays})
 
 
 def ignore_progress(_done: int, _total: int) -> None:

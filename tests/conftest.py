@@ -19,9 +19,10 @@ from hearthlog.analyzer.hmm import LAG_SECONDS, default_transitions
 from hearthlog.analyzer.manifest import read_manifest
 from hearthlog.analyzer.scenario import load_scenario
 from hearthlog.analyzer.train import train_model
-from hearthlog.models.modelfile import Smoothing, load_model, save_model
-from hearthlog.recorder.features import FRAME_SAMPLES
+from hearthlog.models.description import Smoothing
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.sources.files import read_audio
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
@@ -72,12 +73,17 @@ def hearthlog():
 
 
 @pytest.fixture(scope="session")
-def model_file(tmp_path_factory) -> Path:
+def training_set(tmp_path_factory) -> Path:
+    """Simulated sounds of all labels, five clips each."""
+    return write_training_set(tmp_path_factory.mktemp("clips"), clips_per_class=5, seed=11)
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory, training_set) -> Path:
     """A model of the general scenario, trained on simulated sounds, that merges labels."""
     folder = tmp_path_factory.mktemp("model")
     scenario = load_scenario("general")
-    manifest = write_training_set(folder / "clips", clips_per_class=5, seed=11)
-    data = build_dataset(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
+    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, lambda *_: None)
     path = folder / "simulated.safetensors"
     save_model(train_model(data, scenario, lambda *_: None, smoothing="merge"), path)
     return path

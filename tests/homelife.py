@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas import messages
 from hearthlog.schemas.content import Attachment, Rows
 from hearthlog.schemas.files import log_path

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.models.inputs import input_width
-from hearthlog.models.modelfile import Model, Smoothing, load_model, save_model
+from hearthlog.models.description import Smoothing
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import load_model, save_model
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:
@@ -14,10 +16,12 @@ def keep_models(folder: Path, model_file: Path) -> Path:
     folder.mkdir()
     one = load_model(model_file)
     rng = np.random.default_rng(3)
+    intercepts = one.arrays["intercepts"]
+    moved = intercepts + rng.standard_normal(intercepts.shape)
     two = replace(
         one,
         description=one.description.model_copy(update={"smoothing": Smoothing(method="merge")}),
-        intercepts=one.intercepts + rng.standard_normal(one.intercepts.shape),
+        arrays={**one.arrays, "intercepts": moved},
         transitions=np.empty((0, 0)),
     )
     save_model(one, folder / "one.safetensors")
@@ -37,19 +41,20 @@ def put_by_hand(folder: Path, name: str) -> None:
 def _of_bands(model: Model) -> Model:
     """Make a model that looks at the same sounds in another way, and smooths what it sees."""
     rng = np.random.default_rng(4)
-    width, classes = input_width("bands"), len(model.classes)
+    count = len(model.arrays["support_vectors"])
+    width, classes = DEFAULT.inputs["bands"].width, len(model.classes)
     description = model.description.model_copy(
         update={
             "inputs": "bands",
-            "gamma": 0.5 / width,
+            "parameters": model.description.parameters | {"gamma": 0.5 / width},
             "smoothing": Smoothing(method="hmm", lag_seconds=0.7),
         }
     )
-    return replace(
-        model,
-        description=description,
-        scaler_mean=rng.standard_normal(width),
-        scaler_scale=rng.uniform(10.0, 20.0, width),
-        support_vectors=rng.normal(0, 15, (len(model.support_vectors), width)).astype(np.float32),
-        transitions=np.full((classes, classes), 0.02 / classes) + 0.98 * np.eye(classes),
-    )
+    arrays = {
+        **model.arrays,
+        "scaler_mean": rng.standard_normal(width),
+        "scaler_scale": rng.uniform(10.0, 20.0, width),
+        "support_vectors": rng.normal(0, 15, (count, width)).astype(np.float32),
+    }
+    transitions = np.full((classes, classes), 0.02 / classes) + 0.98 * np.eye(classes)
+    return replace(model, description=description, arrays=arrays, transitions=transitions)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.messages import nanoseconds
 from hearthlog.schemas.reader import LogReader

@@ -5,7 +5,8 @@ from dataclasses import replace
 from threading import Event as Flag
 
 from hearthlog.recorder.service import Source
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.recorder.stream import Event, Frames, Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
 class LossySource:

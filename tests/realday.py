@@ -11,15 +11,15 @@ from lossy import LossySource
 
 from hearthlog.analyzer.dataset import build_dataset
 from hearthlog.analyzer.manifest import Clip, read_manifest
-from hearthlog.analyzer.recipe import RECIPES
 from hearthlog.analyzer.scenario import Scenario
+from hearthlog.analyzer.svm_method import PAPER
 from hearthlog.analyzer.train import train_model
 from hearthlog.models.modelfile import save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import SAMPLE_RATE
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas.frames import SAMPLE_RATE
 
 ZONE = "Europe/Vienna"
 START = 1_772_319_600_000_000_000  # the midnight there at which 2026-03-01 begins
@@ -89,7 +89,7 @@ def write_real_day(household: Path, folder: Path) -> Path:
     learnt = [clip for name in CLASSES for clip in _spread(clips[name], _CLIPS)]
     data = build_dataset(learnt, scenario, lambda *_: None)
     model = folder / "home.safetensors"
-    save_model(train_model(data, scenario, lambda *_: None, RECIPES["paper"]), model)
+    save_model(train_model(data, scenario, lambda *_: None, PAPER), model)
     pieces = {name: _write_piece(folder / f"{name}.wav", clips[name]) for name in CLASSES}
     halves = [
         (folder, model, [pieces[name] for name in names], half)
@@ -118,7 +118,12 @@ def _record(folder: Path, model: Path, paths: list[Path], half: int) -> None:
         sync_seconds=3600.0,
     )
     source = FileSource(paths, START + half * 12 * HOUR)
-    record(settings, LossySource(source, {_LOST: _LOST_FRAMES} if half else {}), Flag())
+    record(
+        settings,
+        settings.microphone[0],
+        LossySource(source, {_LOST: _LOST_FRAMES} if half else {}),
+        Flag(),
+    )
 
 
 def _write_piece(path: Path, clips: list[Clip]) -> Path:

@@ -9,31 +9,27 @@ import soundfile
 from blobs import blobs, ignore_progress
 
 from hearthlog.analyzer.adaptation import CORRECTED, adaptation_curve
-from hearthlog.analyzer.augment import augmented
 from hearthlog.analyzer.dataset import Recording, cut_recordings
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.folds import KINDS, evaluate_recipe
+from hearthlog.analyzer.evaluation.folds import KINDS, evaluate_method
 from hearthlog.analyzer.home import home_recordings, home_sequences
 from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.recipe import (
-    RECIPES,
-    decide_with_home,
-    fit,
-    inverse_temperature,
-    prepare,
-    softmax,
-)
+from hearthlog.analyzer.method import inverse_temperature, prepare, softmax
 from hearthlog.analyzer.scenario import Scenario
+from hearthlog.analyzer.svm_method import BANDS
 from hearthlog.analyzer.train import adapt_model, train_model
-from hearthlog.models.classifier import HOME_VOTE, Classifier, home_votes
-from hearthlog.models.inputs import bands_of, window_inputs
+from hearthlog.models.card import model_card
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.features.auros21.augmentation import augmented
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.auros21.inputs import bands_of
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.models.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.files import find_logs
 
 RATE = 16_000
-BANDS = RECIPES["bands"]
 
 
 def split(data, kept):
@@ -64,8 +60,9 @@ def world():
 
 
 def accuracy(model, data):
-    inputs = window_inputs(model.description.inputs, data.windows)
-    return (Classifier(model).probabilities(inputs).argmax(axis=1) == data.target).mean()
+    classifier = Classifier(model)
+    inputs = classifier.inputs.of_windows(data.windows)
+    return (classifier.probabilities(inputs).argmax(axis=1) == data.target).mean()
 
 
 def test_a_model_that_was_adapted_knows_the_home_better(world):
@@ -75,7 +72,7 @@ def test_a_model_that_was_adapted_knows_the_home_better(world):
     about = adapted.description.training_data
     assert about.base_sha256 == base.sha256
     assert sum(amount.segments for amount in about.home.values()) == len(few)
-    assert "Adapted to a home" in adapted.card()
+    assert "Adapted to a home" in model_card(adapted)
 
 
 def test_adapting_to_the_same_home_gives_the_same_file(world, tmp_path):
@@ -90,15 +87,15 @@ def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world)
     base, few, _ = world
     once = adapt_model(base, few)
     twice = adapt_model(once, few)
-    np.testing.assert_array_equal(once.support_vectors, twice.support_vectors)
-    np.testing.assert_array_equal(once.dual_coefficients, twice.dual_coefficients)
+    for name, array in once.arrays.items():
+        np.testing.assert_array_equal(array, twice.arrays[name])
 
 
 def test_a_class_the_home_has_not_is_not_forgotten(world):
     base, few, _ = world
     three = rows(few, few.target != 2)
     windows = base.training_windows[base.training_target == 2]
-    inputs = window_inputs("bands", windows)
+    inputs = DEFAULT.inputs["bands"].of_windows(windows)
     predicted = Classifier(adapt_model(base, three)).probabilities(inputs).argmax(axis=1)
     assert (predicted == 2).mean() > 0.9
 
@@ -125,9 +122,10 @@ def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
         target=np.concatenate([base.training_target, few.target]),
         weight=np.concatenate([np.ones(len(base.training_target)), few.weight]),
     )
-    machine = fit(BANDS, prepare(BANDS, joined))
-    inputs, home = (window_inputs("bands", data.windows) for data in (rest, few))
-    decision = decide_with_home(machine, inputs, 4, home, few.target)
+    home = np.arange(len(joined) - len(few), len(joined))
+    learned = BANDS.fit(prepare(BANDS, joined), home=home)
+    inputs = DEFAULT.inputs["bands"].of_windows(rest.windows)
+    decision = learned.decide(inputs, 4)
     expected = softmax(base.description.inverse_temperature * decision)
     ours = Classifier(adapted).probabilities(inputs)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
@@ -223,7 +221,10 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     assert about["silence"]["seconds"] == pytest.approx(4.0, abs=0.1)
     adapted = load_model(output)
     assert adapted.classes == load_model(model_file).classes
-    assert len(adapted.home_vectors) == about["speech"]["segments"] + about["silence"]["segments"]
+    assert (
+        len(adapted.arrays["home_vectors"])
+        == about["speech"]["segments"] + about["silence"]["segments"]
+    )
 
 
 def test_augmented_sound_is_what_the_other_microphone_would_give():
@@ -254,7 +255,7 @@ def test_folds_by_segment_flatter_and_all_kinds_are_scored(kind):
     collections = dataclasses.replace(
         data, collection=data.group % 3, collection_names=("a", "b", "c")
     )
-    found = evaluate_recipe(collections, BANDS, kind, ignore_progress)
+    found = evaluate_method(collections, BANDS, kind, ignore_progress)
     assert found.folds == {"segment": 5, "source": 5, "collection": 3}[kind]
     assert found.scores.segments == 180
     assert 0.2 < found.scores.macro_f1 <= 1.0
@@ -263,7 +264,7 @@ def test_folds_by_segment_flatter_and_all_kinds_are_scored(kind):
 def test_one_collection_cannot_be_left_out():
     data, _ = blobs(3, 30)
     with pytest.raises(DataError, match="all recordings are of one collection"):
-        evaluate_recipe(data, BANDS, "collection", ignore_progress)
+        evaluate_method(data, BANDS, "collection", ignore_progress)
 
 
 def test_the_curve_of_adaptation_rises_where_homes_differ():
@@ -273,7 +274,7 @@ def test_the_curve_of_adaptation_rises_where_homes_differ():
     data = dataclasses.replace(
         data, windows=far, group=group, collection=group % 2, collection_names=("a", "b")
     )
-    curve = adaptation_curve(data, BANDS._replace(copies=0), ignore_progress)
+    curve = adaptation_curve(data, dataclasses.replace(BANDS, copies=0), ignore_progress)
     assert curve.corrected == CORRECTED
     assert set(curve.collections) == {"a", "b"}
     assert curve.mean[-1] > curve.mean[0]

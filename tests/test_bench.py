@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench import features, reading, timing, writing
 from hearthlog.tools.bench.labmic import make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target

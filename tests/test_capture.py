@@ -10,7 +10,8 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features, read
 
-from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.messages import nanoseconds
 
 RATE = 16_000

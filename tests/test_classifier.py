@@ -1,9 +1,8 @@
-import dataclasses
 from functools import cache
 
 import numpy as np
 import pytest
-from blobs import blobs, ignore_progress
+from blobs import blobs, ignore_progress, with_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics.pairwise import rbf_kernel
@@ -12,21 +11,23 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from hearthlog.analyzer.recipe import RECIPES, decide, softmax
+from hearthlog.analyzer.method import softmax
+from hearthlog.analyzer.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.train import train_model
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import window_inputs
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.svm_rbf import SVM_RBF
 
 ROWS = 600
 
 
 @cache
 def trained(classes, count=60, spread=1.5):
-    return train_model(*blobs(classes, count, spread=spread), ignore_progress, RECIPES["paper"])
+    return train_model(*blobs(classes, count, spread=spread), ignore_progress, PAPER)
 
 
 def statistics(data):
-    return window_inputs("statistics", data.windows)
+    return DEFAULT.inputs["statistics"].of_windows(data.windows)
 
 
 @cache
@@ -44,15 +45,16 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     data, _ = blobs(classes, count, spread=spread)
     model = trained(classes, count, spread)
     machine = SVC(
-        C=model.description.cost,
-        gamma=model.description.gamma,
+        C=model.description.parameters["cost"],
+        gamma=model.description.parameters["gamma"],
         class_weight="balanced",
         decision_function_shape="ovo",
     )
     fitted = make_pipeline(StandardScaler(), machine).fit(
         statistics(data).astype(np.float64), data.target
     )
-    decision = decide(fitted, unseen(classes), classes)
+    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp))
+    decision = learned.decide(unseen(classes), classes)
     expected = softmax(model.description.inverse_temperature * decision)
 
     ours = Classifier(model).probabilities(unseen(classes))
@@ -63,11 +65,10 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     assert len(np.unique(ours.argmax(axis=1))) == classes
 
 
-def judged(classifier, rows):
+def judged(model, rows):
     """Probabilities, and before their rounding to float32 the decisions behind them."""
-    return np.concatenate(
-        [classifier.probabilities(rows), classifier._pairs(classifier._extended(rows))[0]], axis=1
-    )
+    decisions, _ = SVM_RBF.machine(model).decide(rows)
+    return np.concatenate([Classifier(model).probabilities(rows), decisions], axis=1)
 
 
 @settings(deadline=None)
@@ -76,21 +77,20 @@ def judged(classifier, rows):
     cuts=st.sets(st.integers(1, ROWS - 1), max_size=40),
 )
 def test_a_row_is_judged_the_same_in_any_company(classes, cuts):
-    classifier = Classifier(trained(classes))
-    whole = judged(classifier, unseen(classes))
+    model = trained(classes)
+    whole = judged(model, unseen(classes))
     parts = np.split(unseen(classes), sorted(cuts))
-    assert np.array_equal(np.concatenate([judged(classifier, p) for p in parts]), whole)
+    assert np.array_equal(np.concatenate([judged(model, p) for p in parts]), whole)
 
 
 @pytest.mark.parametrize("classes", [2, 3])
 def test_the_number_of_blas_threads_changes_nothing(classes):
     model = trained(classes, 300, spread=9.0)
-    assert model.support_counts.max() > 256  # more than are multiplied at once
-    classifier = Classifier(model)
+    assert model.arrays["support_counts"].max() > 256  # more than are multiplied at once
     results = []
     for threads in (1, 2):
         with threadpool_limits(threads, user_api="blas"):
-            results.append(judged(classifier, unseen(classes)))
+            results.append(judged(model, unseen(classes)))
     assert np.array_equal(*results)
 
 
@@ -101,8 +101,8 @@ def test_every_row_sums_to_one_however_far_from_what_was_learned():
 
 
 def test_support_vectors_beyond_all_precision_still_give_probabilities():
-    far = trained(3).support_vectors * np.float32(1e20)
-    result = Classifier(dataclasses.replace(trained(3), support_vectors=far)).probabilities(far)
+    far = trained(3).arrays["support_vectors"] * np.float32(1e20)
+    result = Classifier(with_arrays(trained(3), support_vectors=far)).probabilities(far)
     np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=1e-6)
 
 
@@ -112,10 +112,10 @@ def test_no_rows_give_no_probabilities():
 
 def test_a_class_without_support_vectors_is_no_obstacle():
     model = trained(3)
-    counts = model.support_counts.copy()
+    counts = model.arrays["support_counts"].copy()
     counts[1] += counts[0]
     counts[0] = 0
-    result = Classifier(dataclasses.replace(model, support_counts=counts)).probabilities(unseen(3))
+    result = Classifier(with_arrays(model, support_counts=counts)).probabilities(unseen(3))
     assert np.isfinite(result).all()
 
 
@@ -123,10 +123,10 @@ def test_novelty_is_what_the_nearest_support_vector_leaves():
     model, rows = trained(3), unseen(3)
     about = model.description
     here, there = (
-        (x.astype(np.float64) - model.scaler_mean) / model.scaler_scale
-        for x in (rows, model.support_vectors)
+        (x.astype(np.float64) - model.arrays["scaler_mean"]) / model.arrays["scaler_scale"]
+        for x in (rows, model.arrays["support_vectors"])
     )
-    nearest = rbf_kernel(here, there, gamma=about.gamma).max(axis=1)
+    nearest = rbf_kernel(here, there, gamma=about.parameters["gamma"]).max(axis=1)
 
     probabilities, novelty = Classifier(model).classify(rows)
 
@@ -136,7 +136,7 @@ def test_novelty_is_what_the_nearest_support_vector_leaves():
 
 def test_what_was_learned_is_not_novel_and_what_is_far_from_it_is():
     model = trained(3)
-    _, of_learned = Classifier(model).classify(model.support_vectors)
-    _, of_far = Classifier(model).classify(model.support_vectors * 100)
+    _, of_learned = Classifier(model).classify(model.arrays["support_vectors"])
+    _, of_far = Classifier(model).classify(model.arrays["support_vectors"] * 100)
     assert of_learned.max() < 1e-6
     assert of_far.min() > 0.99

@@ -26,19 +26,20 @@ from hearthlog.analyzer.dataset import build_dataset
 from hearthlog.analyzer.manifest import read_manifest
 from hearthlog.analyzer.scenario import load_scenario
 from hearthlog.analyzer.train import train_model
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.models.modelfile import Description, load_model, save_model
+from hearthlog.models.description import Description
+from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.cliplog import ClipLog
 from hearthlog.recorder.clips import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
-from hearthlog.recorder.config import Settings, load_settings
+from hearthlog.recorder.config import Microphone, Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.features import FRAME_SAMPLES
 from hearthlog.recorder.retention import Retention
 from hearthlog.recorder.service import record, record_files
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.files import audio_path, find_logs, is_layer
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import nanoseconds
 from hearthlog.schemas.reader import LogReader
 
@@ -100,7 +101,7 @@ sparse = st.builds(
 )
 @settings(max_examples=300, deadline=None)
 def test_no_frame_is_kept_that_any_window_hears_as_private(runs, keep, pre_roll, blocks):
-    finder = ClipFinder(keep, ["speech"], pre_roll)
+    finder = ClipFinder(keep, ["speech"], pre_roll, 20)
     kept, allowed = [], []
     first = 0
     for run in runs:
@@ -120,7 +121,7 @@ def test_no_frame_is_kept_that_any_window_hears_as_private(runs, keep, pre_roll,
 
 
 def test_frames_before_lost_ones_are_not_of_the_windows_behind():
-    finder = ClipFinder("always", ["speech"], 0)
+    finder = ClipFinder("always", ["speech"], 0, 20)
     kept = push(finder, 0, [0.0] * 60, 19)
     kept += push(finder, 61, [0.0] * 60)
     assert kept == [*range(19, 41), *range(61, 102)]
@@ -128,7 +129,7 @@ def test_frames_before_lost_ones_are_not_of_the_windows_behind():
 
 def test_with_nothing_private_every_frame_is_kept_with_or_without_labels():
     for unlabelled in (0, 19, 100):
-        finder = ClipFinder("always", [], 0)
+        finder = ClipFinder("always", [], 0, 20)
         kept = push(finder, 0, [0.9] * 100, unlabelled)
         assert kept + numbers_of(finder.close()) == list(range(100))
 
@@ -151,7 +152,7 @@ def kept_of(finder, probabilities, novelty):
 
 
 def test_events_are_kept_with_the_second_that_was_labelled_what_is_before_and_what_is_behind():
-    finder = ClipFinder("events", ["speech"], 30)
+    finder = ClipFinder("events", ["speech"], 30, 20)
     kept = kept_of(finder, loud(300, 150, 160), np.zeros(300, np.float32))
     assert kept == list(range(150 - 19 - 30, 160 + 20))
 
@@ -163,7 +164,7 @@ def test_what_the_model_is_unsure_of_or_has_not_learned_is_kept():
         probabilities[100, 2] /= 2 if confidence < 0.5 else 1
         unlike = np.zeros(200, np.float32)
         unlike[100] = novelty
-        kept = kept_of(ClipFinder("unsure", ["speech"], 0), probabilities, unlike)
+        kept = kept_of(ClipFinder("unsure", ["speech"], 0, 20), probabilities, unlike)
         assert kept == list(range(81, 121)) * count
 
 
@@ -176,7 +177,7 @@ def asked(folder, model=None, **others):
 
 def keep(paths, about, start=START):
     """Record files as the settings want it; return the layers of sound."""
-    result = record(about, FileSource(paths, start), Flag())
+    result = record(about, about.microphone[0], FileSource(paths, start), Flag())
     return [path for path in map(audio_path, result.logs) if path.exists()]
 
 
@@ -228,7 +229,7 @@ def test_what_is_kept_is_the_sound_itself_and_no_window_of_it_is_like_speech(
 ):
     about = asked(tmp_path, model_file, keep_audio=mode, max_bag_duration=60)
     source = LossySource(FileSource(sounds, START), {3: 7})
-    logs = record(about, source, Flag()).logs
+    logs = record(about, about.microphone[0], source, Flag()).logs
     layers = [path for path in map(audio_path, logs) if path.exists()]
     samples = np.concatenate([block for path in sounds for block in read_audio(path)])
     heard = np.rint(samples[: len(samples) // 800 * 800].reshape(-1, 800) * 32768)
@@ -309,6 +310,7 @@ def test_a_layer_is_complete_soon_after_its_log_though_no_sound_follows(tmp_path
     rolls = START + 5 * SECOND
     log = ClipLog(
         asked(tmp_path, keep_audio="always"),
+        "mic",
         lambda stamp: (names[0], rolls) if stamp < rolls else (names[1], rolls + DAY),
     )
     log.write([Sound(START + np.arange(9) * FRAME_NANOSECONDS, np.zeros((9, 800), np.int16))])
@@ -333,7 +335,7 @@ def test_when_the_clock_is_set_back_sound_stays_beside_its_own_log(noise, tmp_pa
             yield Frames(81, samples, stamps - HOUR)
 
     about = asked(tmp_path, keep_audio="always", never_keep=[])
-    logs = record(about, SetBack(), Flag()).logs
+    logs = record(about, about.microphone[0], SetBack(), Flag()).logs
     kept = [frames_of([audio_path(log)]) for log in logs]
     assert [len(frames) for frames in kept] == [80, 80]
     assert min(kept[0]) == START
@@ -478,6 +480,7 @@ def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(t
         rolls = START + 30 * SECOND
         log = ClipLog(
             asked(tmp_path, keep_audio="always"),
+            "mic",
             lambda stamp: (full, rolls) if stamp < rolls else (good, rolls + DAY),
         )
         refused, again = log.write([sound])
@@ -518,7 +521,7 @@ def test_a_killed_recorder_leaves_clips_that_the_next_one_completes(noise, tmp_p
     (active,) = logs.rglob("*.audio.mcap.active")
     heard, kept = len(read(_log(active), "features")), frames_of([active])
     assert heard - 20 - 19 <= len(kept)
-    record_files(asked(logs), FileSource([noise(3)], START + HOUR), Flag())
+    record_files(asked(logs), Microphone(), FileSource([noise(3)], START + HOUR), Flag())
     assert not active.exists()
     whole = active.with_name(active.name.removesuffix(".active"))
     assert LogReader(whole).complete
@@ -536,7 +539,7 @@ def _leave(noise, folder, change):
     active = layer.with_name(layer.name + ".active")
     active.write_bytes(change(bytearray(layer.read_bytes())))
     layer.unlink()
-    result = record_files(asked(folder), FileSource([noise(3)], START + HOUR), Flag())
+    result = record_files(asked(folder), Microphone(), FileSource([noise(3)], START + HOUR), Flag())
     return layer, active, result.recovered
 
 
@@ -641,7 +644,7 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     about = asked(
         logs, folder / "champion.safetensors", keep_audio="always", max_bag_duration=86_400
     )
-    paths = record(about, source, Flag(), asked=question).logs
+    paths = record(about, about.microphone[0], source, Flag(), asked=question).logs
     assert [audio_path(path).exists() for path in paths] == [True, False, True]
     assert source.unfinished == [1, 0, 1]
     assert said(paths[0]) == []

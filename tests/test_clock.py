@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.recorder.clock import SampleClock
-from hearthlog.recorder.features import FRAME_SAMPLES
 from hearthlog.recorder.sources.framing import Block, Framer
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 RATE = 16_000
 BLOCK = 8_000

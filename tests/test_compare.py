@@ -9,8 +9,8 @@ import pytest
 from kept import keep_models
 from spliced import run
 
-from hearthlog.analyzer.compare import clip_recordings, compare_models
-from hearthlog.analyzer.dataset import cut_recordings
+from hearthlog.analyzer.compare import compare_models
+from hearthlog.analyzer.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.clips import scenario_of
 from hearthlog.analyzer.home import home_recordings
@@ -49,7 +49,7 @@ def days(tmp_path_factory):
         spans = write_day(sound, minutes=1.5, seed=20 + number)
         start = START + number * DAY
         settings = Settings(output=folder / "logs")
-        (log,) = record(settings, FileSource([sound], start), Flag()).logs
+        (log,) = record(settings, settings.microphone[0], FileSource([sound], start), Flag()).logs
         marks = [
             Mark("mic", *(start + round(time * SECOND) for time in span[:2]), span[2])
             for span in spans

@@ -25,11 +25,11 @@ from hearthlog.analyzer.evaluation.events import Events
 from hearthlog.analyzer.evaluation.reference import Labelling
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.marks import Mark, read_marks, write_marks
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.times import read_time, time_text
 from hearthlog.schemas.topics import Topic

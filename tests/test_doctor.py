@@ -38,14 +38,16 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.analyzer.doctor import examine
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.pipeline import Pipeline, stream_info
 from hearthlog.recorder.recovery import recover_active
-from hearthlog.recorder.service import _describe, record
+from hearthlog.recorder.service import describe_log, record
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Gap
+from hearthlog.recorder.stream import Gap
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.records import MAGIC
 
@@ -62,7 +64,7 @@ def recorded(tmp_path_factory, day, model_file):
     soundfile.write(folder / "sound.wav", samples, rate)
     settings = Settings(output=folder, model=model_file)
     source = LossySource(FileSource([folder / "sound.wav"], START), {2: 7})
-    (path,) = record(settings, source, Flag()).logs
+    (path,) = record(settings, settings.microphone[0], source, Flag()).logs
     return path
 
 
@@ -1079,7 +1081,9 @@ def series(tmp_path_factory, recorded, model_file):
     folder = tmp_path_factory.mktemp("series")
     settings = Settings(output=folder, model=model_file, max_bag_duration=10)
     sound = next(recorded.parents[3].glob("*.wav"))
-    record(settings, LossySource(FileSource([sound], START), {2: 7}), Flag())
+    record(
+        settings, settings.microphone[0], LossySource(FileSource([sound], START), {2: 7}), Flag()
+    )
     return folder
 
 
@@ -1096,7 +1100,7 @@ def test_logs_that_follow_each_other_are_sound(folder):
 def test_a_recorder_that_starts_again_begins_with_frame_0(folder, recorded, model_file):
     settings = Settings(output=folder, model=model_file)
     sound = next(recorded.parents[3].glob("*.wav"))
-    record(settings, FileSource([sound], START + 60 * NANOSECONDS), Flag())
+    record(settings, settings.microphone[0], FileSource([sound], START + 60 * NANOSECONDS), Flag())
     assert found(folder) == {("warning", GAP)}
 
 
@@ -1106,8 +1110,9 @@ def test_a_log_that_is_missing_is_missed(folder):
 
 
 def test_a_clock_that_is_set_back_begins_another_log_that_may_overlap(tmp_path):
-    about = _describe(Settings(output=tmp_path), SimpleNamespace(device="test"), None)
-    log, pipeline = RollingLog(about, 3600, 1.0, 5.0), Pipeline("mic")
+    info = stream_info("mic", "test", DEFAULT, None)
+    about = describe_log(Settings(output=tmp_path), info, DEFAULT, None)
+    log, pipeline = RollingLog(about, 3600, 1.0, 5.0), Pipeline("mic", DEFAULT)
     values = np.random.default_rng(0).random((200, 21)).astype(np.float32)
     stamps = START + np.arange(200) * FRAME_NANOSECONDS
     log.write(pipeline.push_features(values, 0, stamps))

@@ -15,10 +15,11 @@ from spliced import run
 from hearthlog.analyzer.enrol import enrol_file
 from hearthlog.analyzer.heard import find_heard
 from hearthlog.analyzer.marks import read_marks
-from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 

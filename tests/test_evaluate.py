@@ -28,7 +28,8 @@ from hearthlog.analyzer.evaluation.scores import (
 )
 from hearthlog.analyzer.evaluation.table import class_table, confusion_table
 from hearthlog.analyzer.hmm import default_transitions
-from hearthlog.models.modelfile import Smoothing, load_model, save_model
+from hearthlog.models.description import Smoothing
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.tools.home.simulate import write_training_set
 
 SECOND = 1_000_000_000

@@ -8,13 +8,9 @@ from hypothesis import strategies as st
 from pyAudioAnalysis import ShortTermFeatures
 from scipy.fftpack import fft
 
-from hearthlog.recorder.features import (
-    FEATURE_NAMES,
-    FRAME_SAMPLES,
-    MFCC_COUNT,
-    FeatureExtractor,
-    mel_bank,
-)
+from hearthlog.models.features.auros21.extractor import FeatureExtractor, mel_bank
+from hearthlog.models.features.auros21.names import FEATURE_NAMES, MFCC_COUNT
+from hearthlog.schemas.frames import FRAME_SAMPLES
 
 RATE = 16_000
 NOISE = np.random.default_rng(7).standard_normal((600, FRAME_SAMPLES)).astype(np.float32) * 0.1

@@ -10,8 +10,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.home.simulate import _perform, _plan_day, write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS, SimulationError, synthesize
 
@@ -36,7 +37,7 @@ def decibels(samples, block=FRAME_SAMPLES):
 
 def one_second_statistics(samples):
     frames = samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
-    mean, std = RollingStatistics()(FeatureExtractor()(frames))
+    mean, std = RollingStatistics(20)(FeatureExtractor()(frames))
     return np.concatenate([mean, std], axis=1)[WINDOW_FRAMES - 1 :: WINDOW_FRAMES]
 
 

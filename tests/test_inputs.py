@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hearthlog.models.inputs import InputStream, bands_of, dct_weights, input_width, window_inputs
+from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.statistics import RollingStatistics
 
 KINDS = ["statistics", "bands"]
@@ -22,31 +23,35 @@ def features(count, seed=0):
 @given(st.lists(st.integers(0, 70), max_size=30), st.integers(1, 700), st.integers(0, 2**32))
 def test_blocks_of_any_size_agree_bit_for_bit(kind, sizes, count, seed):
     values = features(count, seed)
-    whole, stream = InputStream(kind)(values), InputStream(kind)
+    whole, stream = DEFAULT.inputs[kind].stream()(values), DEFAULT.inputs[kind].stream()
     borders = [0, *np.cumsum(sizes).clip(0, count).tolist(), count]
     parts = [stream(values[a:b]) for a, b in pairwise(borders)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-    assert whole.shape == (max(count - 19, 0), input_width(kind))
+    assert whole.shape == (max(count - 19, 0), DEFAULT.inputs[kind].width)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_windows_on_their_own_give_what_the_stream_gives(kind):
     values = features(400)
     windows = np.lib.stride_tricks.sliding_window_view(values, 20, axis=0).transpose(0, 2, 1)
-    np.testing.assert_array_equal(window_inputs(kind, windows), InputStream(kind)(values))
+    np.testing.assert_array_equal(
+        DEFAULT.inputs[kind].of_windows(windows), DEFAULT.inputs[kind].stream()(values)
+    )
 
 
 def test_statistics_are_those_of_the_log():
     values = features(300)
-    logged = np.concatenate(RollingStatistics()(values), axis=1)
-    np.testing.assert_array_equal(InputStream("statistics")(values), logged[19:])
+    logged = np.concatenate(RollingStatistics(20)(values), axis=1)
+    np.testing.assert_array_equal(DEFAULT.inputs["statistics"].stream()(values), logged[19:])
 
 
 def test_after_a_restart_the_window_fills_again():
-    values, stream = features(100), InputStream("bands")
+    values, stream = features(100), DEFAULT.inputs["bands"].stream()
     stream(values[:50])
     stream.restart()
-    np.testing.assert_array_equal(stream(values[50:]), InputStream("bands")(values[50:]))
+    np.testing.assert_array_equal(
+        stream(values[50:]), DEFAULT.inputs["bands"].stream()(values[50:])
+    )
 
 
 def test_bands_of_a_smooth_spectrum_come_back_from_its_cepstra():

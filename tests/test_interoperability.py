@@ -20,6 +20,7 @@ from rosbags.interfaces import QosDurability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from hearthlog.models.card import model_card
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.messages import NANOSECONDS
@@ -187,7 +188,7 @@ def test_the_file_has_the_profile_the_metadata_and_the_attachments_of_the_contra
         assert metadata["hearthlog"]["model_sha256"] == model.sha256
         assert attachments.keys() == {"configuration.json", "model_card.md"}
         assert json.loads(attachments["configuration.json"].data)["node"] == "home"
-        assert attachments["model_card.md"].data.decode() == model.card()
+        assert attachments["model_card.md"].data.decode() == model_card(model)
         found = ours(path)
         assert {channels[i].topic: n for i, n in counts.items() if n} == {
             topic: len(rows) for topic, rows in found.items() if rows

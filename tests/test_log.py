@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from logs import features
 
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.service import Settings, _describe
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.recorder.pipeline import Pipeline, stream_info
+from hearthlog.recorder.service import Settings, describe_log
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
 from hearthlog.schemas.reader import LogReader
 
@@ -23,12 +24,13 @@ class Nowhere:
 
 @pytest.fixture
 def description(tmp_path) -> LogDescription:
-    return _describe(Settings(output=tmp_path), Nowhere(), None)
+    info = stream_info("mic", "test", DEFAULT, None)
+    return describe_log(Settings(output=tmp_path), info, DEFAULT, None)
 
 
 def records(first, count, start):
     stamps = start + np.arange(count) * FRAME_NANOSECONDS
-    return Pipeline("mic").push_features(VALUES[:count], first, stamps)
+    return Pipeline("mic", DEFAULT).push_features(VALUES[:count], first, stamps)
 
 
 def test_files_begin_at_multiples_of_their_duration(description, tmp_path):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from hearthlog.models.classifier import Classifier
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder import lines
-from hearthlog.recorder.features import FRAME_SAMPLES
 from hearthlog.recorder.pipeline import Pipeline, opening
 from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.recorder.stream import Frames, Gap, Health
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import (
     LOG,
     SEGMENT,
@@ -37,7 +38,7 @@ def said(records):
 
 def in_blocks(frames, size, model_file):
     """All records of a minute with a gap in its middle, and of microphones that fell ill."""
-    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     stamps = START + np.arange(len(frames) + LOST) * FRAME_NANOSECONDS
     middle = len(frames) // 2
     records = pipeline.push(Health(START, 0, "listening"))
@@ -77,14 +78,14 @@ def test_every_segment_is_a_line_that_follows_it_at_its_end(frames, model_file):
 
 def test_a_gap_is_a_warning_at_its_end():
     gap = Gap(START, START + 2_050_000_000, "the recorder was too slow", 41)
-    ((time, line),) = said(Pipeline("mic").push(gap))
+    ((time, line),) = said(Pipeline("mic", DEFAULT).push(gap))
     assert time == nanoseconds(line.stamp) == gap.end
     assert line.level == line.WARN
     assert line.msg == "gap of 2.05 s: the recorder was too slow"
 
 
 def test_only_a_change_of_health_is_a_line():
-    pipeline = Pipeline("mic")
+    pipeline = Pipeline("mic", DEFAULT)
     levels = [0, 0, 2, 2, 1, 1, 0, 0, 2]
     records = []
     for second, level in enumerate(levels):

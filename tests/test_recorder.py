@@ -14,12 +14,14 @@ from conftest import HEARTHLOG
 from logs import features, read
 
 from hearthlog.models.classifier import Classifier
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
-from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import nanoseconds
 from hearthlog.schemas.reader import LogReader
 
@@ -143,7 +145,7 @@ def test_diagnostics_come_at_least_every_ten_seconds(day, recorded):
 def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model_file, recorded):
     logs = recorded(day, "--model", model_file)
     frames, stamps, values = features(logs)
-    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     again = []
     for start in range(0, len(frames), 33):
         block = slice(start, start + 33)
@@ -158,7 +160,7 @@ def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model
 
 
 def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_second(model_file):
-    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     frames = as_frames(noise(2))
     stamps = START + np.arange(40) * FRAME_NANOSECONDS
     before = pipeline.push(Frames(0, frames, stamps))

@@ -14,9 +14,9 @@ from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import record_files
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import active_path
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import LogWriter
@@ -30,7 +30,9 @@ def log(tmp_path_factory, day, model_file):
 
     folder = tmp_path_factory.mktemp("whole")
     settings = load_settings(None, {"output": folder, "model": model_file}, {})
-    (path,) = record_files(settings, FileSource([day], 10**18), Event()).logs
+    (path,) = record_files(
+        settings, settings.microphone[0], FileSource([day], 10**18), Event()
+    ).logs
     return path
 
 

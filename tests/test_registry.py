@@ -10,6 +10,7 @@ import pytest
 from kept import keep_models, put_by_hand
 from spliced import run
 
+from hearthlog.models.card import model_card
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import list_models, load, promote, rollback, target
@@ -169,7 +170,7 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
 
 def test_a_model_is_shown_by_its_card(folder, capfd):
     result = run(capfd, "models", "show", "champion", "--folder", folder)
-    assert result.stdout == load(folder, "one").card()
+    assert result.stdout == model_card(load(folder, "one"))
     result = run(capfd, "models", "show", "one", "--json", "--folder", folder)
     assert json.loads(result.stdout)["sha256"] == load(folder, "one").sha256
 

@@ -7,13 +7,13 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
 import pytest
 import soundfile
+from blobs import with_arrays
 from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
 from logs import features
@@ -28,12 +28,12 @@ from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import SAMPLE_RATE
 from hearthlog.recorder.recovery import recover_log
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS
 
@@ -57,7 +57,12 @@ def recording(tmp_path_factory, sounds, model):
     """Logs of a minute with gaps, labelled by the model as they were recorded."""
     folder = tmp_path_factory.mktemp("recorded")
     settings = Settings(output=folder, model=model, max_bag_duration=60)
-    record(settings, LossySource(FileSource(sounds, START), {5: 7, 90: 150}), Flag())
+    record(
+        settings,
+        settings.microphone[0],
+        LossySource(FileSource(sounds, START), {5: 7, 90: 150}),
+        Flag(),
+    )
     return folder
 
 
@@ -135,7 +140,7 @@ def night(tmp_path_factory):
     noise = np.random.default_rng(5).standard_normal(5 * 60 * SAMPLE_RATE) / 3000
     soundfile.write(folder / "night.wav", noise, SAMPLE_RATE)
     settings = Settings(output=folder / "logs", max_bag_duration=60)
-    record(settings, FileSource([folder / "night.wav"], START), Flag())
+    record(settings, settings.microphone[0], FileSource([folder / "night.wav"], START), Flag())
     return folder / "logs"
 
 
@@ -366,7 +371,7 @@ def test_a_layer_of_another_model_of_that_name_is_kept(model, logs, tmp_path, ca
     loaded = load_model(model)
     (tmp_path / "other").mkdir()
     other = tmp_path / "other" / model.name
-    save_model(replace(loaded, intercepts=loaded.intercepts + 1), other)
+    save_model(with_arrays(loaded, intercepts=loaded.arrays["intercepts"] + 1), other)
     done = run(capfd, "relabel", logs, "--model", other, "--workers", 1)
     assert done.returncode == 1
     assert "was made by another model of this name" in done.stderr

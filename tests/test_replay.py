@@ -23,17 +23,19 @@ from hearthlog.analyzer.replay.player import Wanted
 from hearthlog.analyzer.replay.replay import LogSet, find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.train import train_model
+from hearthlog.models.card import model_card
+from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import FEATURE_NAMES
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.recorder.stream import Frames, Gap, Health
 from hearthlog.schemas import messages
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import encode, header, message, nanoseconds, time_message
 from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import Topic, topics_of
@@ -49,8 +51,8 @@ LOST = {5: 7, 12: 150}  # frames, before blocks of ten seconds
 def record_day(folder, day, model, **settings):
     """Record three minutes with gaps, stop, and go on two minutes later; a file a minute."""
     asked = Settings(output=folder, model=model, max_bag_duration=60, **settings)
-    record(asked, LossySource(FileSource([day], START), LOST), Flag())
-    record(asked, FileSource([day], START + 300 * SECOND), Flag())
+    record(asked, asked.microphone[0], LossySource(FileSource([day], START), LOST), Flag())
+    record(asked, asked.microphone[0], FileSource([day], START + 300 * SECOND), Flag())
     return folder
 
 
@@ -113,7 +115,7 @@ def test_with_its_model_a_recording_comes_out_again_message_for_message(
 def test_so_does_real_sound(household, model_file, tmp_path):
     files = sorted(household.glob("*/*.flac"))[::40]
     settings = Settings(output=tmp_path / "recorded", model=model_file, max_bag_duration=60)
-    record(settings, LossySource(FileSource(files, START), LOST), Flag())
+    record(settings, settings.microphone[0], LossySource(FileSource(files, START), LOST), Flag())
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)
     assert result.seconds > 60
     assert content(tmp_path / "again") == content(tmp_path / "recorded")
@@ -148,7 +150,7 @@ def test_so_does_a_microphone_that_was_unplugged_and_a_clock_that_was_set_back(
     day, model_file, tmp_path
 ):
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, Trouble(day), Flag())
+    record(settings, settings.microphone[0], Trouble(day), Flag())
     recorded = content(tmp_path / "recorded")
     assert len(recorded) == 3
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)
@@ -181,12 +183,12 @@ def test_agreement_counts_the_labels_of_the_same_name(folder, model_file, tmp_pa
     save_model(
         type(model)(
             type(model.description).model_validate_json(text),
-            model.scaler_mean,
-            model.scaler_scale,
-            model.support_vectors,
-            model.support_counts,
-            model.dual_coefficients,
-            model.intercepts,
+            model.arrays["scaler_mean"],
+            model.arrays["scaler_scale"],
+            model.arrays["support_vectors"],
+            model.arrays["support_counts"],
+            model.arrays["dual_coefficients"],
+            model.arrays["intercepts"],
         ),
         renamed,
     )
@@ -206,7 +208,7 @@ def test_the_new_log_says_what_it_is_a_replay_of_and_keeps_the_configuration(
     replay(folder, other, other_model)
     recorded, again, changed = (LogReader(find_logs(path)[0]) for path in (folder, same, other))
     assert again.attachments == recorded.attachments
-    assert changed.attachments["model_card.md"] == load_model(other_model).card().encode()
+    assert changed.attachments["model_card.md"] == model_card(load_model(other_model)).encode()
     assert changed.attachments["configuration.json"] == recorded.attachments["configuration.json"]
     first, last = (find_logs(folder)[i].name for i in (0, -1))
     assert again.metadata["hearthlog"] == recorded.metadata["hearthlog"] | {
@@ -241,7 +243,7 @@ def test_a_segment_that_began_long_before_the_start_is_as_recorded(day, model_fi
     sound = np.concatenate([sound, np.zeros(200 * 16_000, np.float32)])
     soundfile.write(tmp_path / "still.wav", sound, 16_000)
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, FileSource([tmp_path / "still.wav"], START), Flag())
+    record(settings, settings.microphone[0], FileSource([tmp_path / "still.wav"], START), Flag())
     result = replay(tmp_path / "recorded", tmp_path / "part", model_file, start_offset=190)
     assert read(tmp_path / "recorded", "segment")[-1:] == read(tmp_path / "part", "segment")
     assert (result.compared.segments, result.compared.identical_segments) == (1, 1)
@@ -283,7 +285,12 @@ def test_a_recording_that_was_killed_comes_out_with_the_segment_that_was_open(
         shutil.copytree(tmp_path / "logs", killed)
 
     settings = Settings(output=tmp_path / "logs", model=model_file)
-    record(settings, LossySource(FileSource([day], START), {}, at_end=keep), Flag())
+    record(
+        settings,
+        settings.microphone[0],
+        LossySource(FileSource([day], START), {}, at_end=keep),
+        Flag(),
+    )
     (recovered,) = recover_active(killed, "home")
     recorded = read(killed, "segment")
     result = replay(killed, tmp_path / "again", model_file)
@@ -457,7 +464,7 @@ def test_clips_of_a_recording_give_what_the_recording_gave(
     sound = np.stack([sound, sound[::-1]][:channels], axis=1)
     soundfile.write(tmp_path / "sound.wav", sound, rate, subtype="PCM_16")
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, FileSource([tmp_path / "sound.wav"], START), Flag())
+    record(settings, settings.microphone[0], FileSource([tmp_path / "sound.wav"], START), Flag())
     lengths = [rate * 7, 12_345, 11, *[rate] * 30]
     clips = write_clips(tmp_path / "clips.mcap", pieces(sound, rate, lengths), rate)
     replay(clips, tmp_path / "again", model_file, kind="audio")
@@ -602,7 +609,7 @@ def test_layers_are_no_part_of_a_recording(folder, model_file, tmp_path):
 def test_logs_of_two_recorders_are_not_mixed(folder, day, hearthlog, tmp_path):
     shutil.copytree(folder, tmp_path / "recorded")
     asked = Settings(output=tmp_path / "recorded", node="flat")
-    record(asked, FileSource([day], START), Flag())
+    record(asked, asked.microphone[0], FileSource([day], START), Flag())
     result = hearthlog("replay", tmp_path / "recorded")
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()

@@ -15,15 +15,14 @@ from joblib import delayed
 
 from hearthlog.analyzer.adaptation import adaptation_curve
 from hearthlog.analyzer.errors import DataError, WorkerError
-from hearthlog.analyzer.evaluation.folds import evaluate_recipe
-from hearthlog.analyzer.recipe import RECIPES, cross_validate, prepare
-from hearthlog.analyzer.search import around, search
+from hearthlog.analyzer.evaluation.folds import evaluate_method
+from hearthlog.analyzer.method import cross_validate, prepare
+from hearthlog.analyzer.search import search
+from hearthlog.analyzer.svm_method import PAPER
 from hearthlog.analyzer.train import group_folds
 from hearthlog.analyzer.workers.parallel import in_parallel, joblib_on
 from hearthlog.models.modelfile import load_model
 from hearthlog.tools.home.simulate import write_training_set
-
-PAPER = RECIPES["paper"]
 
 
 @pytest.fixture(scope="module")
@@ -40,29 +39,31 @@ def clips(tmp_path_factory):
 
 
 def test_a_search_tries_less_as_much_and_more_of_both():
-    recipes = around(PAPER)
-    assert len(set(recipes)) == 9
-    assert PAPER in recipes
-    assert {recipe._replace(cost=0.0, gamma=0.0) for recipe in recipes} == {
-        PAPER._replace(cost=0.0, gamma=0.0)
+    methods = PAPER.variations()
+    assert len(set(methods)) == 9
+    assert PAPER in methods
+    assert {dataclasses.replace(method, cost=0.0, gamma=0.0) for method in methods} == {
+        dataclasses.replace(PAPER, cost=0.0, gamma=0.0)
     }
 
 
 def test_a_search_puts_first_what_tells_segments_apart_best():
     data, _ = blobs(3, 40)
-    useless = PAPER._replace(gamma=1e4)  # so sharp that it knows nothing but what it has seen
+    useless = dataclasses.replace(
+        PAPER, gamma=1e4
+    )  # so sharp that it knows nothing but what it has seen
     tried = search(data, [useless, PAPER], "source", ignore_progress)
-    assert [one.recipe for one in tried] == [PAPER, useless]
+    assert [one.method for one in tried] == [PAPER, useless]
     assert tried[0].scores.macro_f1 > tried[1].scores.macro_f1 + 0.2
 
 
 def test_a_search_finds_the_figures_that_cross_validation_finds():
     data, _ = blobs(3, 40)
     steps = []
-    recipes = around(PAPER)[:2]
-    tried = search(data, recipes, "source", lambda *step: steps.append(step))
-    for recipe, scores in tried:
-        assert scores == evaluate_recipe(data, recipe, "source", ignore_progress).scores
+    methods = PAPER.variations()[:2]
+    tried = search(data, methods, "source", lambda *step: steps.append(step))
+    for method, scores in tried:
+        assert scores == evaluate_method(data, method, "source", ignore_progress).scores
     assert steps == [(done, 10) for done in range(1, 11)]
 
 
@@ -70,13 +71,13 @@ def test_a_search_over_segments_that_are_all_alike_is_refused():
     data, _ = blobs(2, 20)
     flat = dataclasses.replace(data, windows=np.ones_like(data.windows))
     with pytest.raises(DataError, match="all segments are alike"):
-        search(flat, around(PAPER), "source", ignore_progress)
+        search(flat, PAPER.variations(), "source", ignore_progress)
 
 
 def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
     data, _ = blobs(3, 60)
-    recipes, examples = around(PAPER)[:3], prepare(PAPER, data)
-    arguments = (recipes, examples, 3, group_folds(data), ignore_progress)
+    methods, examples = PAPER.variations()[:3], prepare(PAPER, data)
+    arguments = (methods, examples, 3, group_folds(data), ignore_progress)
     here = cross_validate(*arguments)
     with joblib_on(cluster):
         there = cross_validate(*arguments)
@@ -131,7 +132,7 @@ def test_a_model_learned_with_a_cluster_is_the_same_file(cluster, clips, tmp_pat
         assert done.returncode == 0, done.stderr
     here, there = (load_model(tmp_path / f"{name}.safetensors") for name in ("here", "there"))
     assert here.description.cost == 2
-    assert here.description.gamma == pytest.approx(PAPER.gamma / 42)
+    assert here.description.parameters["gamma"] == pytest.approx(PAPER.gamma / 42)
     assert here.sha256 == there.sha256
 
 

@@ -23,19 +23,21 @@ from hearthlog.analyzer.replay.player import Wanted
 from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.models.classifier import Classifier
+from hearthlog.models.description import Smoothing
 from hearthlog.models.errors import ModelError
-from hearthlog.models.inputs import InputStream
-from hearthlog.models.modelfile import Smoothing, load_model, save_model
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.segments import Segmenter
 from hearthlog.models.smoothing import FixedLagSmoother
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames
+from hearthlog.recorder.stream import Frames
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import (
     LOG,
     SEGMENT,
@@ -69,7 +71,7 @@ def decided(smoother, probabilities, size):
 def of_sounds(model_file, frames):
     """Probabilities of a model's classes in real sound."""
     classifier = Classifier(load_model(model_file))
-    inputs = InputStream(classifier.inputs)(FeatureExtractor()(frames))
+    inputs = classifier.inputs.stream()(FeatureExtractor()(frames))
     return classifier.probabilities(inputs), default_transitions(classifier.classes)
 
 
@@ -258,7 +260,7 @@ def test_transitions_that_are_none_are_refused(hmm_file, tmp_path, change, compl
 
 def pushed(day, model_file, size):
     samples = np.concatenate(list(read_audio(day))).reshape(-1, FRAME_SAMPLES)[:1200]
-    pipeline = Pipeline("mic", Classifier(load_model(model_file)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     records = []
     for first in range(0, len(samples), size):
         block = samples[first : first + size]
@@ -305,7 +307,12 @@ def folder(tmp_path_factory, day, hmm_file):
     """Logs of a minute, with gaps."""
     folder = tmp_path_factory.mktemp("recorded")
     settings = Settings(output=folder, model=hmm_file, max_bag_duration=60)
-    record(settings, LossySource(FileSource([day], START), {5: 7, 12: 150}), Flag())
+    record(
+        settings,
+        settings.microphone[0],
+        LossySource(FileSource([day], START), {5: 7, 12: 150}),
+        Flag(),
+    )
     return folder
 
 

@@ -42,7 +42,7 @@ def logs(household, model_file, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=300)
     sounds = sorted(household.glob("*/*.flac"))[::6]
-    record(settings, FileSource(sounds, START), threading.Event())
+    record(settings, settings.microphone[0], FileSource(sounds, START), threading.Event())
     assert len(find_logs(folder)) > 2
     return folder
 

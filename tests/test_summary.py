@@ -48,7 +48,9 @@ def logs(tmp_path_factory, model_file, day):
     settings = Settings(
         output=folder, model=model_file, microphone=[Microphone(name="hall")], max_bag_duration=60
     )
-    return record(settings, LossySource(FileSource([day], START), LOST), Event()).logs
+    return record(
+        settings, settings.microphone[0], LossySource(FileSource([day], START), LOST), Event()
+    ).logs
 
 
 def counted(paths):

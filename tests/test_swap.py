@@ -16,18 +16,21 @@ from kept import keep_models, put_by_hand
 from logs import features, read
 from spliced import run
 
+from hearthlog.models.card import model_card
 from hearthlog.models.classifier import Classifier
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import promote
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.features import FRAME_SAMPLES, FeatureExtractor
 from hearthlog.recorder.log import RollingLog
 from hearthlog.recorder.modelwatch import ModelWatch
-from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.service import _attend, _describe
+from hearthlog.recorder.pipeline import Pipeline, stream_info
+from hearthlog.recorder.service import _attend, describe_log
 from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.reader import LogReader
 
 SECOND = 1_000_000_000
@@ -74,7 +77,7 @@ def said(logs, level=None):
 
 def labels_by(model_path, logs):
     """Labels of a model that has heard everything in some logs, by frame."""
-    pipeline = Pipeline("mic", Classifier(load_model(model_path)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_path)))
     frames, stamps, values = features(logs)
     records = pipeline.push_features(values, int(frames[0]), stamps)
     labels = [record.data for record in records if record.topic == "/mic/label"]
@@ -98,7 +101,7 @@ def check_swap(folder, logs, names):
         model = load_model(folder / f"{name}.safetensors")
         about = LogReader(path)
         assert about.metadata["hearthlog"]["model_sha256"] == model.sha256
-        assert about.attachments["model_card.md"] == model.card().encode()
+        assert about.attachments["model_card.md"] == model_card(model).encode()
         found, wanted = recorded_labels(path), labels_by(folder / f"{name}.safetensors", logs)
         assert found == {frame: wanted[frame] for frame in found}
         labelled += found
@@ -244,23 +247,24 @@ def ready(watch):
     return watch.ready.model
 
 
-class Nowhere:
-    device = "test"
-
-
 def record_and_promote(folder, logs, events):
     """Record events; before the second block of frames another model is ready."""
     settings = Settings(output=logs)
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
-    pipeline = Pipeline("mic", watch.first.classifier)
-    log = RollingLog(_describe(settings, Nowhere(), watch.first.model), 3600, 1.0, 5.0)
+    pipeline = Pipeline("mic", DEFAULT, watch.first.classifier)
+
+    def describe(model):
+        info = stream_info("mic", "test", DEFAULT, model)
+        return describe_log(settings, info, DEFAULT, model)
+
+    log = RollingLog(describe(watch.first.model), 3600, 1.0, 5.0)
     promote(folder, "two")
     ready(watch)
     heard = False
     for event in events:
         if isinstance(event, Frames):
             if heard:
-                _attend(watch, event, pipeline, log, lambda m: _describe(settings, Nowhere(), m))
+                _attend(watch, event, pipeline, log, describe)
             heard = True
         log.write(pipeline.push(event))
     log.finish(pipeline.finish())

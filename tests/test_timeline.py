@@ -35,10 +35,10 @@ from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import audio_path, find_logs
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import header, message, nanoseconds
 from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
@@ -56,7 +56,9 @@ def folder(tmp_path_factory, model_file, day):
     """Logs of one recording with gaps, and a mark that reaches from one log into the next."""
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=60)
-    recording = record(settings, LossySource(FileSource([day], START), LOST), Flag())
+    recording = record(
+        settings, settings.microphone[0], LossySource(FileSource([day], START), LOST), Flag()
+    )
     assert len(recording.logs) > 2
     edge = int(features(recording.logs[1])[1][0])
     write_marks(recording.logs[0], [Mark("mic", edge - SECOND, edge, "yelling", "Ann", 5, "live")])
@@ -186,7 +188,12 @@ def test_what_is_open_when_a_log_is_cut_off_is_labelled_by_its_frames(tmp_path, 
         cut.append(shutil.copy(active, tmp_path / "cut.mcap.active"))
 
     settings = Settings(output=tmp_path / "logs", model=model_file)
-    record(settings, LossySource(FileSource([day], START), {}, copy_active), Flag())
+    record(
+        settings,
+        settings.microphone[0],
+        LossySource(FileSource([day], START), {}, copy_active),
+        Flag(),
+    )
     live = read_timeline(cut).microphones["mic"].labellings[0]
     written = [
         nanoseconds(m.header.stamp) + nanoseconds(m.duration) for m in read(cut[0], "segment")
@@ -264,7 +271,7 @@ def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
     data, scenario = blobs(3, 12)
     save_model(train_model(data, scenario, ignore_progress), tmp_path / "other.safetensors")
     settings = Settings(output=tmp_path / "logs", model=tmp_path / "other.safetensors")
-    later = record(settings, FileSource([day], START + HOUR), Flag()).logs
+    later = record(settings, settings.microphone[0], FileSource([day], START + HOUR), Flag()).logs
     both = read_timeline([*later, folder]).microphones["mic"].labellings[0]
     classes = (*load_model(model_file).classes, *scenario.classes)
     assert both.probabilities.names == classes

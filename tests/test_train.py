@@ -16,10 +16,9 @@ from hearthlog.analyzer.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.train import calibration_error, group_folds, train_model
 from hearthlog.models.classifier import Classifier
 from hearthlog.models.errors import ModelError
-from hearthlog.models.inputs import InputStream
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.features import FeatureExtractor
 from hearthlog.tools.cli.train import train
 
 RATE = 16_000
@@ -123,7 +122,7 @@ def test_clips_too_short_and_of_other_labels_are_counted(tmp_path):
     ]
     two = Scenario("two", {"speech": ("speech",), "quiet": ("silence",)})
     data = build_dataset(clips, two, ignore_progress)
-    assert data.skipped == {"label shower is not in the scenario": 1, "shorter than a second": 2}
+    assert data.skipped == {"label shower is not in the scenario": 1, "shorter than 1 s": 2}
     assert [amount.seconds for amount in data.amounts.values()] == [2.0, 1.0]
 
 
@@ -214,8 +213,8 @@ def test_the_command_makes_a_model_that_knows_its_sounds(home):
     for label in model.classes:
         samples = sound(label, 1, seed=99).astype(np.float32)
         features = FeatureExtractor()(samples.reshape(-1, 800))
-        inputs = InputStream(model.description.inputs)(features)
-        best = Classifier(model).probabilities(inputs).argmax()
+        classifier = Classifier(model)
+        best = classifier.probabilities(classifier.inputs.stream()(features)).argmax()
         assert model.classes[best] == label
 
 

@@ -36,10 +36,10 @@ from hearthlog.analyzer.timeline.live import (
 from hearthlog.analyzer.viewer.live import LiveServer
 from hearthlog.analyzer.viewer.process import Process, free_port
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.follow import follow_messages
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 SECOND = 1_000_000_000
 MINUTES = 3

@@ -5,7 +5,7 @@
 runs the verbs on a folder of labelled clips and prints one line for every topic of every log and
 layer, array of a model, page and table. It reads them with mcap and rosbags alone, field by field:
 what is appended to a message is not hashed unless both sides have it, and whatever names the
-version, the machine or the time of the run is left out.
+version, or the time and the folder of the run, is left out.
 """
 
 import argparse
@@ -27,7 +27,8 @@ from safetensors.numpy import load_file
 
 _START = "2026-03-01T07:00:00"
 _CLIPS_PER_CLASS = 24
-_HEADER = ("classes", "scenario", "gamma", "inverse_temperature", "smoothing", "metrics")
+_HEADER = ("classes", "scenario", "cost", "gamma", "inverse_temperature", "smoothing", "metrics")
+_NOT_FIELDS = {"__msgtype__", "made"}  # a mark says when it was made
 # What differs from run to run, or is not the content: versions, digests, times, folders.
 _NOT_CONTENT = re.compile(r"\b(\d+\.\d+\.\d+|[0-9a-f]{12,64}|\d+\.\d+ MB)\b")
 
@@ -64,28 +65,26 @@ def run_verbs(command: list[str], clips: Path, folder: Path) -> dict[str, str]:
         texts[name] = f"{done.returncode}\n{done.stdout}"
 
     scenario = ("--data", manifest, "--scenario", "general")
-    run("train", "train", *scenario, "-o", "general.safetensors", "--json")
+    run("train", "train", *scenario, "-o", "general.safetensors")
     paper = ("--method", "paper", "--smoothing", "merge")
-    run("train paper", "train", *scenario, "-o", "paper.safetensors", *paper, "--json")
+    run("train paper", "train", *scenario, "-o", "paper.safetensors", *paper)
     start = ("--start", _START, "-o", "logs", "--keep-audio", "events")
     run("record", "record", *sounds, *start, "--model", "general.safetensors", "-d", 300)
     run("annotate", "annotate", "import", "logs", labels)
     run("relabel", "relabel", "logs", "--model", "paper.safetensors")
     adapted = ("--base", "general.safetensors", "--home", "logs", "-o", "home.safetensors")
-    run("adapt", "train", *adapted, "--json")
-    run("enrol", "enrol", "coughing", "--home", "enrolled", "--file", sounds[0])
+    run("adapt", "train", *adapted)
     run("replay", "replay", "logs", "--json")
     run("replay paper", "replay", "logs", "--model", "paper.safetensors", "-o", "again")
     run("diff", "diff", "logs", "live", "paper", "--json")
     run("queue", "diff", "logs", "live", "--queue", "--list", "queue.csv")
     run("report", "report", "logs", "--day", "2026-03-01", "-o", "day.html")
     run("evaluate logs", "evaluate", "logs", "--reference", "review", "--json")
-    evaluated = ("--model", "general.safetensors", "--data", others, "--json")
+    evaluated = ("--model", "general.safetensors", "--data", others)
     run("evaluate model", "evaluate", *evaluated)
     run("compare", "models", "compare", "general", "paper", "--data", others, "--folder", ".")
     run("export", "export", "logs", "-o", "labels.csv", "--topics", "/mic/label")
     run("segments", "cat", "logs", "--topics", "/mic/segment", "--format", "ndjson")
-    run("info", "info", "logs", "--json")
     run("doctor", "doctor", "logs")
     return texts
 
@@ -120,6 +119,7 @@ def parts_of(path: Path) -> list[tuple[str, str]]:
         with path.open("rb") as stream:
             length = int.from_bytes(stream.read(8), "little")
             header = json.loads(json.loads(stream.read(length))["__metadata__"]["hearthlog"])
+        header |= header.get("parameters", {})
         kept = {key: header[key] for key in _HEADER if key in header}
         return [*hashes, ("header", digest(json.dumps(kept, sort_keys=True)))]
     if path.suffix in {".csv", ".html", ".txt", ".json"}:
@@ -160,7 +160,7 @@ def _field_bits(value: Any) -> bytes:
     return b"".join(
         name.encode() + _field_bits(getattr(value, name))
         for name in fields
-        if name != "__msgtype__"
+        if name not in _NOT_FIELDS
     )
 
 

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hearthlog.analyzer.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.diff.sources import Side
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.events import Events, Int64
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS

@@ -11,7 +11,7 @@ from hearthlog.analyzer.diff.difference import Difference
 from hearthlog.analyzer.diff.queue import Queue
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.textfile import csv_records, read_text
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import new_file
 from hearthlog.schemas.times import read_time, time_text

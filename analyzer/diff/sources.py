@@ -14,7 +14,7 @@ from hearthlog.analyzer.evaluation.reference import Labelling
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.known import is_of_type
 from hearthlog.analyzer.selection import Progress, Selection, select
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.description import CLASS_NAME
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, join, read_columns
 from hearthlog.schemas.errors import LogError

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 from collections import Counter
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,8 +13,9 @@ from mcap.records import Channel
 from hearthlog.analyzer.doctor.contract import NAME, Contract, place_of, type_of
 from hearthlog.analyzer.doctor.data import ATTACHMENTS, Data
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.recorder import features
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import NANOSECONDS, definition, type_hash
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.topics import Topic, topics_of
@@ -21,7 +23,7 @@ from hearthlog.schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
 
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
-_CONFIGURATION, _MODEL_CARD = ATTACHMENTS
+_CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS
 
 
 class About:
@@ -75,11 +77,12 @@ class About:
         if missing := sorted(_KEYS - records[0].keys()):
             self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
         found = self._data.attachments
-        wanted = {_CONFIGURATION, _MODEL_CARD} if records[0].get("model") else {_CONFIGURATION}
-        for name in ATTACHMENTS:
+        with_model = 1 if records[0].get("model") else 0
+        wanted = {_CONFIGURATION: {1}, _MODEL_CARD: {with_model}, _MODEL: {0, with_model}}
+        for name, counts in wanted.items():
             count = len(found.get(name, ()))
-            if count != (name in wanted):
-                what = f"there are {count} attachments {name}, not {int(name in wanted)}"
+            if count not in counts:
+                what = f"there are {count} attachments {name}, not {max(counts)}"
                 self._error("attachments", what)
         if len(found.get(_CONFIGURATION, ())) == 1:
             digest = hashlib.sha256(found[_CONFIGURATION][0]).hexdigest()
@@ -112,12 +115,13 @@ class About:
 
     def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
         expected: dict[str, Any] = {
-            "sample_rate": features.SAMPLE_RATE,
-            "frame_seconds": features.FRAME_SAMPLES / features.SAMPLE_RATE,
-            "window_seconds": WINDOW_FRAMES * features.FRAME_SAMPLES / features.SAMPLE_RATE,
+            "sample_rate": SAMPLE_RATE,
+            "frame_seconds": FRAME_SECONDS,
         }
-        if info["feature_set"] == features.NAME:
-            expected["feature_names"] = list(features.FEATURE_NAMES)
+        with suppress(ModelError):  # of a set that is not installed nothing is known
+            features = feature_set(str(info["feature_set"]))
+            expected["window_seconds"] = features.window_seconds
+            expected["feature_names"] = list(features.feature_names)
         for record in self._data.metadata.get(METADATA, [])[:1]:
             expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
         for name, value in expected.items():

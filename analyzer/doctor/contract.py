@@ -14,10 +14,11 @@ from hearthlog.analyzer.doctor.batch import Batch
 from hearthlog.analyzer.doctor.data import Data
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frames import FEATURES, GAP, LABEL, SEGMENT, STATISTICS, Frames
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, decode
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages import definition
 from hearthlog.schemas.rows import Int64
 from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT
@@ -37,6 +38,7 @@ _TOPIC = re.compile(r"/([a-z](?:_?[a-z0-9])*)/(\w+)")
 _STAMP = "header.stamp"
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _CLOCK_SET = "the clock was set"
+_LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
 _SUM_TOLERANCE = 1e-4
 _LONGEST_LAG = 61_000_000_000  # ns; of smoothing, and what stamps may be off in that time
 
@@ -168,7 +170,10 @@ class Contract:
         if microphone not in self.frames:
             every = statistics_every(self._data)
             labelled = info is not None and len(info["labels"]) > 0
-            self.frames[microphone] = Frames(self._findings, microphone, every, labelled=labelled)
+            window = _window_frames(info)
+            self.frames[microphone] = Frames(
+                self._findings, microphone, every, window, labelled=labelled
+            )
         if kind in _WIDTHS and info is not None:
             names = info["labels"] if kind == LABEL else info["feature_names"]
             for field in _WIDTHS[kind]:
@@ -333,6 +338,14 @@ def statistics_every(data: Data) -> int | None:
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
     return every if isinstance(every, int) and every > 0 else None
+
+
+def _window_frames(info: Mapping[str, Any] | None) -> int:
+    """Tell how many frames end with one that has a label, by what a log says."""
+    seconds = DEFAULT.window_seconds if info is None else float(info["window_seconds"])
+    if not FRAME_SECONDS <= seconds <= _LONGEST_WINDOW:
+        seconds = DEFAULT.window_seconds
+    return round(seconds / FRAME_SECONDS)
 
 
 def _rows(columns: Columns) -> Any:

@@ -16,13 +16,14 @@ from hearthlog.analyzer.doctor.chunk import Chunk, Content, check_channels
 from hearthlog.analyzer.doctor.definitions import Definitions, name_of, parse_strictly
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.walk import Record
+from hearthlog.models.card import CARD, DESCRIPTION
 from hearthlog.schemas.chunks import MESSAGE_HEAD
 from hearthlog.schemas.records import HEAD
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.rows import Int64
 from hearthlog.schemas.writer import METADATA
 
-ATTACHMENTS = ("configuration.json", "model_card.md")
+ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
 _NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept
 _KEPT_SIZE = 1 << 20  # bytes
 _INDEX_SIZE = 4096  # bytes; what has a longer name is not compared with its index

@@ -7,8 +7,8 @@ from pathlib import Path
 from hearthlog.analyzer.doctor.check import Examined
 from hearthlog.analyzer.doctor.findings import Findings, time_text
 from hearthlog.analyzer.doctor.frames import Frames
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas.files import SUFFIX
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
 _LEFT = {

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.rows import Int64
 
 # Behind a sound server stamps are steered by when blocks arrive, at first by up to 45 % (ns).
@@ -56,6 +55,8 @@ class Frames:
     microphone : str
     statistics_every : int or None
         Frames from one statistics message to the next, if that is known.
+    window_frames : int
+        Which end with a frame that has a label.
     labelled : bool
         Whether there is a model.
 
@@ -70,7 +71,13 @@ class Frames:
     """
 
     def __init__(
-        self, findings: Findings, microphone: str, statistics_every: int | None, *, labelled: bool
+        self,
+        findings: Findings,
+        microphone: str,
+        statistics_every: int | None,
+        window_frames: int,
+        *,
+        labelled: bool,
     ) -> None:
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
@@ -79,6 +86,7 @@ class Frames:
         self._findings = findings
         self._name = microphone
         self._every = statistics_every
+        self._window = window_frames
         self._labelled = labelled
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
@@ -247,16 +255,15 @@ class Frames:
                 first = int(features[start, 1])
                 self._heard = 0 if known_start[start] else self._guess(first, labels)
             heard[start:end] = self._heard + np.arange(1, end - start + 1)
-            self._heard = min(int(heard[end - 1]), WINDOW_FRAMES)
-        return heard >= WINDOW_FRAMES
+            self._heard = min(int(heard[end - 1]), self._window)
+        return heard >= self._window
 
-    @staticmethod
-    def _guess(frame: int, labels: Int64) -> int:
+    def _guess(self, frame: int, labels: Int64) -> int:
         """Guess how many frames were heard before one of which that is not known."""
         first = np.searchsorted(labels[:, 1], frame)
         if first == len(labels):
             return 0
-        return int(max(WINDOW_FRAMES - 1 - (labels[first, 1] - frame), 0))
+        return int(max(self._window - 1 - (labels[first, 1] - frame), 0))
 
     def _check_same(
         self, features: Int64, rows: Int64, kind: str, wanted: NDArray[np.bool_] | None

@@ -1,26 +1,22 @@
 """A model on labelled clips: by segments as in training, and by events as in a log."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.dataset import Progress, Recording, clip_features, cut_recordings
+from hearthlog.analyzer.dataset import Progress, Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.events import Detections, Events, detect
 from hearthlog.analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.manifest import Clip
 from hearthlog.analyzer.scenario import Scenario
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import InputStream, window_inputs
-from hearthlog.models.modelfile import Model
+from hearthlog.models.model import Model
 from hearthlog.models.segments import Segmenter
-from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages import NANOSECONDS
-
-_FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 
 Float32 = NDArray[np.float32]
 
@@ -88,13 +84,14 @@ def evaluate_model(
     scenario = Scenario(
         scenario.name, {name: scenario.classes[name] for name in model.classes}, scenario.ignored
     )
-    listener = _Listener(model)
-    data = cut_recordings(_heard(clips, scenario, listener, progress), scenario)
+    classifier = Classifier(model)
+    features, listener = classifier.feature_set, _Listener(classifier)
+    recordings = clip_recordings(clips, scenario, progress, features)
+    data = cut_recordings(listener.overhear(recordings, scenario), scenario, features)
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
         raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
-    inputs = window_inputs(model.description.inputs, data.windows)
-    probabilities = Classifier(model).probabilities(inputs)
+    probabilities = classifier.probabilities(classifier.inputs.of_windows(data.windows))
     scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
     return Evaluation(
         scores=scores,
@@ -123,21 +120,6 @@ def check_classes(model: Model, scenario: Scenario) -> None:
         )
 
 
-def _heard(
-    clips: Sequence[Clip], scenario: Scenario, listener: "_Listener", progress: Progress
-) -> Iterator[Recording]:
-    """Read the clips once, for segments and events alike."""
-    class_of = scenario.class_of
-    for number, clip in enumerate(clips):
-        progress(number, len(clips))
-        features = np.empty((0, len(FEATURE_NAMES)), np.float32)
-        if clip.label in class_of:
-            features = clip_features(clip)
-            listener.listen(features, class_of[clip.label])
-        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
-    progress(len(clips), len(clips))
-
-
 class _Listener:
     """Collects the events of recordings that are laid out one after the other.
 
@@ -147,27 +129,34 @@ class _Listener:
         Labelled time, in nanoseconds.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, classifier: Classifier) -> None:
         self.duration = 0
-        self._model = model
-        self._classifier = Classifier(model)
+        self._classifier = classifier
         self._place = 0
         self._reference: list[tuple[int, int, int]] = []
         self._found: list[tuple[int, int, int]] = []
 
-    def listen(self, features: Float32, label: str) -> None:
+    def overhear(self, recordings: Iterable[Recording], scenario: Scenario) -> Iterator[Recording]:
+        """Add recordings that are on their way."""
+        class_of = scenario.class_of
+        for recording in recordings:
+            if recording.label in class_of:
+                self._listen(recording.features, class_of[recording.label])
+            yield recording
+
+    def _listen(self, features: Float32, label: str) -> None:
         """Add a recording of one label."""
-        inputs = InputStream(self._classifier.inputs)(features)
+        inputs = self._classifier.inputs.stream()(features)
         probabilities = self._classifier.probabilities(inputs)
         if not len(probabilities):
             return
         length = len(probabilities) * FRAME_NANOSECONDS
         stamps = self._place + np.arange(0, length, FRAME_NANOSECONDS)
-        about = self._model.description
-        segmenter = Segmenter(about.smoothing, self._model.transitions, _FRAME_SECONDS)
+        smoothing, transitions = self._classifier.smoothing, self._classifier.transitions
+        segmenter = Segmenter(smoothing, transitions, FRAME_SECONDS)
         segments = segmenter.push(probabilities, stamps) + segmenter.close(self._place + length)
         self._found += [(one.start, one.end, one.label) for one in segments]
-        true = self._model.classes.index(label)
+        true = self._classifier.classes.index(label)
         self._reference.append((self._place, self._place + length, true))
         self.duration += length
         self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
@@ -177,4 +166,4 @@ class _Listener:
         reference, found = (
             Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._found)
         )
-        return detect(reference, found, self._model.classes, self.duration)
+        return detect(reference, found, self._classifier.classes, self.duration)

@@ -8,9 +8,9 @@ from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 from hearthlog.analyzer.dataset import Dataset, Progress
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.scores import Bin, Scores, calibration_error, reliability, score
-from hearthlog.analyzer.recipe import (
+from hearthlog.analyzer.method import (
     Fold,
-    Recipe,
+    Method,
     cross_validate,
     inverse_temperature,
     prepare,
@@ -40,15 +40,15 @@ class CrossValidation:
     reliability: list[Bin]
 
 
-def evaluate_recipe(
-    data: Dataset, recipe: Recipe, kind: Kind, progress: Progress
+def evaluate_method(
+    data: Dataset, method: Method, kind: Kind, progress: Progress
 ) -> CrossValidation:
     """Cross-validate a way to learn.
 
     Parameters
     ----------
     data : Dataset
-    recipe : Recipe
+    method : Method
     kind : str
         What is never on both sides of a fold: a `segment` (the paper's folds, which flatter,
         since segments of one recording are alike), a `source`, or a `collection`, which is what
@@ -63,8 +63,8 @@ def evaluate_recipe(
     """
     check_varied(data)
     folds = divide(data, kind)
-    examples = prepare(recipe, data)
-    [decisions] = cross_validate([recipe], examples, len(data.classes), folds, progress)
+    examples = prepare(method, data)
+    [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
     probabilities = softmax(inverse_temperature(decisions, data.target) * decisions)
     return CrossValidation(
         len(folds),

@@ -18,7 +18,7 @@ from hearthlog.analyzer.evaluation.events import (
     total,
 )
 from hearthlog.analyzer.evaluation.scores import Scores, score
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS

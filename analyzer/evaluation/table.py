@@ -66,13 +66,12 @@ def reliability_table(bins: Sequence[Bin], error: float) -> Iterator[str]:
 
 
 def search_table(tried: Sequence["Tried"]) -> Iterator[str]:
-    """Yield a line for each recipe that was tried."""
-    yield f"{'cost':>8} {'gamma':>8} {'macro F1':>9}   95 %"
-    for recipe, scores in tried:
-        yield (
-            f"{recipe.cost:8g} {recipe.gamma:8g} {scores.macro_f1:9.3f}   "
-            f"{_between(scores.macro_f1_interval)}"
-        )
+    """Yield a line for each method that was tried."""
+    names = "".join(f"{name:>8} " for name in tried[0].method.parameters)
+    yield f"{names}{'macro F1':>9}   95 %"
+    for method, scores in tried:
+        values = "".join(f"{value:8g} " for value in method.parameters.values())
+        yield f"{values}{scores.macro_f1:9.3f}   {_between(scores.macro_f1_interval)}"
 
 
 def shown(name: str) -> str:

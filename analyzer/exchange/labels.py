@@ -10,7 +10,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.heard import Heard
 from hearthlog.analyzer.marks import LATEST, NAME, Mark
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.description import CLASS_NAME
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.times import read_time, time_text
 

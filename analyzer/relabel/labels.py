@@ -31,7 +31,8 @@ from hearthlog.analyzer.relabel.reading import (
 from hearthlog.analyzer.replay.origin import Origin
 from hearthlog.models.classifier import Classifier
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile import Model, load_model
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.segments import Run, Segment
 from hearthlog.schemas.content import METADATA, LogContent, Rows
 from hearthlog.schemas.errors import LogError

@@ -12,7 +12,7 @@ from hearthlog.analyzer.relabel.labels import Job, Labelled, complete_layer, lab
 from hearthlog.analyzer.relabel.layer import About, digest, layer_path, read_about
 from hearthlog.analyzer.relabel.neighbours import Chain, find_chains, is_active
 from hearthlog.analyzer.workers import Workers
-from hearthlog.models.modelfile import Model
+from hearthlog.models.model import Model
 from hearthlog.models.segments import Run
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import stem

@@ -7,13 +7,12 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import InputStream
 from hearthlog.models.segments import Run, Segment, Segmenter
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Gap
+from hearthlog.recorder.stream import Gap
 from hearthlog.schemas.content import Rows
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
-_FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
 _STEP = NANOSECONDS // 5  # what the line through a sound card's times may jump by
 
 Float32 = NDArray[np.float32]
@@ -68,8 +67,8 @@ class Stream:
     def __init__(self, classifier: Classifier) -> None:
         self.segments: list[Segment] = []
         self._classifier = classifier
-        self._inputs = InputStream(classifier.inputs)
-        self._segmenter = Segmenter(classifier.smoothing, classifier.transitions, _FRAME_SECONDS)
+        self._inputs = classifier.inputs.stream()
+        self._segmenter = Segmenter(classifier.smoothing, classifier.transitions, FRAME_SECONDS)
         self._next: int | None = None  # number of the frame that follows
         self._end = 0  # of the last frame
         self._from_start = False  # of the sound, or from a gap on
@@ -108,7 +107,7 @@ class Stream:
         count = len(event.stamps)
         inputs = self._inputs(event.values)
         self._next, self._end = event.first + count, int(event.stamps[-1]) + FRAME_NANOSECONDS
-        heard = slice(count - len(inputs), None)  # labels are of a whole second
+        heard = slice(count - len(inputs), None)  # labels are of a whole window
         probabilities, novelty = self._classifier.classify(inputs)
         frames, stamps = np.arange(event.first, event.first + count)[heard], event.stamps[heard]
         if len(inputs):

@@ -7,11 +7,11 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap
+from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, iterate_columns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.messages import NANOSECONDS
 
 _FORMAT = "pcm-s16"

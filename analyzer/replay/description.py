@@ -6,18 +6,20 @@ from pathlib import Path
 
 from hearthlog import __version__
 from hearthlog.analyzer.replay.origin import Origin
-from hearthlog.models.modelfile import Model
-from hearthlog.recorder import features
+from hearthlog.models.card import CARD, DESCRIPTION, model_attachments
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.model import Model
 from hearthlog.recorder.log import LogDescription
 from hearthlog.recorder.pipeline import stream_info
 from hearthlog.schemas.topics import topics_of
-from hearthlog.schemas.writer import Attachment
-
-MODEL_CARD = "model_card.md"
 
 
 def describe(
-    origin: Origin, model: Model | None, output: Path, replayed: Mapping[str, str]
+    origin: Origin,
+    features: FeatureSet,
+    model: Model | None,
+    output: Path,
+    replayed: Mapping[str, str],
 ) -> LogDescription:
     """Say of a new log what the recorder said of the old one.
 
@@ -25,6 +27,7 @@ def describe(
     ----------
     origin : Origin
         Of the old one.
+    features : FeatureSet
     model : Model or None
         Which gives the labels now.
     output : Path
@@ -35,21 +38,21 @@ def describe(
     if model is not None and model.sha256 == origin.model_sha256:
         model = replace(model, name=origin.model)  # whatever its file is called here
     classes = None if model is None else list(model.classes)
-    info = stream_info(origin.microphone, origin.device, model)
-    attachments = [item for item in origin.attachments if item.name != MODEL_CARD]
+    info = stream_info(origin.microphone, origin.device, features, model)
+    attachments = [item for item in origin.attachments if item.name not in {CARD, DESCRIPTION}]
     if model is not None:
-        attachments.append(Attachment(MODEL_CARD, "text/markdown", model.card().encode()))
+        attachments += model_attachments(model)
     return LogDescription(
         root=output,
         node=origin.node,
-        microphone=origin.microphone,
-        topics=topics_of(origin.microphone, features.FEATURE_NAMES, classes),
-        info=info,
+        topics=topics_of(origin.microphone, features.feature_names, classes),
+        infos=[info],
         metadata={
             **origin.metadata,
             "version": __version__,
             "node": origin.node,
-            "feature_set": features.NAME,
+            "feature_set": features.name,
+            "feature_set_version": str(features.version),
             "model": info.model,
             "model_sha256": info.model_sha256,
             **replayed,

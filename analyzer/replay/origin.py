@@ -10,6 +10,9 @@ from mcap import records
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.schemas import messages
 from hearthlog.schemas.chunks import read_chunks
 from hearthlog.schemas.errors import LogError
@@ -132,6 +135,28 @@ def read_origin(path: Path, kind: str) -> Origin | None:
         attachments=attachments,
         first_frame=first,
     )
+
+
+def features_of(origin: Origin) -> FeatureSet:
+    """Return the feature set of a log, the default one where the log does not say which.
+
+    Raises
+    ------
+    LogError
+        If it is not installed, or another version of it is.
+    """
+    name = origin.feature_set or DEFAULT.name
+    try:
+        features = feature_set(name)
+    except ModelError as error:
+        raise LogError(f"{origin.path}: {error}") from error
+    version = origin.metadata.get("feature_set_version", "1")
+    if version != str(features.version):
+        raise LogError(
+            f"{origin.path}: has features of {name}, version {version[:20]!r}; here is version "
+            f"{features.version}, which gives other values"
+        )
+    return features
 
 
 def _microphones(file: LogFile, kind: str) -> set[str]:

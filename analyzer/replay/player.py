@@ -9,20 +9,20 @@ from threading import Event as Flag
 
 from hearthlog.analyzer.replay.comparison import Comparison
 from hearthlog.analyzer.replay.description import describe
-from hearthlog.analyzer.replay.origin import Origin
+from hearthlog.analyzer.replay.origin import Origin, features_of
 from hearthlog.analyzer.replay.recorded import Features, Piece
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import WINDOW_FRAMES
-from hearthlog.models.modelfile import Model
-from hearthlog.recorder import features
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.model import Model
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline, Record
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Frames, Gap, Health
+from hearthlog.recorder.stream import Frames, Gap, Health
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 
-_FRAME_SECONDS = FRAME_NANOSECONDS / NANOSECONDS
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
 _LOST = "the log that was replayed does not have it"
@@ -95,7 +95,7 @@ class Replay:
     @property
     def seconds(self) -> float:
         """Seconds of sound that were replayed."""
-        return self.frames * _FRAME_SECONDS
+        return self.frames * FRAME_SECONDS
 
 
 class Player:
@@ -192,15 +192,11 @@ class Player:
         self._result.compared.finish(cut=cut)
 
     def _begin(self, origin: Origin) -> None:
-        if self._wanted.kind == "features" and origin.feature_set not in {"", features.NAME}:
-            raise LogError(
-                f"{origin.path}: has features of set {origin.feature_set!r}; this version "
-                f"replays {features.NAME}"
-            )
         model = self._wanted.model(origin)
         asked = origin.configuration
         classifier = None if model is None else Classifier(model)
-        self._pipeline = Pipeline(origin.microphone, classifier, asked.statistics_every)
+        features = self._features(origin, classifier)
+        self._pipeline = Pipeline(origin.microphone, features, classifier, asked.statistics_every)
         if self._wanted.output is not None:
             about = self._describe(origin, model)
             seconds = asked.flush_seconds, asked.sync_seconds
@@ -208,6 +204,18 @@ class Player:
         self._sha256 = None if model is None else model.sha256
         self._origin = origin
         self._next, self._end, self._after_gap = 0, None, False
+
+    def _features(self, origin: Origin, classifier: Classifier | None) -> FeatureSet:
+        """Return the feature set to go on with; clips can be given to any."""
+        if self._wanted.kind != "features":
+            return DEFAULT if classifier is None else classifier.feature_set
+        features = features_of(origin)
+        if classifier is not None and classifier.feature_set != features:
+            raise LogError(
+                f"{origin.path}: has features of set {features.name}; the model is for "
+                f"{classifier.feature_set.name}"
+            )
+        return features
 
     def _goes_on(self, origin: Origin) -> bool:
         """Tell whether a log is of the same start of a recorder, but of another model."""
@@ -227,6 +235,7 @@ class Player:
             return
         assert origin.first_frame is not None
         classifier = None if model is None else Classifier(model)
+        self._features(origin, classifier)
         closing, opening = self._pipeline.change_model(model, classifier, *origin.first_frame)
         self._emit(closing)
         if self._log is not None:
@@ -238,7 +247,8 @@ class Player:
         assert self._wanted.output is not None
         kind = "clips" if self._wanted.kind == "audio" else self._wanted.kind
         replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
-        return describe(origin, model, self._wanted.output, replayed)
+        features = self._pipeline.feature_set
+        return describe(origin, features, model, self._wanted.output, replayed)
 
     def _follow(self, event: Features) -> None:
         """See whether frames follow the last ones, and if not, do what the recorder did."""
@@ -281,7 +291,7 @@ class Player:
             if end > self._start:
                 self._progress(end)
         if self._sha256 is None:
-            self.settled |= len(event.stamps) >= WINDOW_FRAMES
+            self.settled |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
 
     def _emit(self, records: list[Record]) -> None:

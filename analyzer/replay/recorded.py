@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.known import is_of_type
-from hearthlog.analyzer.replay.origin import Origin
-from hearthlog.recorder.features import FEATURE_NAMES
+from hearthlog.analyzer.replay.origin import Origin, features_of
 from hearthlog.recorder.stream import Gap, Health
 from hearthlog.schemas import messages
 from hearthlog.schemas.chunks import RawMessages
@@ -68,8 +67,10 @@ def read_recorded(
     Raises
     ------
     LogError
-        If the log is damaged, or its messages are not those of a recorder.
+        If the log is damaged, or its messages are not those of a recorder, or its feature set is
+        not installed.
     """
+    width = features_of(origin).width
     kinds = _HEARD if heard_only else _TYPES
     topics = {topic(origin.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not heard_only:
@@ -82,17 +83,17 @@ def read_recorded(
                 found[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
         try:
-            events = _events(found, origin.microphone, buffers)
+            events = _events(found, origin.microphone, width, buffers)
         except LogError as error:
             raise LogError(f"{origin.path}: {error}") from error
         yield Piece(events, found[messages.LABEL], found[messages.SEGMENT])
 
 
 def _events(
-    found: _Found, microphone: str, buffers: Sequence[int]
+    found: _Found, microphone: str, width: int, buffers: Sequence[int]
 ) -> list[Features | Gap | Health]:
     """Put features, gaps and states into the order in which they were written."""
-    heard = [_features(raw) for raw in found[messages.FEATURES]]
+    heard = [_features(raw, width) for raw in found[messages.FEATURES]]
     others: list[Gap | Health | None] = [gap for raw in found[messages.GAP] for gap in _gaps(raw)]
     others += [state for raw in found[messages.DIAGNOSTICS] for state in _health(raw, microphone)]
     raws = found[messages.FEATURES] + found[messages.GAP] + found[messages.DIAGNOSTICS]
@@ -125,11 +126,11 @@ def _runs(frames: Fields, rows: NDArray[np.intp]) -> Iterator[Features]:
         yield Features(first, frames["values"][run], frames["header.stamp"][run])
 
 
-def _features(raw: RawMessages) -> Fields:
+def _features(raw: RawMessages, width: int) -> Fields:
     (columns,) = decode([raw], ("header.stamp", "frame", "values"))
     values, numbers = columns["values"], columns["frame"]
-    if values.shape[1:] != (len(FEATURE_NAMES),):
-        raise LogError(f"{columns.topic}: frames are not of {len(FEATURE_NAMES)} values")
+    if values.shape[1:] != (width,):
+        raise LogError(f"{columns.topic}: frames are not of {width} values")
     if not np.abs(values).max() < _LARGEST_VALUE:  # a NaN compares as false
         raise LogError(f"{columns.topic}: holds values that no sound has")
     if numbers.max() > _LARGEST_FRAME:

@@ -11,7 +11,8 @@ from hearthlog.analyzer.replay.origin import Origin, read_origin
 from hearthlog.analyzer.replay.player import Player, Replay, Wanted
 from hearthlog.analyzer.replay.recorded import read_recorded
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile import SUFFIX, Model, load_model
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import SUFFIX, load_model
 from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logfile import time_span

@@ -20,7 +20,8 @@ from hearthlog.analyzer.report.spans import NONE, Int64, Spans, common, joined, 
 from hearthlog.analyzer.report.trouble import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.report.words import ALIASES
 from hearthlog.analyzer.selection import Selection, select
-from hearthlog.models.modelfile import CLASS_NAME
+from hearthlog.models.card import DESCRIPTION
+from hearthlog.models.description import CLASS_NAME, class_metrics
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, read_columns
 from hearthlog.schemas.errors import LogError
@@ -35,8 +36,6 @@ _LATEST = 1 << 61
 _MOST_CLASSES = 100
 _FIELDS = {"header.stamp", "duration", "label", "confidence"}
 _SEGMENTS = re.compile(r"/(?P<microphone>[^/]+)/segment")
-_CARD = "model_card.md"
-_ROW = re.compile(r"\| ([a-z][a-z0-9_]*) \|.*\| (\d\.\d+) \| \d\.\d+ \| \d\.\d+ \|")
 Progress = Callable[[float], None]
 Source = tuple[str, str]  # node, microphone
 
@@ -77,7 +76,7 @@ class Heard:
     gaps, troubles : list of Trouble
         In the part of time that was to be looked at closely.
     precisions : dict of str to float
-        How often the model was right with a class, by its card.
+        How often the model was right with a class, by its own figures.
     nodes : list of str
     losses : list of str
         What could not be read, and why.
@@ -343,7 +342,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
 
 
 def _precisions(entries: Iterable[Entry]) -> dict[str, float]:
-    """Read from the model cards in the logs how often a class was right; the last log counts."""
+    """Read from the models that logs name how often a class was right; the last log counts."""
     found: Mapping[str, float] = {}
     for entry in entries:
         try:
@@ -357,10 +356,9 @@ def _precisions_of(path: Path) -> dict[str, float]:
     with LogFile(path) as file:
         places = [place for place in file.places if place.opcode == Opcode.ATTACHMENT]
         records = [file.record(place) for place in places]
-    texts = [r.data for r in records if isinstance(r, Attachment) and r.name == _CARD]
-    lines = [line for data in texts for line in data.decode(errors="replace").splitlines()]
-    rows = (_ROW.fullmatch(line) for line in lines)
-    return {ALIASES.get(row[1], row[1]): min(float(row[2]), 1.0) for row in rows if row}
+    texts = [r.data for r in records if isinstance(r, Attachment) and r.name == DESCRIPTION]
+    classes = [metrics for text in texts for metrics in class_metrics(text).items()]
+    return {ALIASES.get(name, name): metrics.precision for name, metrics in classes}
 
 
 def _lose(heard: Heard, line: str) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from hearthlog.analyzer.timeline.contents import Clip, Frames, Spans, no_spans
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 TOPIC = re.compile(
     r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"

@@ -14,12 +14,12 @@ from hearthlog.analyzer.timeline.contents import Lines, Spans
 from hearthlog.analyzer.timeline.decoding import FIELDS, TOPIC, decibel, spans_of, value_names
 from hearthlog.analyzer.timeline.grid import Float64, Grid, Int64
 from hearthlog.analyzer.timeline.lanes import Changes, changes, clock
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.chunks import RawMessages
 from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import time_span
 from hearthlog.schemas.messages import NANOSECONDS
 

@@ -40,10 +40,10 @@ from hearthlog.analyzer.timeline.decoding import (
 )
 from hearthlog.analyzer.timeline.files import File, find_files, records_of
 from hearthlog.analyzer.timeline.grid import Grid, Means
-from hearthlog.recorder.stream import FRAME_NANOSECONDS
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.series import iterate_pieces
 

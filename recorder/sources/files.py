@@ -10,7 +10,7 @@ import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.schemas.frames import SAMPLE_RATE
 
 _BLOCK_SECONDS = 10.0
 _RATES = range(1_000, 768_001)  # what any recording has, and soxr converts in bounded memory

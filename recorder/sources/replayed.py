@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.features import FRAME_SAMPLES
 from hearthlog.recorder.sources.files import audio_seconds, read_audio
-from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Health
+from hearthlog.recorder.stream import Event, Frames, Health
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
 
 _REALTIME_FRAMES = 10

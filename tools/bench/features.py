@@ -6,7 +6,8 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.recorder.features import FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
+from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
 from hearthlog.tools.bench.workload import Workload

@@ -8,10 +8,10 @@ from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
 from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.recipe import RECIPES, decide, fit, prepare, softmax
+from hearthlog.analyzer.method import prepare, softmax
+from hearthlog.analyzer.svm_method import BANDS, LearnedSvm
 from hearthlog.models.classifier import Classifier
-from hearthlog.models.inputs import InputStream
-from hearthlog.recorder.features import FeatureExtractor
+from hearthlog.models.svm_rbf import SVM_RBF
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
 from hearthlog.tools.bench.workload import Workload
@@ -31,7 +31,8 @@ def measure(work: Workload) -> Table:
     rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
     machine[-1].decision_function_shape = "ovo"
-    decision = decide(machine, rows, len(work.model.classes))
+    learned = LearnedSvm(machine, rows[:0], np.empty(0, np.intp))
+    decision = learned.decide(rows, len(work.model.classes))
     machine[-1].decision_function_shape = "ovr"
     expected = softmax(work.model.description.inverse_temperature * decision)
     difference = np.abs(ours(rows) - expected).max()
@@ -49,15 +50,14 @@ def measure(work: Workload) -> Table:
         row = Row(f"scikit-learn, {count} rows a call", other, "µs a row", other / mine, target)
         found.append(row)
     found.append(Row("largest difference", float(difference), "", target=_THE_SAME))
-    support, classes = len(work.model.support_vectors), len(work.model.classes)
-    return Table(f"inference: {support} support vectors, {classes} classes, CPU time", found)
+    size, classes = SVM_RBF.summary(work.model), len(work.model.classes)
+    return Table(f"inference: {size}, {classes} classes, CPU time", found)
 
 
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
     """Fit what `hearthlog.analyzer.train` does, and calibrate it as scikit-learn does."""
-    recipe = RECIPES["bands"]
-    examples = prepare(recipe, data)
-    machine = fit(recipe, examples)
+    examples = prepare(BANDS, data)
+    machine = BANDS.fit(examples).machine
     machine[-1].decision_function_shape = "ovr"  # the default, which its calibration needs
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
@@ -66,4 +66,5 @@ def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
 
 
 def _inputs(work: Workload) -> NDArray[np.float32]:
-    return InputStream("bands")(FeatureExtractor()(work.frames(_SECONDS)))
+    features = BANDS.features
+    return features.inputs[BANDS.inputs].stream()(features.extractor()(work.frames(_SECONDS)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.timing import BenchError
 
 DEVICE = "labmic"

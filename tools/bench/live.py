@@ -8,8 +8,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.models.svm_rbf import SVM_RBF
 from hearthlog.recorder.sources import capture
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.labmic import DEVICE, make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import HEARTHLOG, BenchError
@@ -54,8 +55,8 @@ class _Usage:
 
 def measure(work: Workload) -> Table:
     """Record for a minute, and beside it hear the same device without doing anything."""
-    support = len(work.model.support_vectors)
-    title = f"live: one microphone for {_SECONDS:.0f} s, {support} support vectors"
+    size = SVM_RBF.summary(work.model)
+    title = f"live: one microphone for {_SECONDS:.0f} s, {size}"
     try:
         rows = _live(work)
     except (BenchError, ImportError) as error:

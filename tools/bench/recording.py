@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from hearthlog.models.svm_rbf import SVM_RBF
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of_processes
 from hearthlog.tools.bench.workload import Workload
@@ -15,10 +16,9 @@ def measure(work: Workload) -> Table:
     second = work.write_wav("second.wav", 1.0)
     elapsed, cpu = best_of_processes([_record(work, work.wav, i) for i in range(_REPEATS)])
     started, _ = best_of_processes([_record(work, second, i) for i in range(_REPEATS)])
-    support = len(work.model.support_vectors)
+    size = SVM_RBF.summary(work.model)
     return Table(
-        f"recording: {work.seconds:.0f} s of WAV to a labelled log on one core, {support} support "
-        "vectors",
+        f"recording: {work.seconds:.0f} s of WAV to a labelled log on one core, {size}",
         [
             Row("hearthlog record", work.seconds / elapsed, "x real time", target=_FAST),
             Row("the same by CPU time", work.seconds / cpu, "x real time"),

@@ -15,8 +15,10 @@ from rosbags.highlevel import AnyReader
 from hearthlog.analyzer.dataset import Dataset
 from hearthlog.analyzer.hmm import viterbi
 from hearthlog.analyzer.train import train_model
-from hearthlog.models.inputs import InputStream
-from hearthlog.models.modelfile import Model, save_model
+from hearthlog.models.classifier import Classifier
+from hearthlog.models.model import Model
+from hearthlog.models.modelfile import save_model
+from hearthlog.models.svm_rbf import SVM_RBF
 from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.messages import LABEL, definition, encode, header, message, nanoseconds
 from hearthlog.tools.bench.inference import fit_scikit_learn
@@ -66,8 +68,8 @@ def measure(work: Workload) -> Table:
         Row(what, peer, "s", peer / two.seconds, Target(10)),
         Row("peak memory of a process", two.megabytes, "MB", target=Target(500, at_most=True)),
     ]
-    support, classes = len(model.support_vectors), len(model.classes)
-    title = f"relabel: {two.frames:,} frames, {support} support vectors, {classes} classes, elapsed"
+    size, classes = SVM_RBF.summary(model), len(model.classes)
+    title = f"relabel: {two.frames:,} frames, {size}, {classes} classes, elapsed"
     return Table(title, rows)
 
 
@@ -75,7 +77,7 @@ def _part(work: Workload) -> Dataset:
     """Take so much of the training data that about 2,000 vectors support what it teaches."""
     data, _ = work.training
     # The fewer segments, the larger the share of them at the borders between classes.
-    share = min(_SUPPORT / len(work.model.support_vectors), 1.0) ** 1.2
+    share = min(_SUPPORT / len(work.model.arrays["support_vectors"]), 1.0) ** 1.2
     rows = np.random.default_rng(0).permutation(len(data))[: round(share * len(data))]
     rows.sort()
     fields = ("windows", "target", "group", "collection", "weight")
@@ -109,7 +111,7 @@ def _peer(log: Path, model: Model, data: Dataset, output: Path) -> float:
         chosen = [c for c in reader.connections if c.topic == "/mic/features"]
         read = (reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen))
         heard: list[Any] = [message for _, message in zip(range(_SAMPLE), read, strict=False)]
-    inputs = InputStream(model.description.inputs)(np.array([m.values for m in heard]))
+    inputs = Classifier(model).inputs.stream()(np.array([m.values for m in heard]))
     rows = inputs.astype(np.float64)
     calls = [rows[first : first + _CALL] for first in range(0, len(rows), _CALL)]
     found = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.tools.cli.method import chosen_method
 from hearthlog.tools.cli.progress import steps_done
-from hearthlog.tools.cli.recipe import chosen_recipe
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.events import Detections
     from hearthlog.analyzer.evaluation.folds import Kind
     from hearthlog.analyzer.evaluation.scores import Bin, Scores
+    from hearthlog.analyzer.method import Method
 
 
 def evaluate(
@@ -94,7 +95,7 @@ def evaluate(
                 _search(data, scenario, folds or "source", method, as_json=as_json)
             else:
                 assert folds is not None
-                _evaluate_recipe(data, scenario, folds, method, plot, as_json=as_json)
+                _evaluate_method(data, scenario, folds, method, plot, as_json=as_json)
     elif scheduler is not None:
         wrong_use("--scheduler goes with --folds, --adaptation or --search")
     elif all(of_log) and not any((*of_model, scenario)):
@@ -144,7 +145,8 @@ def _evaluate_model(
     else:
         scores = found.scores
         print(
-            f"model {model.name}, scenario {chosen.name}: {scores.segments} segments of 1 s from "
+            f"model {model.name}, scenario {chosen.name}: {scores.segments} segments of "
+            f"{model.description.window_seconds:g} s from "
             f"{scores.groups} sources\n"
         )
         _print_tables(scores, found.detections)
@@ -161,16 +163,16 @@ def _evaluate_model(
         )
 
 
-def _evaluate_recipe(
+def _evaluate_method(
     data: Path, scenario: str, folds: str, method: str, plot: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.evaluation.folds import evaluate_recipe
+    from hearthlog.analyzer.evaluation.folds import evaluate_method
     from hearthlog.analyzer.evaluation.table import reliability_table
 
-    recipe, kind = chosen_recipe(method), _kind(folds)
-    segments = _segments(data, scenario)
+    chosen, by = chosen_method(method), _kind(folds)
+    segments = _segments(data, scenario, chosen)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        found = evaluate_recipe(segments, recipe, kind, report)
+        found = evaluate_method(segments, chosen, by, report)
     if plot is not None:
         _save_plot(
             plot, f"{method} on {data} ({scenario}), by {folds}", found.scores, found.reliability
@@ -188,7 +190,8 @@ def _evaluate_recipe(
         )
         return
     print(
-        f"method {method}, scenario {scenario}: {found.scores.segments} segments of 1 s from "
+        f"method {method}, scenario {scenario}: {found.scores.segments} segments of "
+        f"{chosen.features.window_seconds:g} s from "
         f"{found.scores.groups} sources, {found.folds} folds by {folds}\n"
     )
     _print_tables(found.scores, None)
@@ -198,25 +201,24 @@ def _evaluate_recipe(
 
 def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool) -> None:
     from hearthlog.analyzer.evaluation.table import search_table
-    from hearthlog.analyzer.search import around, search
+    from hearthlog.analyzer.search import search
 
-    recipes, kind = around(chosen_recipe(method)), _kind(folds)
-    segments = _segments(data, scenario)
+    chosen, by = chosen_method(method), _kind(folds)
+    segments = _segments(data, scenario, chosen)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        tried = search(segments, recipes, kind, report)
+        tried = search(segments, chosen.variations(), by, report)
     if as_json:
-        found = [
-            {"cost": one.recipe.cost, "gamma": one.recipe.gamma} | asdict(one.scores)
-            for one in tried
-        ]
+        found = [one.method.parameters | asdict(one.scores) for one in tried]
         _print_json({"scenario": scenario, "method": method, "by": folds, "tried": found})
         return
     print(
-        f"method {method}, scenario {scenario}: {len(segments)} segments of 1 s, folds by {folds}\n"
+        f"method {method}, scenario {scenario}: {len(segments)} segments of "
+        f"{chosen.features.window_seconds:g} s, folds by {folds}\n"
     )
     print(*search_table(tried), sep="\n")
-    best = tried[0].recipe
-    print(f"\nhearthlog train --method {method} --cost {best.cost:g} --gamma {best.gamma:g} …")
+    best = tried[0].method.parameters
+    options = "".join(f" --{name} {value:g}" for name, value in best.items())
+    print(f"\nhearthlog train --method {method}{options} …")
 
 
 def _kind(folds: str) -> "Kind":
@@ -231,21 +233,22 @@ def _kind(folds: str) -> "Kind":
 def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: bool) -> None:
     from hearthlog.analyzer.adaptation import adaptation_curve
 
-    recipe = chosen_recipe(method)
-    segments = _segments(data, scenario)
+    chosen = chosen_method(method)
+    segments = _segments(data, scenario, chosen)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        found = adaptation_curve(segments, recipe, report)
+        found = adaptation_curve(segments, chosen, report)
     if as_json:
         _print_json({"scenario": scenario, "method": method} | found._asdict())
         return
     width = max(map(len, (*found.collections, "collection left out")))
-    print("macro F1 after so many corrected segments of 1 s\n")
+    window = f"{chosen.features.window_seconds:g} s"
+    print(f"macro F1 after so many corrected segments of {window}\n")
     print(f"{'collection left out':{width}}", *(f"{count:6}" for count in found.corrected))
     for name, row in (found.collections | {"mean": found.mean}).items():
         print(f"{name:{width}}", *(f"{value:6.3f}" for value in row))
 
 
-def _segments(data: Path, scenario: str) -> "Dataset":
+def _segments(data: Path, scenario: str, method: "Method") -> "Dataset":
     from hearthlog.analyzer.dataset import build_dataset
     from hearthlog.analyzer.manifest import read_manifest
     from hearthlog.analyzer.scenario import load_scenario
@@ -253,7 +256,7 @@ def _segments(data: Path, scenario: str) -> "Dataset":
     chosen = load_scenario(scenario)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
     with steps_done(f"listening to {len(clips)} clips") as report:
-        return build_dataset(clips, chosen, report)
+        return build_dataset(clips, chosen, report, features=method.features)
 
 
 def _evaluate_log(

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.compare import Comparison
     from hearthlog.analyzer.dataset import Recording
     from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.models.features.feature_set import FeatureSet
     from hearthlog.models.registry import Entry
 
 models = typer.Typer(
@@ -59,6 +60,7 @@ def show(
     as_json: _Json = False,
 ) -> None:
     """Print a model's card: what it tells apart, how well, and what it learned from."""
+    from hearthlog.models.card import model_card
     from hearthlog.models.registry import load
 
     model = load(_folder(folder), name)
@@ -66,7 +68,7 @@ def show(
         about = {"name": model.name, "sha256": model.sha256}
         print(json.dumps(about | model.description.model_dump(), indent=2))
     else:
-        print(model.card(), end="")
+        print(model_card(model), end="")
 
 
 @models.command()
@@ -97,6 +99,7 @@ def compare(
     from hearthlog.analyzer.compare import compare_models
     from hearthlog.analyzer.evaluation.clips import scenario_of
     from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.models.features.installed import feature_set
     from hearthlog.models.registry import load
     from hearthlog.tools.cli.selection import wrong_use
 
@@ -105,7 +108,8 @@ def compare(
     place = _folder(folder)
     first, second = load(place, a), load(place, b)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
-    found = compare_models(first, second, _recordings(data, logs, chosen), chosen)
+    features = feature_set(first.description.feature_set)
+    found = compare_models(first, second, _recordings(data, logs, chosen, features), chosen)
     if as_json:
         print(json.dumps(asdict(found) | {"clear": found.clear}, indent=2))
     else:
@@ -145,14 +149,16 @@ def rollback(folder: _Folder = None) -> None:
     print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
 
 
-def _recordings(data: Path | None, logs: Path | None, scenario: "Scenario") -> "list[Recording]":
-    from hearthlog.analyzer.compare import clip_recordings
+def _recordings(
+    data: Path | None, logs: Path | None, scenario: "Scenario", features: "FeatureSet"
+) -> "list[Recording]":
+    from hearthlog.analyzer.dataset import clip_recordings
     from hearthlog.analyzer.home import home_recordings
     from hearthlog.analyzer.manifest import read_manifest
     from hearthlog.tools.cli.progress import share_done
 
     if logs is not None:
-        return list(home_recordings(logs))
+        return list(home_recordings(logs, features))
     assert data is not None
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, scenario.labels)
     with share_done(f"listening to {len(clips)} clips") as share:
@@ -160,7 +166,7 @@ def _recordings(data: Path | None, logs: Path | None, scenario: "Scenario") -> "
         def report(done: int, total: int) -> None:
             share(done / max(total, 1))
 
-        return list(clip_recordings(clips, scenario, report))
+        return list(clip_recordings(clips, scenario, report, features))
 
 
 def _folder(given: Path | None) -> Path:
@@ -178,7 +184,7 @@ def _after(before: str | None) -> str:
 
 def _print_comparison(found: "Comparison") -> None:
     a, b = found.a, found.b
-    print(f"{a.scores.segments} segments of 1 s from {a.scores.groups} sources", end="")
+    print(f"{a.scores.segments} segments from {a.scores.groups} sources", end="")
     print(f"; {found.sources_left_out} sources left out that a model has learned from")
     for reason, count in found.skipped.items():
         print(f"{count} recordings left out: {reason}")

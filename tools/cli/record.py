@@ -80,6 +80,7 @@ def record(
         "keep_audio": keep_audio,
     }
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
+    (microphone,) = settings.microphone
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -88,13 +89,13 @@ def record(
         begin = start_time(start, files[0])
         with share_done("recording") as progress:
             source = FileSource(files, begin, realtime=realtime, progress=progress)
-            recording = record_files(settings, source, stop, asked)
+            recording = record_files(settings, microphone, source, stop, asked)
     elif start is not None or realtime:
         raise typer.BadParameter("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
             typer.echo("hearthlog: listening; Ctrl-C completes the log", err=True)
-        recording = record_microphone(settings, stop, asked)
+        recording = record_microphone(settings, microphone, stop, asked)
     _say(recording)
 
 

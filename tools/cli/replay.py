@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.replay.origin import Origin
     from hearthlog.analyzer.replay.player import Replay, Wanted
     from hearthlog.analyzer.replay.replay import LogSet
-    from hearthlog.models.modelfile import Model
+    from hearthlog.models.model import Model
 
 _MAX_RATE = "max"
 

@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.tools.cli.method import chosen_method
 from hearthlog.tools.cli.progress import steps_done
-from hearthlog.tools.cli.recipe import chosen_recipe
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.dataset import Dataset, Recording
-    from hearthlog.analyzer.recipe import Recipe
+    from hearthlog.analyzer.method import Method
     from hearthlog.analyzer.scenario import Scenario
-    from hearthlog.models.modelfile import Model
+    from hearthlog.models.features.feature_set import FeatureSet
+    from hearthlog.models.model import Model
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -69,9 +70,9 @@ def train(
             wrong_use("give --data and --scenario, or --base and --home")
         from hearthlog.analyzer.workers.parallel import joblib_on
 
-        recipe = chosen_recipe(method, cost, gamma)
+        chosen = chosen_method(method, cost=cost, gamma=gamma)
         with joblib_on(scheduler):
-            model, segments = _learned(data, scenario, home or [], recipe, smoothing)
+            model, segments = _learned(data, scenario, home or [], chosen, smoothing)
     save_model(model, output)
     saved = load_model(output)
     if as_json:
@@ -84,7 +85,7 @@ def train(
 
 
 def _learned(
-    data: list[Path], scenario: str, home: list[Path], recipe: "Recipe", smoothing: str
+    data: list[Path], scenario: str, home: list[Path], method: "Method", smoothing: str
 ) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.dataset import build_dataset
     from hearthlog.analyzer.manifest import read_manifest
@@ -96,20 +97,23 @@ def _learned(
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
     with steps_done(f"listening to {len(clips)} clips") as report:
-        segments = build_dataset(clips, chosen, report, _heard_at(home))
+        recordings = _heard_at(home, method.features)
+        segments = build_dataset(clips, chosen, report, recordings, method.features)
     _warn_of_few(segments)
     with steps_done(f"learning from {len(segments)} segments") as report:
-        return train_model(segments, chosen, report, recipe, smoothing), segments
+        return train_model(segments, chosen, report, method, smoothing), segments
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.dataset import cut_recordings
     from hearthlog.analyzer.home import home_sequences
     from hearthlog.analyzer.train import adapt_model
+    from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile import load_model
 
     model = load_model(base)
-    segments = cut_recordings(_heard_at(home), _scenario(model))
+    features = feature_set(model.description.feature_set)
+    segments = cut_recordings(_heard_at(home, features), _scenario(model), features)
     with steps_done(f"learning from {len(segments)} segments of the home besides"):
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         return adapt_model(model, segments, sequences), segments
@@ -127,11 +131,11 @@ def _manifest(path: Path) -> Path:
     return path / "manifest.csv" if path.is_dir() else path
 
 
-def _heard_at(folders: list[Path]) -> Iterator["Recording"]:
-    for folder in folders:
-        from hearthlog.analyzer.home import home_recordings
+def _heard_at(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
+    from hearthlog.analyzer.home import home_recordings
 
-        yield from home_recordings(folder)
+    for folder in folders:
+        yield from home_recordings(folder, features)
 
 
 def _warn_of_few(segments: "Dataset") -> None:
@@ -145,6 +149,8 @@ def _warn_of_few(segments: "Dataset") -> None:
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
+    from hearthlog.models.classifier import classifier_kind
+
     about, metrics = model.description, model.description.metrics
     width = max(len(name) for name in (*about.classes, "class"))
     print(f"{'class':{width}}  sources  seconds  segments  precision  recall     F1")
@@ -157,8 +163,8 @@ def _print(model: "Model", segments: "Dataset") -> None:
     print(f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error ", end="")
     print(f"{metrics.expected_calibration_error:.3f}", end="")
     print(f" (cross-validated, {metrics.folds} folds, sources never split)")
-    print(f"cost {about.cost:g}, gamma {about.gamma:.4g}, ", end="")
-    print(f"{len(model.support_vectors)} support vectors\n")
+    parameters = [f"{name} {value:.4g}" for name, value in about.parameters.items()]
+    print(*parameters, classifier_kind(about.kind).summary(model), sep=", ", end="\n\n")
     print("confusion: true class in rows, predicted in columns")
     size = max(len(str(value)) for row in metrics.confusion for value in row) + 2
     for name, row in zip(about.classes, metrics.confusion, strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.sounds import (
     LABELS,
     RoomTone,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hearthlog.recorder.features import SAMPLE_RATE
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.waveforms import (
     Range,
     Train,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter, sosfilt
 
-from hearthlog.recorder.features import SAMPLE_RATE
+from hearthlog.schemas.frames import SAMPLE_RATE
 
 # First three formants of a man's vowels (Peterson & Barney 1952), and a fixed fourth.
 _VOWELS = {

@@ -1,4 +1,4 @@
-"""Feature set `auros21`: 21 values for every 50 ms frame.
+"""The values of `auros21` for every frame.
 
 Everything is computed in float64 over whole arrays of frames and rounded once, to float32.
 A frame's values do not depend on how many frames are computed together with it, so a stream
@@ -10,28 +10,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.inputs import dct_weights
+from hearthlog.models.features.auros21.inputs import dct_weights
+from hearthlog.models.features.auros21.names import CEPSTRA, FEATURE_NAMES, MEL_BANDS
 from hearthlog.models.rowwise import rowwise_matmul
-
-NAME = "auros21"
-SAMPLE_RATE = 16_000
-FRAME_SAMPLES = 800
-MFCC_COUNT = 13
-FEATURE_NAMES = (
-    "energy",
-    "zero_crossing_rate",
-    "energy_entropy",
-    "spectral_centroid",
-    "spectral_spread",
-    "spectral_entropy",
-    "spectral_flux",
-    "spectral_rolloff",
-    *(f"mfcc_{i}" for i in range(1, MFCC_COUNT + 1)),
-)
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 _BINS = FRAME_SAMPLES // 2
 _PARTS = 10  # sub-frames, and sub-bands, of the two entropies
-_MEL_BANDS = 32
 _ROLLOFF_BANDS = 20
 _ROLLOFF_SHARE = 0.90
 _RUNNING_SUM = np.triu(np.ones((_ROLLOFF_BANDS, _ROLLOFF_BANDS)))
@@ -112,7 +97,7 @@ class FeatureExtractor:
         power = np.square(magnitude[1:], out=magnitude[1:])
         out[:, 7] = _rolloff(power, band_power[1:])
         mel_db = 10.0 * np.log10(rowwise_matmul(power, _mel_weights()) + _POWER_FLOOR)
-        out[:, 8:] = rowwise_matmul(mel_db, dct_weights())
+        out[:, CEPSTRA] = rowwise_matmul(mel_db, dct_weights())
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
@@ -145,7 +130,7 @@ def mel_centres() -> Float64:
 
 
 def _mel_corners() -> Float64:
-    return _mel_to_hertz(np.linspace(0.0, _hertz_to_mel(SAMPLE_RATE / 2), _MEL_BANDS + 2))
+    return _mel_to_hertz(np.linspace(0.0, _hertz_to_mel(SAMPLE_RATE / 2), MEL_BANDS + 2))
 
 
 # The scale of Slaney's Auditory Toolbox: linear below 1 kHz, logarithmic above.

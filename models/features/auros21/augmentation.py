@@ -7,10 +7,10 @@ the cepstra stand for, so the sound itself is not needed.
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.inputs import bands_of, dct_weights
-from hearthlog.recorder.features import mel_centres
+from hearthlog.models.features.auros21.extractor import mel_centres
+from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
+from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY
 
-_ENERGY, _CEPSTRA = 0, slice(8, None)
 _SHARE = 0.6  # of the segments, of each of gain, tilt and every bump
 _GAIN = 12.0  # dB, and how far it may be from none
 _TILT = 3.0  # dB an octave
@@ -39,15 +39,15 @@ def augmented(windows: Float32, rng: np.random.Generator) -> Float32:
         Energy and cepstra are changed; what else a spectrum tells, hardly depends on these.
     """
     gain, curve = _curves(len(windows), rng)
-    cepstra = windows[:, :, _CEPSTRA]
+    cepstra = windows[:, :, CEPSTRA]
     before = bands_of(cepstra.reshape(-1, cepstra.shape[2])).reshape(*cepstra.shape[:2], -1)
     after = before + (gain + curve)[:, np.newaxis]
     noisy = rng.random((len(windows), 1, 1)) < _NOISE_SHARE
     noise = rng.uniform(*_NOISE, (len(windows), 1, 1))
     after = np.where(noisy, _power_sum(after, noise), after)
     changed = windows.astype(np.float64)
-    changed[:, :, _CEPSTRA] += (after - before) @ dct_weights()
-    changed[:, :, _ENERGY] *= 10.0 ** (gain / 10.0)
+    changed[:, :, CEPSTRA] += (after - before) @ dct_weights()
+    changed[:, :, ENERGY] *= 10.0 ** (gain / 10.0)
     return changed.astype(np.float32)
 
 

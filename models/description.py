@@ -1,0 +1,207 @@
+"""What a model file says of its model besides arrays, checked when it is read."""
+
+import re
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic_core import from_json
+
+from hearthlog.models.errors import ModelError
+
+CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
+MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
+FORMAT: Final = 3
+_OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
+
+_ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
+_Text = Annotated[str, StringConstraints(pattern=rf"^{TEXT.pattern}$")]
+_Digest = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
+_Count = Annotated[int, Field(ge=0, lt=1 << 53)]
+_Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+_Seconds = Annotated[float, Field(ge=0.0, le=1e12)]
+_Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class Amount(_Record):
+    """How much of something was learned from; a source is a source group of the manifest."""
+
+    sources: _Count
+    segments: _Count
+    seconds: _Seconds
+
+
+class Collection(_Record):
+    """A public collection the audio came from: to be named wherever the model goes."""
+
+    name: _Text
+    licence: _Text
+    clips: _Count
+
+
+class TrainingData(_Record):
+    """What the model learned from; the digest is of its segments, not of files.
+
+    Attributes
+    ----------
+    home : dict of str to Amount
+        What a home of its own added, by class, if it was adapted.
+    base_sha256 : str
+        Of the model file that was adapted, or empty.
+    """
+
+    sha256: _Digest
+    classes: dict[_ClassName, Amount]
+    collections: list[Collection]
+    home: dict[_ClassName, Amount] = {}
+    base_sha256: _Text = ""
+
+
+class ClassMetrics(_Record):
+    """Of the segments of one class, cross-validated."""
+
+    precision: _Share
+    recall: _Share
+    f1: _Share
+
+
+class Metrics(_Record):
+    """Cross-validated by source group, with the model's own parameters.
+
+    The confusion matrix has a row for each true class and a column for each predicted one.
+    """
+
+    folds: _Count
+    macro_f1: _Share
+    expected_calibration_error: _Share
+    classes: dict[_ClassName, ClassMetrics]
+    confusion: list[list[_Count]]
+
+
+class Smoothing(_Record):
+    """How labels become segments.
+
+    Attributes
+    ----------
+    method : str
+        `merge`: successive equal labels become one. `hmm`: the labels are those of the likeliest
+        path through a hidden Markov model, decided `lag_seconds` after the sound.
+    lag_seconds : float
+    """
+
+    method: Literal["merge", "hmm"]
+    lag_seconds: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+
+
+class Description(_Record):
+    """Everything about a model that is no array.
+
+    Attributes
+    ----------
+    kind : str
+        Of classifier.
+    parameters : dict
+        Of that kind.
+    feature_set, feature_set_version, inputs : str, int, str
+        What the classifier looks at.
+    method : str
+        By which it was learned, and is adapted.
+    copies : int
+        How often each segment was learned from as another microphone would hear it.
+    inverse_temperature : float
+        Calibrates: it multiplies the decision values before the softmax.
+    """
+
+    format: Literal[3]
+    kind: _Text
+    parameters: dict[_Text, Any]
+    method: _Text
+    classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
+    feature_set: _Text
+    feature_set_version: Annotated[int, Field(ge=1, lt=1 << 31)]
+    feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
+    inputs: _Text
+    window_seconds: _Positive
+    scenario_name: _Text
+    scenario: dict[_ClassName, list[_Text]]
+    copies: _Count = 0
+    calibration: Literal["temperature"]
+    inverse_temperature: _Positive
+    smoothing: Smoothing
+    training_data: TrainingData
+    metrics: Metrics
+    versions: dict[_Text, _Text]
+
+
+def read_description(text: str) -> Description:
+    """Read a description, of this format or an older one.
+
+    Raises
+    ------
+    ModelError
+        If it is of a newer format, or says what cannot be.
+    """
+    try:
+        content = from_json(text)
+        if isinstance(content, dict):
+            content = _in_this_format(content)
+        return Description.model_validate(content)
+    except ValidationError as error:
+        raise ModelError(first_problem(error)) from error
+    except ValueError as error:
+        raise ModelError(f"its description is no JSON ({one_line(error)})") from error
+
+
+class _WithMetrics(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+    metrics: Metrics
+
+
+def class_metrics(text: bytes) -> dict[str, ClassMetrics]:
+    """Read the figures of each class from a description in a log, which may be of any format.
+
+    Returns
+    -------
+    dict of str to ClassMetrics
+        Empty where it has none that can be understood.
+    """
+    try:
+        return _WithMetrics.model_validate_json(text).metrics.classes
+    except ValidationError:
+        return {}
+
+
+def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
+    number = content.get("format")
+    if isinstance(number, int) and number > FORMAT:
+        raise ModelError(f"is of format {number}, newer than this version of hearthlog: update it")
+    if number != 2:
+        return content
+    inputs = content.get("inputs", "statistics")
+    parameters = {key: content[key] for key in ("cost", "gamma") if key in content}
+    rest = {key: value for key, value in content.items() if key not in parameters}
+    return {
+        **rest,
+        "format": FORMAT,
+        "parameters": parameters,
+        "feature_set_version": 1,
+        "inputs": inputs,
+        "method": _OLD_METHODS.get(inputs, "") if isinstance(inputs, str) else "",
+    }
+
+
+def first_problem(error: ValidationError) -> str:
+    """Say in one line what the first thing wrong with a description is."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
+    return f"{one_line(where)}: {one_line(first['msg'])}"
+
+
+def one_line(text: object) -> str:
+    """Return a text that can be part of a message, whatever a file put into it."""
+    return "".join(c if c.isprintable() else " " for c in str(text))[:200]

@@ -1,0 +1,66 @@
+"""What other distributions add to hearthlog, found by name."""
+
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from typing import Generic, Protocol, TypeVar
+
+from hearthlog.models.errors import ModelError
+
+
+class Named(Protocol):
+    """Anything with a name."""
+
+    @property
+    def name(self) -> str:
+        """What it is found by."""
+
+
+T = TypeVar("T", bound=Named)
+
+
+class Extensions(Generic[T]):
+    """Objects of one kind, by name: our own, and those that entry points of others name.
+
+    Entry points are looked at only for names that are not ours: a recorder with a model of our
+    own imports nothing of others.
+
+    Parameters
+    ----------
+    group : str
+        Of entry points, such as `[project.entry-points."hearthlog.feature_sets"]`. Each is an
+        object of this kind, with the entry point's name as its `name`.
+    kind : type
+        Of the objects.
+    ours : sequence of T
+    """
+
+    def __init__(self, group: str, kind: type[T], ours: Sequence[T]) -> None:
+        self._group = group
+        self._kind = kind
+        self._ours = {one.name: one for one in ours}
+        self._loaded = dict(self._ours)
+
+    def names(self) -> list[str]:
+        """Return all names, ours first."""
+        theirs = {point.name for point in entry_points(group=self._group)}
+        return [*self._ours, *sorted(theirs - self._ours.keys())]
+
+    def get(self, name: str) -> T | None:
+        """Return the object of a name; None if there is none.
+
+        Raises
+        ------
+        ModelError
+            If the distribution that has it cannot be used.
+        """
+        if name not in self._loaded:
+            for point in entry_points(group=self._group, name=name):
+                try:
+                    loaded = point.load()
+                except Exception as error:  # whatever is wrong with the code of others
+                    raise ModelError(f"{point.value} cannot be imported: {error!r}") from error
+                if not isinstance(loaded, self._kind) or loaded.name != name:
+                    what = f"no {self._kind.__name__} of the name {name!r}"
+                    raise ModelError(f"{point.value} is {what}; see docs/extending.md")
+                self._loaded[name] = loaded
+        return self._loaded.get(name)

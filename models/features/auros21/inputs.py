@@ -1,0 +1,71 @@
+"""What classifiers look at in `auros21`: the features themselves, or better use of them.
+
+`statistics` are the paper's (section 3.2): mean and standard deviation of the features. `bands`
+uses the same features better: energy and flux as logarithms, besides the cepstra the smooth mel
+bands they stand for, and besides mean and deviation how much a value changes from frame to frame.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY, FEATURE_NAMES, FLUX, MEL_BANDS
+from hearthlog.models.features.window_inputs import WindowStatistics
+from hearthlog.models.rowwise import rowwise_matmul
+
+WINDOW_FRAMES = 20
+_SCALARS, _WIDTH = CEPSTRA.start, len(FEATURE_NAMES)
+_FLOOR = 1e-7
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+def features_themselves(features: Float32) -> Float32:
+    """Return the features as they are."""
+    return features
+
+
+def band_values(features: Float32) -> Float64:
+    """Make better values of the features of each frame.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 21)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 53)], float64
+        The features before the cepstra, of them energy in dB and the natural logarithm of the
+        flux, then 32 mel bands in dB, then the cepstra.
+    """
+    cepstra = features[:, CEPSTRA]
+    values = np.empty((len(features), _WIDTH + MEL_BANDS))
+    values[:, :_SCALARS] = features[:, :_SCALARS]
+    values[:, ENERGY] = 10.0 * np.log10(np.maximum(values[:, ENERGY], 0.0) + _FLOOR)
+    values[:, FLUX] = np.log(np.maximum(values[:, FLUX], 0.0) + _FLOOR)
+    values[:, _SCALARS : _SCALARS + MEL_BANDS] = bands_of(cepstra)
+    values[:, _SCALARS + MEL_BANDS :] = cepstra
+    return values
+
+
+def bands_of(cepstra: Float32) -> Float64:
+    """Turn mel cepstra back into bands in dB, smoothed by the cepstra that are not there."""
+    return rowwise_matmul(cepstra.astype(np.float64), dct_weights().T)
+
+
+@cache
+def dct_weights() -> Float64:
+    """Orthonormal DCT-II of the mel bands, its first coefficients (the first is the level)."""
+    band = np.arange(MEL_BANDS)[:, np.newaxis]
+    order = np.arange(_WIDTH - _SCALARS)
+    weights = np.sqrt(2.0 / MEL_BANDS) * np.cos(np.pi / MEL_BANDS * (band + 0.5) * order)
+    weights[:, 0] /= np.sqrt(2.0)
+    return weights
+
+
+INPUTS = {
+    "statistics": WindowStatistics(WINDOW_FRAMES, features_themselves, _WIDTH),
+    "bands": WindowStatistics(WINDOW_FRAMES, band_values, _WIDTH + MEL_BANDS, changes=True),
+}

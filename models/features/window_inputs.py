@@ -1,0 +1,202 @@
+"""What a classifier looks at: one row of numbers for every window of frames."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+_FRAMES_AT_ONCE = 256
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+class InputStream(Protocol):
+    """The inputs at the frames of one stream."""
+
+    def __call__(self, features: Float32) -> Float32:
+        """Compute the inputs at successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+
+        Returns
+        -------
+        np.ndarray [shape=(m, width)], float32
+            At the last m of these frames: those with a whole window since the start or the last
+            restart. The same frames give the same bits in blocks of any size.
+        """
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+
+
+class Inputs(Protocol):
+    """One way to look at windows of features.
+
+    Attributes
+    ----------
+    width : int
+        How many inputs there are.
+    """
+
+    @property
+    def width(self) -> int:
+        """How many inputs there are."""
+
+    def stream(self) -> InputStream:
+        """Begin a stream."""
+
+    def of_windows(self, windows: Float32) -> Float32:
+        """Compute the inputs of windows that do not follow each other.
+
+        Parameters
+        ----------
+        windows : np.ndarray [shape=(n, window_frames, d)], float32
+            Features.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, width)], float32
+            The same bits as of a stream.
+        """
+
+
+@dataclass(frozen=True)
+class WindowStatistics:
+    """Mean and standard deviation of a window, of its features or of what is made of them.
+
+    Attributes
+    ----------
+    window_frames : int
+    values : callable
+        Makes d' values of each frame, shape (n, d'), from its features, shape (n, d).
+    values_width : int
+        d'.
+    changes : bool
+        Besides, how much a value changes from frame to frame: the mean of its absolute
+        differences.
+    """
+
+    window_frames: int
+    values: Callable[[Float32], NDArray[Any]]
+    values_width: int
+    changes: bool = False
+
+    @property
+    def width(self) -> int:
+        """How many inputs there are."""
+        return (3 if self.changes else 2) * self.values_width
+
+    def stream(self) -> "StatisticsStream":
+        """Begin a stream."""
+        return StatisticsStream(self)
+
+    def of_windows(self, windows: Float32) -> Float32:
+        """Compute the inputs of windows that do not follow each other.
+
+        Parameters
+        ----------
+        windows : np.ndarray [shape=(n, window_frames, d)], float32
+            Features.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, width)], float32
+        """
+        inputs = np.empty((len(windows), self.width), np.float32)
+        for start in range(0, len(windows), _FRAMES_AT_ONCE):
+            part = windows[start : start + _FRAMES_AT_ONCE]
+            values = self.values(part.reshape(-1, part.shape[-1]))
+            frames = values.reshape(len(part), self.window_frames, -1).swapaxes(0, 1)
+            changes = np.abs(np.diff(frames, axis=0))
+            self.reduce([*frames], [*changes], inputs[start : start + _FRAMES_AT_ONCE])
+        return inputs
+
+    def reduce(
+        self, frames: Sequence[NDArray[Any]], changes: Sequence[NDArray[Any]], out: Float32
+    ) -> None:
+        """Put the statistics of windows into rows.
+
+        Parameters
+        ----------
+        frames : sequence of np.ndarray [shape=(n, d')]
+            The first frames of all windows, the second ones, and so on.
+        changes : sequence of np.ndarray [shape=(n, d')]
+            The same of their differences.
+        out : np.ndarray [shape=(n, width)], float32
+        """
+        parts = [*mean_and_std(frames)]
+        if self.changes:
+            parts.append(_sum(changes) / len(changes))
+        np.concatenate(parts, axis=1, out=out, casting="same_kind")
+
+
+class StatisticsStream:
+    """The statistics at the frames of one stream, as `InputStream`."""
+
+    def __init__(self, inputs: WindowStatistics) -> None:
+        self._inputs = inputs
+        self._recent: Float32 | None = None
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._recent = None
+
+    def __call__(self, features: Float32) -> Float32:
+        """Compute the inputs at successive frames; see `InputStream`."""
+        length = self._inputs.window_frames
+        if self._recent is not None:
+            features = np.concatenate([self._recent, features])
+        self._recent = features[max(len(features) - length + 1, 0) :].copy()
+        values = self._inputs.values(features)
+        count = max(len(features) - length + 1, 0)
+        inputs = np.empty((count, self._inputs.width), np.float32)
+        for start in range(0, count, _FRAMES_AT_ONCE):
+            end = min(start + _FRAMES_AT_ONCE, count)
+            part = values[start : end + length - 1]
+            changes = successive(np.abs(np.diff(part, axis=0)), length - 1)
+            self._inputs.reduce(successive(part, length), changes, inputs[start:end])
+        return inputs
+
+
+def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
+    """Return the first rows of all windows of so many successive rows, the second ones, and so on.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, d)]
+    length : int
+    """
+    count = len(values) - length + 1
+    return [values[place : place + count] for place in range(length)]
+
+
+def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
+    """Reduce windows to mean and standard deviation, in float64.
+
+    Frame after frame for many windows at once: what is summed stays in the cache.
+
+    Parameters
+    ----------
+    frames : sequence of np.ndarray [shape=(n, d)]
+        The first frames of all windows, the second ones, and so on.
+    """
+    mean = _sum(frames) / len(frames)
+    square = np.zeros_like(mean)
+    deviation = np.empty_like(mean)
+    for values in frames:
+        np.subtract(values, mean, out=deviation)
+        np.square(deviation, out=deviation)
+        square += deviation
+    return mean, np.sqrt(square / len(frames))
+
+
+def _sum(frames: Sequence[NDArray[Any]]) -> Float64:
+    total = frames[0].astype(np.float64)
+    for values in frames[1:]:
+        total += values
+    return total

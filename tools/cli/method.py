@@ -1,0 +1,23 @@
+"""The way to learn that the user chose."""
+
+from typing import TYPE_CHECKING
+
+from hearthlog.tools.cli.selection import wrong_use
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.method import Method
+
+
+def chosen_method(name: str, **parameters: float | None) -> "Method":
+    """Return a way to learn, with other parameters where they are given."""
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.methods import method_named
+
+    given = {key: value for key, value in parameters.items() if value is not None}
+    for key, value in given.items():
+        if not 0 < value < float("inf"):
+            wrong_use(f"--{key} {value:g}: it must be more than 0")
+    try:
+        return method_named(name).with_parameters(given)
+    except DataError as error:
+        wrong_use(f"--method {name}: {error}")
