@@ -18,8 +18,8 @@ from hearthlog.analyzer.marks import Mark, read_marks
 from hearthlog.analyzer.report.shelf import RELABEL, REVIEW, Entry, Shelf
 from hearthlog.analyzer.report.spans import NONE, Int64, Spans, common, joined, without
 from hearthlog.analyzer.report.trouble import Status, Trouble, gaps_of, statuses_of, troubles_of
-from hearthlog.analyzer.report.words import ALIASES
 from hearthlog.analyzer.selection import Selection, select
+from hearthlog.models.classes import class_name
 from hearthlog.models.modelfile import CLASS_NAME
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, read_columns
@@ -256,8 +256,8 @@ def _in_order(source: Source, parts: Sequence[Columns]) -> Segments:
 
 
 def _known(topic: str, labels: NDArray[Any]) -> NDArray[Any]:
-    """Give classes the names that this report has for them; raise LogError if one cannot be."""
-    names = {label: ALIASES.get(label, label) for label in set(labels.tolist())}
+    """Give each class one name, whatever logs call it; raise LogError if one cannot be."""
+    names = {label: class_name(label) for label in set(labels.tolist())}
     if len(names) > _MOST_CLASSES:
         raise LogError(f"{topic}: has {len(names)} different labels; no classifier has so many")
     for label in names:
@@ -287,7 +287,7 @@ def _of_marks(marks: Sequence[Mark]) -> Segments:
     return Segments(
         np.array([mark.start for mark in ordered], np.int64),
         np.array([mark.end for mark in ordered], np.int64),
-        np.array([ALIASES.get(mark.label, mark.label) for mark in ordered], object),
+        np.array([class_name(mark.label) for mark in ordered], object),
         np.ones(len(ordered)),
     )
 
@@ -338,7 +338,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
                 names[node, microphone] |= dict.fromkeys(said)
     for source, segments in heard.segments.items():
         names[source] |= dict.fromkeys(sorted(set(segments.labels.tolist())))
-        sound = [ALIASES.get(name, name) for name in names[source] if CLASS_NAME.fullmatch(name)]
+        sound = [class_name(name) for name in names[source] if CLASS_NAME.fullmatch(name)]
         heard.known[source] = list(dict.fromkeys(sound))[:_MOST_CLASSES]
 
 
@@ -360,7 +360,11 @@ def _precisions_of(path: Path) -> dict[str, float]:
     texts = [r.data for r in records if isinstance(r, Attachment) and r.name == _CARD]
     lines = [line for data in texts for line in data.decode(errors="replace").splitlines()]
     rows = (_ROW.fullmatch(line) for line in lines)
-    return {ALIASES.get(row[1], row[1]): min(float(row[2]), 1.0) for row in rows if row}
+    found: dict[str, float] = {}
+    for row in filter(None, rows):
+        name = class_name(row[1])
+        found[name] = min(found.get(name, 1.0), float(row[2]))
+    return found
 
 
 def _lose(heard: Heard, line: str) -> None:
