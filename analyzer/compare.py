@@ -141,7 +141,7 @@ def clip_recordings(
     for number, clip in enumerate(clips):
         progress(number, len(clips))
         features = np.empty((0, len(FEATURE_NAMES)), np.float32)
-        if clip.label in scenario.class_of:
+        if scenario.find(clip.label) is not None:
             features = clip_features(clip)
         yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
     progress(len(clips), len(clips))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.manifest import Clip
 from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.inputs import WINDOW_FRAMES
 from hearthlog.recorder.features import FEATURE_NAMES, FRAME_SAMPLES, SAMPLE_RATE, FeatureExtractor
 from hearthlog.recorder.sources.files import read_audio
@@ -23,7 +24,6 @@ _FRAME_SECONDS = FRAME_SAMPLES / SAMPLE_RATE
 _ENERGY = FEATURE_NAMES.index("energy")
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
-_UNGATED = "silence"
 
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -153,10 +153,11 @@ def build_dataset(
 
 
 def _heard(clips: Sequence[Clip], scenario: Scenario, progress: Progress) -> Iterable[Recording]:
-    known = scenario.class_of
     for number, clip in enumerate(clips):
         progress(number, len(clips))
-        features = clip_features(clip) if clip.label in known else np.empty((0, 0), np.float32)
+        features = np.empty((0, 0), np.float32)
+        if scenario.find(clip.label) is not None:
+            features = clip_features(clip)
         yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
     progress(len(clips), len(clips))
 
@@ -169,7 +170,6 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
     for each class and source group.
     """
     classes = tuple(scenario.classes)
-    class_of = {name: name for name in classes} | scenario.class_of
     groups: dict[str, int] = {}
     collections: dict[str, int] = {}
     used: Counter[tuple[str, str]] = Counter()
@@ -179,11 +179,14 @@ def cut_recordings(recordings: Iterable[Recording], scenario: Scenario) -> Datas
     weights = [np.empty(0)]
     rows = [np.empty((0, 3), np.intp)]
     for item in recordings:
-        reason, found = _segments(item, class_of)
+        name = scenario.find(item.label, marked=True)
+        if name is None:
+            skipped[f"label {item.label} is not in the scenario"] += 1
+            continue
+        reason, found = _segments(item)
         if reason:
             skipped[reason] += 1
             continue
-        name = class_of[item.label]
         used[item.collection, item.licence] += 1
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * _FRAME_SECONDS
         windows.append(found)
@@ -227,17 +230,15 @@ def clip_features(clip: Clip) -> Float32:
     return np.concatenate(features)
 
 
-def _segments(recording: Recording, class_of: Mapping[str, str]) -> tuple[str, Float32]:
+def _segments(recording: Recording) -> tuple[str, Float32]:
     """Return why there are no segments, or those that are loud enough, shape (n, 20, 21)."""
     features = recording.features
     nothing = np.empty((0, WINDOW_FRAMES, len(FEATURE_NAMES)), np.float32)
-    if recording.label not in class_of:
-        return f"label {recording.label} is not in the scenario", nothing
     if len(features) < WINDOW_FRAMES:  # the recorder labels whole windows only
         return "shorter than a second", nothing
     every = np.lib.stride_tricks.sliding_window_view(features, WINDOW_FRAMES, axis=0)
     windows = every[::HOP_FRAMES].transpose(0, 2, 1)
-    if recording.label == _UNGATED:
+    if class_name(recording.label) == SILENCE:
         return "", windows
     energy = windows[:, :, _ENERGY].mean(axis=1, dtype=np.float64)
     level = features[:, _ENERGY].mean(dtype=np.float64)

@@ -1,5 +1,6 @@
 """One table of classes: what a sound is called, by others too, is the same for all that ask."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from hearthlog.models.classes import (
 )
 from hearthlog.models.modelfile import CLASS_NAME, load_model
 
+DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"
 AUDIOSET = {
     "Silence": "silence",
@@ -56,6 +58,12 @@ def test_no_name_is_of_two_classes():
     assert [find_class(name) for name in names] == [
         row for row in CLASSES for _ in (row.name, *row.aliases)
     ]
+
+
+def test_the_documented_names_are_those_of_the_table():
+    lines = re.findall(r"^\| (`.*`) \| (`.*`) \|$", DOCS.read_text("utf-8"), re.MULTILINE)
+    documented = {name.strip("`"): tuple(re.findall("`(.*?)`", names)) for name, names in lines}
+    assert documented == {row.name: row.aliases for row in CLASSES if row.aliases}
 
 
 @pytest.mark.parametrize(("name", "expected"), AUDIOSET.items())

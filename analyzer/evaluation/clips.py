@@ -127,13 +127,13 @@ def _heard(
     clips: Sequence[Clip], scenario: Scenario, listener: "_Listener", progress: Progress
 ) -> Iterator[Recording]:
     """Read the clips once, for segments and events alike."""
-    class_of = scenario.class_of
     for number, clip in enumerate(clips):
         progress(number, len(clips))
         features = np.empty((0, len(FEATURE_NAMES)), np.float32)
-        if clip.label in class_of:
+        name = scenario.find(clip.label)
+        if name is not None:
             features = clip_features(clip)
-            listener.listen(features, class_of[clip.label])
+            listener.listen(features, name)
         yield Recording(clip.label, clip.source_group, clip.source, clip.licence, features)
     progress(len(clips), len(clips))
 
