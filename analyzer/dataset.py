@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.manifest import Clip
 from hearthlog.analyzer.scenario import Scenario
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.files import read_audio
@@ -22,7 +23,6 @@ HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
-_UNGATED = "silence"
 
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.intp]
@@ -168,11 +168,10 @@ def clip_recordings(
     SourceError
         If a clip cannot be read.
     """
-    class_of = scenario.class_of
     for number, clip in enumerate(clips):
         progress(number, len(clips))
         values = np.empty((0, features.width), np.float32)
-        if clip.label in class_of:
+        if scenario.find(clip.label) is not None:
             values = clip_features(clip, features)
         yield Recording(clip.label, clip.source_group, clip.source, clip.licence, values)
     progress(len(clips), len(clips))
@@ -188,7 +187,6 @@ def cut_recordings(
     for each class and source group.
     """
     classes = tuple(scenario.classes)
-    class_of = {name: name for name in classes} | scenario.class_of
     groups: dict[str, int] = {}
     collections: dict[str, int] = {}
     used: Counter[tuple[str, str]] = Counter()
@@ -198,11 +196,14 @@ def cut_recordings(
     weights = [np.empty(0)]
     rows = [np.empty((0, 3), np.intp)]
     for item in recordings:
-        reason, found = _segments(item, class_of, features)
+        name = scenario.find(item.label, marked=True)
+        if name is None:
+            skipped[f"label {item.label} is not in the scenario"] += 1
+            continue
+        reason, found = _segments(item, features)
         if reason:
             skipped[reason] += 1
             continue
-        name = class_of[item.label]
         used[item.collection, item.licence] += 1
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
         windows.append(found)
@@ -246,21 +247,17 @@ def clip_features(clip: Clip, features: FeatureSet) -> Float32:
     return np.concatenate(values)
 
 
-def _segments(
-    recording: Recording, class_of: Mapping[str, str], features: FeatureSet
-) -> tuple[str, Float32]:
+def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]:
     """Return why there are no segments, or those that are loud enough."""
     values, window = recording.features, features.window_frames
     nothing = np.empty((0, window, features.width), np.float32)
-    if recording.label not in class_of:
-        return f"label {recording.label} is not in the scenario", nothing
     if values.shape[1] != features.width:
         return f"its features are not {features.name}", nothing
     if len(values) < window:  # the recorder labels whole windows only
         return f"shorter than {features.window_seconds:g} s", nothing
     every = np.lib.stride_tricks.sliding_window_view(values, window, axis=0)
     windows = every[::HOP_FRAMES].transpose(0, 2, 1)
-    if recording.label == _UNGATED:
+    if class_name(recording.label) == SILENCE:
         return "", windows
     power = features.power(windows).mean(axis=1, dtype=np.float64)
     level = features.power(values).mean(dtype=np.float64)

@@ -19,6 +19,7 @@ from hearthlog.analyzer.heard import find_heard
 from hearthlog.analyzer.marks import Mark, write_marks
 from hearthlog.analyzer.selection import select
 from hearthlog.analyzer.splice import splice
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.description import CLASS_NAME
 from hearthlog.recorder.config import Microphone, load_settings
 from hearthlog.recorder.service import Source, record
@@ -38,7 +39,6 @@ FOLDER = "enrolled"
 SECONDS = 5.0  # of a microphone, unless it is said
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
-_SILENCE = "silence"
 _PATIENCE = 10.0  # seconds for a microphone to wake
 _STAMP = "header.stamp"
 _ENERGY = "energy"
@@ -214,7 +214,7 @@ def _check_sound(label: str, energies: NDArray[np.floating[Any]]) -> None:
     seconds = len(energies) * FRAME_NANOSECONDS / NANOSECONDS
     if seconds < LEAST_SECONDS:
         raise DataError(f"only {seconds:.2f} s of sound; enrol at least {LEAST_SECONDS:.0f} s")
-    if label != _SILENCE and (energies < _FLOOR).all():
+    if class_name(label) != SILENCE and (energies < _FLOOR).all():
         raise DataError(
             f"all of it is below -60 dBFS: this is silence, not {label}; is the microphone muted?"
         )

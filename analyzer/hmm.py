@@ -1,34 +1,18 @@
 """The hidden Markov model behind smoothing: its transitions, and the whole of a sound at once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from hmmlearn.base import BaseHMM
 from numpy.typing import NDArray
 
+from hearthlog.models.classes import find_class
 from hearthlog.models.smoothing import Float32, Float64, States, log_likelihoods
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not
 
-# How long a sound goes on, in seconds, by the classes of the built-in scenarios.
-DURATIONS: Mapping[str, float] = {
-    "silence": 60.0,
-    "speech": 5.0,
-    "music": 60.0,
-    "phone_ring": 5.0,
-    "coughing": 0.5,
-    "crying": 5.0,
-    "yelling": 2.0,
-    "laughing": 2.0,
-    "objects_activity": 2.0,
-    "flushing_water": 15.0,
-    "shower": 300.0,
-    "tap_water": 10.0,
-    "bathroom_other": 5.0,
-    "other": 10.0,  # anything that is not of the bathroom
-}
-_DURATION = 5.0
+_SECONDS = 5.0  # of a sound of somebody's own class
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
@@ -48,7 +32,8 @@ def default_transitions(classes: Sequence[str]) -> Float64:
 
 def expected_durations(classes: Sequence[str]) -> Float64:
     """Return how many seconds the sounds of classes are expected to go on, shape (C,)."""
-    return np.array([DURATIONS.get(name, _DURATION) for name in classes])
+    rows = map(find_class, classes)
+    return np.array([_SECONDS if row is None else row.seconds for row in rows])
 
 
 def transitions_from_durations(durations: Float64, frame_seconds: float) -> Float64:

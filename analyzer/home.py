@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.dataset import Recording
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.marks import Mark, read_marks
+from hearthlog.models.classes import translation
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.columns import Columns, read_columns
@@ -71,7 +72,9 @@ def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
     found: list[Int64] = []
     for log in find_logs(folder):
         runs: list[list[Mark]] = []
-        for mark in sorted(read_marks(log)):
+        marks = read_marks(log)
+        names = translation({mark.label for mark in marks}, classes)
+        for mark in sorted(mark._replace(label=names[mark.label]) for mark in marks):
             last = runs[-1][-1] if runs else None
             follows = (
                 last is not None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.textfile import csv_records, read_text
+from hearthlog.models.classes import meant_by
 from hearthlog.models.description import TEXT
 
 REQUIRED = ("path", "label", "source_group")
@@ -43,7 +44,8 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
     path : Path
         CSV, UTF-8; the paths in it are relative to its folder. Other columns are ignored.
     labels : collection of str
-        Labels that mean something; any other is an error.
+        Labels that mean something, as do other names of the same sounds (see
+        `hearthlog.models.classes`); any other is an error.
 
     Raises
     ------
@@ -89,7 +91,7 @@ def _clip(
     for name in OPTIONAL:
         if not TEXT.fullmatch(value[name]):
             raise DataError(f"{where}: {name} must be one line of at most 300 characters")
-    if value["label"] not in labels:
+    if not meant_by(value["label"], labels):
         known = ", ".join(sorted(labels))
         raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {known}")
     audio = folder / value["path"]

@@ -6,26 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.models import classes as sound
 from hearthlog.models.description import CLASS_NAME, MOST_CLASSES, TEXT
 
 _SIZE_LIMIT = 1 << 20
 
-# What is audible in a home, by the names the built-in scenarios use. `other_negative` (rain, a
-# dog, sirens …) is no class of either: an honest recogniser calls it unknown.
 _GENERAL = (
-    "silence",
-    "speech",
-    "music",
-    "phone_ring",
-    "coughing",
-    "crying",
-    "yelling",
-    "laughing",
-    "objects_activity",
+    *(sound.SILENCE, sound.SPEECH, sound.MUSIC, sound.PHONE_RING, sound.COUGHING, sound.CRYING),
+    *(sound.YELLING, sound.LAUGHING, sound.OBJECTS_ACTIVITY),
 )
-_WATER = ("flushing_water", "shower", "tap_water")
-_BATHROOM_OTHER = ("bathroom_other", *_GENERAL[1:])
-LABELS = frozenset({*_GENERAL, *_WATER, "bathroom_other", "other_negative"})
+_WATER = (sound.FLUSHING_WATER, sound.SHOWER, sound.TAP_WATER)
+_BATHROOM_OTHER = (sound.BATHROOM_OTHER, *_GENERAL[1:])
+LABELS = frozenset(row.name for row in sound.CLASSES) - {sound.OTHER, sound.UNKNOWN}
 
 
 @dataclass(frozen=True)
@@ -50,16 +42,34 @@ class Scenario:
         """Class of each label that has one."""
         return {label: name for name, labels in self.classes.items() for label in labels}
 
+    def find(self, label: str, *, marked: bool = False) -> str | None:
+        """Return the class that a label belongs to; None if it is ignored, or in no class.
+
+        It is the class that lists this very label. If none does, it is the one that lists another
+        name of the same sound (see `hearthlog.models.classes`), unless two classes do.
+
+        Parameters
+        ----------
+        label : str
+        marked : bool
+            Whether a reviewer says it: then the names of the classes are labels, too.
+        """
+        classes: dict[str, str | None] = dict.fromkeys(self.ignored)
+        classes |= {name: name for name in self.classes} if marked else {}
+        classes |= self.class_of
+        meant = {classes[name] for name in sound.meant_by(label, classes)}
+        return meant.pop() if len(meant) == 1 else None
+
     @property
     def labels(self) -> frozenset[str]:
-        """Labels a manifest may use: built in, in a class, or ignored."""
+        """Labels a manifest may use, besides other names of them: built in, in a class, ignored."""
         return LABELS | self.class_of.keys() | self.ignored
 
 
 BUILTIN = {
     "bathroom": Scenario(
         "bathroom",
-        {"silence": ("silence",)} | {w: (w,) for w in _WATER} | {"other": _BATHROOM_OTHER},
+        {name: (name,) for name in (sound.SILENCE, *_WATER)} | {sound.OTHER: _BATHROOM_OTHER},
     ),
     "general": Scenario("general", {label: (label,) for label in _GENERAL}),
 }

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.recorder.stream import Frames
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
@@ -17,7 +18,6 @@ Keep = Literal["off", "events", "unsure", "always"]
 PRIVATE_LIMIT = 0.02
 UNSURE_CONFIDENCE = 0.5
 UNSURE_NOVELTY = 0.7
-_QUIET = "silence"
 _BEHIND_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 
 Float32 = NDArray[np.float32]
@@ -133,8 +133,8 @@ class ClipFinder:
         if self._keep == "unsure":
             sure = probabilities.max(axis=1) >= UNSURE_CONFIDENCE
             return private, ~sure | (novelty > UNSURE_NOVELTY)
-        quiet = classes.index(_QUIET) if _QUIET in classes else -1
-        return private, probabilities.argmax(axis=1) != quiet
+        loud = np.array([class_name(name) != SILENCE for name in classes])
+        return private, loud[probabilities.argmax(axis=1)]
 
     def _unlabelled(self, count: int) -> Float32:
         """Take what is not labelled for private, unless nothing is."""

@@ -15,7 +15,7 @@ from hearthlog.analyzer.evaluation.folds import KINDS, evaluate_method
 from hearthlog.analyzer.home import home_recordings, home_sequences
 from hearthlog.analyzer.marks import Mark, write_marks
 from hearthlog.analyzer.method import inverse_temperature, prepare, softmax
-from hearthlog.analyzer.scenario import Scenario
+from hearthlog.analyzer.scenario import BUILTIN, Scenario
 from hearthlog.analyzer.svm_method import BANDS
 from hearthlog.analyzer.train import adapt_model, train_model
 from hearthlog.models.card import model_card
@@ -159,6 +159,27 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     assert found[0].group == found[1].group
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
     assert data.weight.min() == 5.0
+
+
+def test_a_mark_by_another_name_is_learned_as_its_class(recorded):
+    log = find_logs(recorded)[0]
+    stamps = read_columns([log], ["/mic/features"])["/mic/features"]["header.stamp"].tolist()
+    names = {"crying": "crying_sobbing", "yelling": "shout"}
+    learned = []
+    for crying, yelling in (names, names.values()):
+        marks = [
+            Mark("mic", stamps[100], stamps[140], crying),
+            Mark("mic", stamps[140], stamps[180], yelling),
+        ]
+        layer = write_marks(log, marks)
+        try:
+            data = cut_recordings(home_recordings(recorded), BUILTIN["general"])
+            (follows,) = home_sequences(recorded, data.classes)
+        finally:
+            layer.unlink()
+        learned.append((data.digest, data.amounts, follows.tolist()))
+    assert learned[0] == learned[1]
+    assert [name for name, one in learned[0][1].items() if one.seconds] == ["crying", "yelling"]
 
 
 def test_marks_without_time_between_them_say_what_follows_what(recorded):

@@ -12,7 +12,7 @@ from spliced import run
 from hearthlog.analyzer.compare import compare_models
 from hearthlog.analyzer.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.clips import scenario_of
+from hearthlog.analyzer.evaluation.clips import evaluate_model, scenario_of
 from hearthlog.analyzer.home import home_recordings
 from hearthlog.analyzer.manifest import read_manifest
 from hearthlog.analyzer.marks import Mark, write_marks
@@ -89,6 +89,21 @@ def test_the_order_of_the_classes_changes_nothing(folder, unheard):
     assert found.a.scores.classes == models[0].classes[::-1]
     straight = compare(folder, ["one", "bands"], heard(unheard))
     assert found.difference.macro_f1 == pytest.approx(straight.difference.macro_f1)
+
+
+def test_clips_of_other_names_are_those_of_the_classes(folder, unheard):
+    other = unheard.with_name("other.csv")
+    other.write_text(unheard.read_text().replace(",coughing,", ",Cough,"))
+    found, same = (
+        compare(folder, ["one", "bands"], heard(manifest)) for manifest in (other, unheard)
+    )
+    assert found.b.scores == same.b.scores
+    model, scenario = load_model(folder / "bands.safetensors"), load_scenario("general")
+    one, two = (
+        evaluate_model(model, read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
+        for manifest in (other, unheard)
+    )
+    assert (one.scores, one.detections) == (two.scores, two.detections)
 
 
 def test_a_model_and_itself_do_not_differ(folder, unheard):

@@ -189,6 +189,22 @@ def test_classes_that_only_one_side_knows_are_named():
     assert found.classes == ["speech", "music", "tap_water"]
 
 
+def test_another_name_for_a_class_is_no_difference():
+    second = NANOSECONDS
+    a = side("live", [(0, second, "crying"), (second, 3 * second, "speech")], ("crying", "speech"))
+    rows = [
+        (0, second, "crying_sobbing"),
+        (second, 2 * second, "shout"),
+        (2 * second, 3 * second, "yell"),
+    ]
+    b = side("relabel/two", rows, ("crying_sobbing", "speech", "shout", "yell"))
+    found = compare_sides(a, b)
+    assert found.classes == ["crying", "speech", "shout", "yell"]
+    assert (found.only_a, found.only_b) == ([], ["shout", "yell"]), "b tells these apart"
+    assert found.total.per_class["crying"].minutes_both == pytest.approx(1 / 60)
+    assert found.total.agreement == pytest.approx(1 / 3)
+
+
 def test_what_the_recorder_said_is_compared_with_a_relabel_layer(logs, hearthlog, tmp_path):
     listed = tmp_path / "list.csv"
     result = hearthlog("diff", logs, "live", "two", "--json", "--list", listed)
@@ -364,6 +380,21 @@ def queue_of(log, count):
     sources = find_sources(log)
     live = sources.read("mic", "live")
     return make_queue(sources, "mic", live, other=None, marks=None, count=count)
+
+
+def test_another_name_for_a_class_is_no_reason_to_review_it(tmp_path):
+    rows = [(0, 4, "speech"), (4, 8, "coughing"), (8, 12, "speech")]
+    sources = find_sources(write_home(tmp_path / "home.mcap", rows, lambda *_: [0.0, 1.0, 0.0]))
+    said = [
+        *((MIDNIGHT + 4 * NANOSECONDS, MIDNIGHT + 8 * NANOSECONDS, "cough"),),
+        *((MIDNIGHT + 8 * NANOSECONDS, MIDNIGHT + 12 * NANOSECONDS, "laughter"),),
+    ]
+    other = side("relabel/two", said, ("cough", "laughter"))
+    live = sources.read("mic", "live")
+    queue = make_queue(
+        sources, "mic", live, other=other, marks=None, count=9, ranking="disagreeing"
+    )
+    assert list(zip(queue.labels, queue.others, strict=True)) == [("speech", "laughter")]
 
 
 def test_a_queue_is_of_many_days_and_classes(tmp_path):

@@ -328,6 +328,14 @@ def test_labels_that_the_log_does_not_know_are_said():
         compare(labelling((0, 9, "doorbell")), labelling((0, 14, "speech")), CLASSES)
 
 
+def test_a_reference_may_have_other_names_for_the_classes():
+    found = labelling((0, 10, "speech"), (10, 14, "coughing"))
+    ours = compare(labelling((0, 9, "speech"), (9, 14, "coughing")), found, CLASSES)
+    others = compare(labelling((0, 9, "Speech"), (9, 14, "cough")), found, CLASSES)
+    assert others == ours
+    assert others.unknown_labels == {}
+
+
 def test_a_reference_of_another_time_is_refused():
     with pytest.raises(DataError, match="have no time in common"):
         compare(labelling((100, 110, "speech")), labelling((0, 14, "speech")), CLASSES)

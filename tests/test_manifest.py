@@ -32,6 +32,16 @@ def test_clips_are_read_with_paths_beside_the_manifest(tmp_path):
     assert (second.source, second.licence) == ("", "")
 
 
+def test_the_names_that_audioset_has_for_our_labels_are_labels(tmp_path):
+    rows = 'a.wav,"Crying, sobbing",anna\nb.wav,water_tap_faucet,bath\n'
+    path = manifest(tmp_path, "path,label,source_group\n" + rows)
+    clips = read_manifest(path, LABELS)
+    assert [clip.label for clip in clips] == ["Crying, sobbing", "water_tap_faucet"], "as they are"
+    assert [BUILTIN["bathroom"].find(clip.label) for clip in clips] == ["other", "tap_water"]
+    assert [BUILTIN["general"].find(clip.label) for clip in clips] == ["crying", None]
+    assert "'water_tap_faucet'" in refusal(path, ["crying", "speech"])
+
+
 def test_columns_may_be_in_any_order_and_others_are_ignored(tmp_path):
     path = manifest(tmp_path, "\ufeffsource_group,note,label,path\nanna,x,speech,a.wav\n")
     (clip,) = read_manifest(path, LABELS)
@@ -108,6 +118,43 @@ def test_a_scenario_of_ones_own_may_bring_and_ignore_labels(tmp_path):
     assert scenario.class_of == {"bark": "dog", "howl": "dog", "silence": "quiet"}
     assert {"rain", "bark", "speech"} <= scenario.labels
     assert "cat" not in scenario.labels
+
+
+def scenario_of(folder, text):
+    path = folder / "own.toml"
+    path.write_text(text)
+    return load_scenario(str(path))
+
+
+def test_a_label_that_a_scenario_names_is_taken_literally_first(tmp_path):
+    own = scenario_of(
+        tmp_path,
+        'ignore = ["laughter"]\n[classes]\nloud = ["shout"]\nangry = ["yell"]\n'
+        'cough = ["wet"]\nother = ["coughing", "laughing"]\n',
+    )
+    labels = ["shout", "yell", "Yell", "yelling", "laughter", "laughing", "cough", "wet"]
+    assert {label: own.find(label) for label in labels} == {
+        "shout": "loud",
+        "yell": "angry",
+        "Yell": "angry",
+        "yelling": None,  # it may be either
+        "laughter": None,
+        "laughing": "other",
+        "cough": "other",
+        "wet": "cough",
+    }
+    assert own.find("cough", marked=True) == "cough", "a reviewer names classes"
+    assert own.find("laughter", marked=True) is None
+
+
+def test_a_scenario_of_other_names_understands_ours(tmp_path):
+    own = scenario_of(
+        tmp_path, '[classes]\ncry = ["crying_sobbing"]\nloud = ["shout", "yell", "bark"]\n'
+    )
+    assert own.find("crying") == own.find("Crying and sobbing") == "cry"
+    assert own.find("yelling") == "loud", "all names of it are in one class"
+    assert own.find("bark") == "loud"
+    assert own.find("Bark") is None, "nobody knows that this is the same"
 
 
 @pytest.mark.parametrize(

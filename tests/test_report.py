@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
+import homelife
 import numpy as np
 import pytest
 from homelife import BATHROOM, GENERAL, HOUR, at, midnight, write_day, write_life
@@ -92,6 +93,31 @@ def test_sounds_of_a_class_within_ten_seconds_are_one_event_that_counts_as_its_s
     assert count.expected == pytest.approx(0.9 + 0.6)
     assert count.variance == pytest.approx(0.9 * 0.1 + 0.6 * 0.4)
     assert look(tmp_path).minutes("coughing").minutes == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("alias", "name"), [("crying_sobbing", "crying"), ("shout", "yelling"), ("cough", "coughing")]
+)
+def test_a_sound_by_another_name_is_counted_told_and_drawn_as_its_class(tmp_path, alias, name):
+    pages = []
+    for label in (name, alias):
+        events = [(at("10:00"), 60, label, 0.6), (at("23:00"), 30, label, 1.0)]
+        classes = [label if each == name else each for each in GENERAL]
+        write_day(tmp_path / label, DAY, events, classes=classes)
+        pages.append(page_of(tmp_path / label, tmp_path / label))
+    day = look(tmp_path / alias)
+    assert (day.count(name).marked, day.minutes(name).minutes) == (2, 1.5)
+    assert day.home.classes == GENERAL
+    assert pages[0] == pages[1]
+
+
+def test_names_that_a_report_puts_together_are_as_right_as_the_worst_of_them(tmp_path, monkeypatch):
+    rows = [("shout", 0.9), ("yell", 0.4), ("music", 0.8), ("yelling", 0.7)]
+    card = "".join(f"| {n} | {n} | 7 | 290 | {p:.3f} | 0.900 | 0.900 |\n" for n, p in rows)
+    monkeypatch.setattr(homelife, "CARD", card)
+    write_day(tmp_path, DAY, [(at("10:00"), 60, "shout", 0.6)], hours=[10])
+    heard = read_heard(find_shelf([tmp_path]), "live", 0, day_span(DAY, UTC))
+    assert heard.precisions == {"yelling": 0.4, "music": 0.8}
 
 
 def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):

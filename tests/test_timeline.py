@@ -562,6 +562,13 @@ def test_labellings_differ_where_both_say_something_else(grid, data):
     assert all(a[1] <= b[0] for a, b in pairwise(found))
 
 
+def test_two_names_of_one_sound_are_no_difference():
+    times = np.array([0, 10, 20, 30])
+    one = Spans(times[:-1], times[1:], np.array(["crying", "speech", "music"], object))
+    other = Spans(times[:-1], times[1:], np.array(["crying_sobbing", "shout", "music"], object))
+    assert as_list(disagreements(one, other)) == [(10, 20, "speech / shout")]
+
+
 def test_from_afar_a_block_says_what_was_heard_the_most_and_silence_counts_a_quarter():
     grid = Grid(START, START + BLOCKS * 100 * SECOND, SHARES)
     rng = np.random.default_rng(2)

@@ -20,6 +20,7 @@ from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
 from hearthlog.tools.cli.train import train
+from hearthlog.tools.home.simulate import write_training_set
 
 RATE = 16_000
 TOML = '[classes]\nsilence = ["silence"]\nmusic = ["music"]\nspeech = ["speech"]\n'
@@ -67,6 +68,12 @@ def home(tmp_path):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A manifest of two clips of each sound of a simulated home."""
+    return write_training_set(tmp_path_factory.mktemp("simulated") / "clips", 2, seed=3)
+
+
 def run(*arguments):
     app = Typer()
     app.command()(train)
@@ -90,6 +97,13 @@ def test_quiet_stretches_of_a_clip_are_not_its_event_but_all_of_silence_is(tmp_p
     segments = np.bincount(data.target)
     assert segments[data.classes.index("silence")] == 15
     assert segments[data.classes.index("speech")] == 8  # 7 in the loud half, 1 across
+
+
+def test_silence_by_any_name_may_be_silent(tmp_path):
+    data = dataset(
+        clip(tmp_path, "speech", sound("speech", 3)), clip(tmp_path, "Silence", np.zeros(3 * RATE))
+    )
+    assert np.bincount(data.target).tolist() == [5, 5]
 
 
 def test_sound_below_the_floor_teaches_nothing(tmp_path):
@@ -227,6 +241,30 @@ def test_the_same_clips_give_the_same_bytes(home):
     assert a["sha256"] == b["sha256"]
     assert a["metrics"]["macro_f1"] == 1.0
     assert a["training_data"]["collections"] == [{"name": "made up", "licence": "CC0", "clips": 36}]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "names"),
+    [
+        ("general", {"speech": "Speech", "crying": "Crying, sobbing", "yelling": "shout"}),
+        ("general", {"phone_ring": "Ringtone", "coughing": "cough", "laughing": "laughter"}),
+        ("bathroom", {"flushing_water": "Toilet flush", "tap_water": "water_tap_faucet"}),
+        ("bathroom", {"silence": "Silence", "crying": "Crying_and_sobbing"}),
+    ],
+)
+def test_a_manifest_of_other_names_teaches_the_same_model(simulated, tmp_path, scenario, names):
+    renamed = simulated.with_name(f"{tmp_path.name}.csv")
+    with simulated.open(newline="") as stream:
+        rows = list(csv.reader(stream))
+    with renamed.open("w", newline="") as stream:
+        csv.writer(stream).writerows(
+            [path, names.get(label, label), *rest] for path, label, *rest in rows
+        )
+    files = [tmp_path / f"{path.stem}.safetensors" for path in (simulated, renamed)]
+    for path, file in zip((simulated, renamed), files, strict=True):
+        result = run("--data", path, "--scenario", scenario, "--output", file, "--method", "paper")
+        assert result.exit_code == 0, result.output
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_an_output_that_exists_is_refused_before_anything_is_read(tmp_path):

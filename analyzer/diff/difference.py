@@ -141,11 +141,14 @@ class Difference:
 def compare_sides(a: Side, b: Side) -> Difference:
     """Compare two labellings where both have a label.
 
+    What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
+
     Raises
     ------
     DataError
         If they have no time in common.
     """
+    b = b.called_as(a.classes)
     classes = list(dict.fromkeys([*a.classes, *b.classes]))
     events = [events_of(side, classes) for side in (a, b)]
     pieces = laid_over(events, DAY)

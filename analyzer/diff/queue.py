@@ -82,7 +82,7 @@ def make_queue(  # noqa: PLR0913
     side : Side
         The labelling to be reviewed.
     other : Side or None
-        Another one, to see where they disagree.
+        Another one, to see where they disagree; another name for a class is no disagreement.
     marks : Labelling or None
         What was reviewed already: it is left out.
     count : int
@@ -97,6 +97,7 @@ def make_queue(  # noqa: PLR0913
     DataError
         If nothing is left to review, or nothing says what to review first.
     """
+    other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
     segments = events_of(side, classes)
     if marks is not None:

@@ -14,6 +14,7 @@ from hearthlog.analyzer.evaluation.reference import Labelling
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.known import is_of_type
 from hearthlog.analyzer.selection import Progress, Selection, select
+from hearthlog.models.classes import translation
 from hearthlog.models.description import CLASS_NAME
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, join, read_columns
@@ -67,6 +68,12 @@ class Side(NamedTuple):
     name: str
     classes: tuple[str, ...]
     labelling: Labelling
+
+    def called_as(self, classes: Sequence[str]) -> "Side":
+        """Give classes that are among some by another name the name that they have there."""
+        names = translation(self.classes, classes)
+        own = tuple(dict.fromkeys(names.values()))
+        return Side(self.name, own, self.labelling.called_as(classes))
 
 
 @dataclass

@@ -138,10 +138,10 @@ class _Listener:
 
     def overhear(self, recordings: Iterable[Recording], scenario: Scenario) -> Iterator[Recording]:
         """Add recordings that are on their way."""
-        class_of = scenario.class_of
         for recording in recordings:
-            if recording.label in class_of:
-                self._listen(recording.features, class_of[recording.label])
+            name = scenario.find(recording.label)
+            if name is not None:
+                self._listen(recording.features, name)
             yield recording
 
     def _listen(self, features: Float32, label: str) -> None:

@@ -18,6 +18,7 @@ from hearthlog.analyzer.evaluation.events import (
     total,
 )
 from hearthlog.analyzer.evaluation.scores import Scores, score
+from hearthlog.models.classes import translation
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS
 
@@ -42,6 +43,11 @@ class Labelling:
 
     def __len__(self) -> int:
         return len(self.starts)
+
+    def called_as(self, classes: Sequence[str]) -> "Labelling":
+        """Give labels that mean one of some classes, by another name, the name of that class."""
+        names = translation(set(self.labels), classes)
+        return replace(self, labels=np.array([names[label] for label in self.labels], object))
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,8 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
     Parameters
     ----------
     reference : Labelling
-        May have several labels at a time.
+        May have several labels at a time, and other names for the classes (see
+        `hearthlog.models.classes`).
     found : Labelling
         Has one at a time.
     classes : sequence of str
@@ -96,6 +103,7 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
             f"the reference ({_between(reference)}) and what is labelled in the log "
             f"({_between(found)}) have no time in common"
         )
+    reference = reference.called_as(classes)
     names = [*classes, *sorted(set(reference.labels) - set(classes))]
     true, said = (laid_out(_events(each, names), spans) for each in (reference, found))
     lengths = np.bincount(true.labels, true.ends - true.starts, len(names)) / NANOSECONDS

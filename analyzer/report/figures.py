@@ -22,7 +22,7 @@ from hearthlog.analyzer.report.spans import (
     without,
 )
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.analyzer.report.words import QUIET
+from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.messages import NANOSECONDS
 
 EVENING, MORNING = 22, 7  # of the clock: between them is the night
@@ -110,7 +110,7 @@ def whole_home(heard: Heard) -> Home:
         np.concatenate([getattr(part, name) for part in parts]) for name in Segments._fields
     )
     everything = joined(starts, ends)
-    loud = labels != QUIET
+    loud = labels != SILENCE
     sound = joined(starts[loud], ends[loud])
     classes = list(dict.fromkeys(name for known in heard.known.values() for name in known))
     listened, spans, events = {}, {}, {}
@@ -123,9 +123,9 @@ def whole_home(heard: Heard) -> Home:
         listened[name] = joined(begun, ended)
         spans[name] = joined(starts[own], ends[own])
         events[name] = _events(starts[own], ends[own], chances[own])
-    if QUIET in spans:
-        spans[QUIET] = without(spans[QUIET], sound)  # another microphone heard something
-        del events[QUIET]
+    if SILENCE in spans:
+        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
+        del events[SILENCE]
     return Home(classes, everything, listened, sound, spans, events)
 
 

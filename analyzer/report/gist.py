@@ -5,14 +5,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 from hearthlog.analyzer.hometime import local_time
-from hearthlog.analyzer.report import words
 from hearthlog.analyzer.report.account import Account
 from hearthlog.analyzer.report.figures import HOUR, Day
 from hearthlog.analyzer.report.sections import Figure, events_of, sections
 from hearthlog.analyzer.report.spans import joined, without
 from hearthlog.analyzer.report.trouble import Trouble
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.analyzer.report.words import QUIET, clock_text, in_words, listed, short_day
+from hearthlog.analyzer.report.words import (
+    clock_text,
+    in_words,
+    listed,
+    several_in_words,
+    short_day,
+)
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER
 
 _SHOWN = 4  # changes in one sentence
 _MOST = 6  # kinds of gaps, or of trouble
@@ -101,7 +107,7 @@ def plain(name: str) -> str:
 
 
 def _loudest(day: Day) -> str:
-    names = [name for name in day.home.classes if name != QUIET]
+    names = [name for name in day.home.classes if name != SILENCE]
     lasting = ((minutes.minutes, name) for name in names if (minutes := day.minutes(name)))
     most = [
         in_words(name).lower() for minutes, name in sorted(lasting, reverse=True) if minutes >= 1
@@ -141,16 +147,16 @@ def _figures(day: Day) -> Iterator[tuple[Figure, str]]:
         for figure in section.figures:
             yield figure, " in the night" if section.title == "Night" else ""
     for name in day.home.classes:
-        if name not in (QUIET, words.FLUSH, words.SHOWER, words.TAP):
+        if name not in (SILENCE, FLUSHING_WATER, SHOWER, TAP_WATER):
             yield events_of(name), ""
 
 
 def _night(day: Day) -> str:
     parts = []
-    for name, what in ((words.FLUSH, "toilet flushes"), (words.COUGH, "bouts of coughing")):
+    for name in (FLUSHING_WATER, COUGHING):
         count = day.night_count(name)
         if count is not None:
-            parts.append(f"{what} {count.text}")
+            parts.append(f"{several_in_words(name).lower()} {count.text}")
     parts.append(f"{day.night_sound.text} of sound in all")
     partly = "" if day.night_hours > 8.5 else f" Only {day.night_hours:.1f} hours of it were heard."
     return f"Night before, 22:00 to 07:00: {'; '.join(parts)}.{partly}"

@@ -7,9 +7,18 @@ whose text is licensed. Most questions of the form are about the last three days
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hearthlog.analyzer.report import words
 from hearthlog.analyzer.report.figures import Day
 from hearthlog.analyzer.report.values import Count, Minutes
+from hearthlog.analyzer.report.words import in_words, several_in_words
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    FLUSHING_WATER,
+    PHONE_RING,
+    SHOWER,
+    SPEECH,
+    YELLING,
+)
 
 DAYS = 3
 
@@ -38,6 +47,10 @@ class Item(NamedTuple):
     limits: str
 
 
+def _several(name: str) -> str:
+    return several_in_words(name).lower()
+
+
 ITEMS = (
     Item(
         "Sleep",
@@ -48,58 +61,58 @@ ITEMS = (
     ),
     Item(
         "Toilet use at night",
-        "toilet flushes in the night",
-        words.FLUSH,
-        lambda day: day.night_count(words.FLUSH),
+        f"{_several(FLUSHING_WATER)} in the night",
+        FLUSHING_WATER,
+        lambda day: day.night_count(FLUSHING_WATER),
         "Whether help was needed, or whether there was any incontinence.",
     ),
     Item(
         "Toilet use",
-        "toilet flushes, day and night",
-        words.FLUSH,
-        lambda day: day.count(words.FLUSH),
+        f"{_several(FLUSHING_WATER)}, day and night",
+        FLUSHING_WATER,
+        lambda day: day.count(FLUSHING_WATER),
         "Toilet visits without a flush, and who used it.",
     ),
     Item(
         "Bathing",
-        "showers",
-        words.SHOWER,
-        lambda day: day.count(words.SHOWER),
+        _several(SHOWER),
+        SHOWER,
+        lambda day: day.count(SHOWER),
         "Whether help was needed, and washing at the basin.",
     ),
     Item(
         "Coughing",
-        "bouts of coughing, day and night",
-        words.COUGH,
-        lambda day: day.count(words.COUGH),
+        f"{_several(COUGHING)}, day and night",
+        COUGHING,
+        lambda day: day.count(COUGHING),
         "The cause, or whether there is phlegm or shortness of breath.",
     ),
     Item(
         "Mood: crying",
-        "times of crying",
-        words.CRY,
-        lambda day: day.count(words.CRY),
+        _several(CRYING),
+        CRYING,
+        lambda day: day.count(CRYING),
         "Who cried and why; a film sounds the same. Sadness is often silent.",
     ),
     Item(
         "Behaviour: shouting",
-        "times of shouting",
-        words.SHOUT,
-        lambda day: day.count(words.SHOUT),
+        _several(YELLING),
+        YELLING,
+        lambda day: day.count(YELLING),
         "At whom, or whether it was a call for help, anger or television.",
     ),
     Item(
         "Using the telephone",
-        "times the telephone rang",
-        words.PHONE,
-        lambda day: day.count(words.PHONE),
+        _several(PHONE_RING),
+        PHONE_RING,
+        lambda day: day.count(PHONE_RING),
         "Whether it was answered, by whom, and calls that the person made.",
     ),
     Item(
         "Company and conversation",
-        "talking, in all",
-        words.SPEECH,
-        lambda day: day.minutes(words.SPEECH),
+        f"{in_words(SPEECH).lower()}, in all",
+        SPEECH,
+        lambda day: day.minutes(SPEECH),
         "Who talked. Radio and television count as well; what was said is not kept.",
     ),
 )

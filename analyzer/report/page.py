@@ -22,7 +22,14 @@ from hearthlog.analyzer.report.markup import box, figure, heading, page, paragra
 from hearthlog.analyzer.report.reading import LIVE
 from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
 from hearthlog.analyzer.report.values import Count, Minutes, Value
-from hearthlog.analyzer.report.words import QUIET, clock_text, in_words, listed, times_in_words
+from hearthlog.analyzer.report.words import (
+    clock_text,
+    in_words,
+    listed,
+    several_in_words,
+    times_in_words,
+)
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
@@ -70,8 +77,8 @@ def week_page(account: Account, picture: bytes) -> str:
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{words.date_in_words(first)} to {words.date_in_words(last)}"
     title = f"Week {first.isocalendar().week}, {spoken}"
-    names = [name for name in account.classes if name != QUIET and _was_heard(account, name)]
-    absent = [in_words(name).lower() for name in account.classes if name not in (*names, QUIET)]
+    names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
+    absent = [in_words(name).lower() for name in account.classes if name not in (*names, SILENCE)]
     body = [
         *_top(account, title, list(gist_of_week(account))),
         figure(picture, f"Timeline of {title}", _WEEK_CAPTION),
@@ -119,16 +126,16 @@ def _sounds(account: Account, day: Day) -> Iterator[str]:
     tested = any(name in account.precisions for name in account.classes)
     usually = ["Usually"] * account.comparable
     heads = ["Sound", "How long", *usually, "How often", *usually, *["Right in tests"] * tested]
-    names = [name for name in account.classes if name != QUIET]
+    names = [name for name in account.classes if name != SILENCE]
     absent = [name for name in names if not _was_heard(account, name)]
     rows = []
-    for name in [*names, *[QUIET] * (QUIET in account.classes)]:
+    for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
         if name in absent:
             continue
         often = events_of(name)
         row = [swatch(*colour(name)) + escape(in_words(name))]
         row += _cells(account, minutes_of(name), day)
-        row += [""] * (1 + account.comparable) if name == QUIET else _cells(account, often, day)
+        row += [""] * (1 + account.comparable) if name == SILENCE else _cells(account, often, day)
         rows.append(row + [_tenths(account.precisions.get(name))] * tested)
     yield table(heads, rows)
     if absent:
@@ -167,9 +174,10 @@ def _section(account: Account, section: Section, day: Day) -> Iterator[str]:
     if share < _PARTLY * day.share:
         yield paragraph(f"These sounds could be heard for {percent(share)} of the day only.")
     if section.title == "Bathroom":
-        for name, what in ((words.FLUSH, "Toilet flushes"), (words.SHOWER, "Showers")):
+        for name in (FLUSHING_WATER, SHOWER):
             starts = day.events(name).starts
-            yield paragraph(f"{what} at {times_in_words(starts, day.zone)}." if len(starts) else "")
+            times = f"{several_in_words(name)} at {times_in_words(starts, day.zone)}."
+            yield paragraph(times if len(starts) else "")
     elif section.title == "Night":
         yield paragraph(_coughing(day))
     else:
@@ -179,7 +187,7 @@ def _section(account: Account, section: Section, day: Day) -> Iterator[str]:
 
 def _coughing(day: Day) -> str:
     """Say in which hours of the night there was coughing, as marked."""
-    events = day.night_events(words.COUGH)
+    events = day.night_events(COUGHING)
     if not len(events.starts) or not day.night_hours:
         return ""
     hours = [clock_text(time, day.zone)[:2] for time in events.starts.tolist()]

@@ -15,7 +15,8 @@ from hearthlog.analyzer.report.baseline import Usual, usual
 from hearthlog.analyzer.report.figures import EVENING, HOUR, MORNING, Day
 from hearthlog.analyzer.report.spans import Int64, Spans, lengths, without
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.analyzer.report.words import QUIET, in_words, short_day
+from hearthlog.analyzer.report.words import in_words, short_day
+from hearthlog.models.classes import SILENCE
 
 _DAY_BINS, _WEEK_BINS = 20, 6  # an hour
 _LEAST = 0.35  # of a lane's height, for what is short: a cough has to be seen
@@ -55,7 +56,7 @@ def save_week(path: Path, days: Sequence[Day]) -> None:
 
 
 def _names(*days: Day) -> list[str]:
-    return [name for name in days[0].home.classes if name != QUIET]
+    return [name for name in days[0].home.classes if name != SILENCE]
 
 
 def _lanes(axes: Any, names: Sequence[str], days: Sequence[Day], bins: int) -> None:

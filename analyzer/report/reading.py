@@ -18,9 +18,9 @@ from hearthlog.analyzer.marks import Mark, read_marks
 from hearthlog.analyzer.report.shelf import RELABEL, REVIEW, Entry, Shelf
 from hearthlog.analyzer.report.spans import NONE, Int64, Spans, common, joined, without
 from hearthlog.analyzer.report.trouble import Status, Trouble, gaps_of, statuses_of, troubles_of
-from hearthlog.analyzer.report.words import ALIASES
 from hearthlog.analyzer.selection import Selection, select
 from hearthlog.models.card import DESCRIPTION
+from hearthlog.models.classes import class_name
 from hearthlog.models.description import CLASS_NAME, class_metrics
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, read_columns
@@ -255,8 +255,8 @@ def _in_order(source: Source, parts: Sequence[Columns]) -> Segments:
 
 
 def _known(topic: str, labels: NDArray[Any]) -> NDArray[Any]:
-    """Give classes the names that this report has for them; raise LogError if one cannot be."""
-    names = {label: ALIASES.get(label, label) for label in set(labels.tolist())}
+    """Give each class one name, whatever logs call it; raise LogError if one cannot be."""
+    names = {label: class_name(label) for label in set(labels.tolist())}
     if len(names) > _MOST_CLASSES:
         raise LogError(f"{topic}: has {len(names)} different labels; no classifier has so many")
     for label in names:
@@ -286,7 +286,7 @@ def _of_marks(marks: Sequence[Mark]) -> Segments:
     return Segments(
         np.array([mark.start for mark in ordered], np.int64),
         np.array([mark.end for mark in ordered], np.int64),
-        np.array([ALIASES.get(mark.label, mark.label) for mark in ordered], object),
+        np.array([class_name(mark.label) for mark in ordered], object),
         np.ones(len(ordered)),
     )
 
@@ -337,7 +337,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
                 names[node, microphone] |= dict.fromkeys(said)
     for source, segments in heard.segments.items():
         names[source] |= dict.fromkeys(sorted(set(segments.labels.tolist())))
-        sound = [ALIASES.get(name, name) for name in names[source] if CLASS_NAME.fullmatch(name)]
+        sound = [class_name(name) for name in names[source] if CLASS_NAME.fullmatch(name)]
         heard.known[source] = list(dict.fromkeys(sound))[:_MOST_CLASSES]
 
 
@@ -357,8 +357,12 @@ def _precisions_of(path: Path) -> dict[str, float]:
         places = [place for place in file.places if place.opcode == Opcode.ATTACHMENT]
         records = [file.record(place) for place in places]
     texts = [r.data for r in records if isinstance(r, Attachment) and r.name == DESCRIPTION]
-    classes = [metrics for text in texts for metrics in class_metrics(text).items()]
-    return {ALIASES.get(name, name): metrics.precision for name, metrics in classes}
+    precisions: dict[str, float] = {}
+    for text in texts:
+        for label, metrics in class_metrics(text).items():
+            name = class_name(label)
+            precisions[name] = min(precisions.get(name, 1.0), metrics.precision)
+    return precisions
 
 
 def _lose(heard: Heard, line: str) -> None:

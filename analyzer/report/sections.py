@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from hearthlog.analyzer.report import words
 from hearthlog.analyzer.report.figures import Day
 from hearthlog.analyzer.report.values import Value
+from hearthlog.analyzer.report.words import in_words, listed, several_in_words
+from hearthlog.models.classes import COUGHING, CRYING, FLUSHING_WATER, SHOWER, TAP_WATER
 
-BATHROOM = (words.FLUSH, words.SHOWER, words.TAP)
+BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 
 
 class Figure(NamedTuple):
@@ -54,37 +55,40 @@ def sections(classes: Sequence[str]) -> list[Section]:
 
 def minutes_of(name: str) -> Figure:
     """Return for how long a class was heard."""
-    title = words.in_words(name)
+    title = in_words(name)
     return Figure(title, title, lambda day: day.minutes(name), name)
 
 
 def events_of(name: str, title: str = "") -> Figure:
     """Return how often a class was heard."""
-    title = title or words.in_words(name)
+    title = title or in_words(name)
     return Figure(title, title, lambda day: day.count(name), name)
 
 
-def _at_night(name: str, title: str, short: str = "") -> Figure:
-    return Figure(title, short or title, lambda day: day.night_count(name), name)
+def _at_night(name: str, title: str, short: str) -> Figure:
+    return Figure(title, short, lambda day: day.night_count(name), name)
+
+
+def _day_and_night(name: str) -> Iterator[Figure]:
+    title = several_in_words(name)
+    yield events_of(name, title)
+    yield _at_night(name, f"{title} at night", "at night")
 
 
 def _bathroom(classes: Sequence[str]) -> Iterator[Figure]:
-    if words.FLUSH in classes:
-        yield events_of(words.FLUSH, "Toilet flushes")
-        yield _at_night(words.FLUSH, "Toilet flushes at night", "at night")
-    if words.SHOWER in classes:
-        yield events_of(words.SHOWER, "Showers")
-        yield minutes_of(words.SHOWER)._replace(title="Time in the shower", short="Shower time")
-    if words.TAP in classes:
-        yield events_of(words.TAP, "Water taps")
-        yield _at_night(words.TAP, "Water taps at night", "at night")
+    if FLUSHING_WATER in classes:
+        yield from _day_and_night(FLUSHING_WATER)
+    if SHOWER in classes:
+        yield events_of(SHOWER, several_in_words(SHOWER))
+        yield minutes_of(SHOWER)._replace(title="Time in the shower", short="Shower time")
+    if TAP_WATER in classes:
+        yield from _day_and_night(TAP_WATER)
 
 
 def _night(classes: Sequence[str]) -> Iterator[Figure]:
-    if words.COUGH in classes:
-        yield _at_night(words.COUGH, "Bouts of coughing", "Coughing")
-    if words.CRY in classes:
-        yield _at_night(words.CRY, "Times of crying", "Crying")
+    for name in (COUGHING, CRYING):
+        if name in classes:
+            yield _at_night(name, several_in_words(name), in_words(name))
     yield Figure("Times with sound", "Times with sound", lambda day: day.night_stretches)
     yield Figure("Time with sound", "Time with sound", lambda day: day.night_sound)
 
@@ -111,5 +115,5 @@ _ACTIVITY_NOTE = (
 def _missing(classes: Sequence[str], wanted: Sequence[str]) -> str:
     if any(name in classes for name in wanted):
         return ""
-    names = words.listed([words.in_words(name).lower() for name in wanted])
+    names = listed([in_words(name).lower() for name in wanted])
     return f"Cannot be told: the model of this home does not know these sounds ({names})."

@@ -6,36 +6,8 @@ import numpy as np
 
 from hearthlog.analyzer.hometime import local_time
 from hearthlog.analyzer.report.spans import Int64
+from hearthlog.models.classes import find_class
 
-QUIET = "silence"
-FLUSH, SHOWER, TAP = "flushing_water", "shower", "tap_water"
-COUGH, CRY, SHOUT, LAUGH = "coughing", "crying", "yelling", "laughing"
-PHONE, SPEECH, MUSIC = "phone_ring", "speech", "music"
-
-ALIASES = {  # the names that AudioSet has for them
-    "toilet_flush": FLUSH,
-    "water_tap": TAP,
-    "cough": COUGH,
-    "yell": SHOUT,
-    "laughter": LAUGH,
-    "telephone_bell_ringing": PHONE,
-}
-_WORDS = {
-    QUIET: "Quiet",
-    SPEECH: "Talking",
-    MUSIC: "Music",
-    PHONE: "Telephone ringing",
-    COUGH: "Coughing",
-    CRY: "Crying",
-    SHOUT: "Shouting",
-    LAUGH: "Laughing",
-    "objects_activity": "Household sounds",
-    FLUSH: "Toilet flush",
-    SHOWER: "Shower",
-    TAP: "Water tap",
-    "other": "Other sounds",
-    "unknown": "Not sure",
-}
 _WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
 _MONTHS = (
     *("January", "February", "March", "April", "May", "June"),
@@ -45,7 +17,14 @@ _MONTHS = (
 
 def in_words(label: str) -> str:
     """Name a class as people would."""
-    return _WORDS.get(label, label.replace("_", " ").capitalize())
+    row = find_class(label)
+    return label.replace("_", " ").capitalize() if row is None else row.words
+
+
+def several_in_words(label: str) -> str:
+    """Name events of a class as people would who count them."""
+    row = find_class(label)
+    return (row.several if row else "") or in_words(label)
 
 
 def day_in_words(day: date) -> str:

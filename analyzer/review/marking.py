@@ -12,8 +12,6 @@ from hearthlog.analyzer.heard import Heard
 from hearthlog.analyzer.marks import Mark, Span, read_marks, write_marks
 from hearthlog.analyzer.timeline.contents import Spans
 
-UNKNOWN = "unknown"
-
 
 @dataclass
 class _Change:

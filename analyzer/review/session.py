@@ -11,8 +11,9 @@ from typing import NamedTuple, Protocol
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.hometime import local_time
 from hearthlog.analyzer.marks import Mark
-from hearthlog.analyzer.review.marking import UNKNOWN, Marking
+from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.timeline.contents import Spans
+from hearthlog.models.classes import UNKNOWN
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages import NANOSECONDS
 

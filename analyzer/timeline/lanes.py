@@ -9,10 +9,10 @@ import numpy as np
 from hearthlog.analyzer.hometime import local_time
 from hearthlog.analyzer.timeline.contents import Labelling, Spans, no_spans
 from hearthlog.analyzer.timeline.grid import Float64, Grid, Int64, time_shares
+from hearthlog.models.classes import SILENCE, class_name, translation
 from hearthlog.schemas.messages import NANOSECONDS
 
 BLOCKS = 420  # of a lane seen from afar: what is narrower than four pixels would be drawn grey
-_QUIET = "silence"
 _QUIET_WEIGHT = 0.25  # so that a few minutes of a night in which someone coughs are seen
 _HOUR = 3600
 _TICKS = (60, 300, 900, _HOUR, 3 * _HOUR, 6 * _HOUR, 24 * _HOUR)  # seconds
@@ -57,7 +57,7 @@ def from_afar(labelling: Labelling, grid: Grid) -> Spans:
     names, shares = _shares(labelling, coarse)
     if not names:
         return no_spans()
-    weights = np.array([_QUIET_WEIGHT if name == _QUIET else 1.0 for name in names])
+    weights = np.array([_QUIET_WEIGHT if class_name(name) == SILENCE else 1.0 for name in names])
     best = (shares * weights).argmax(axis=1)
     best = np.where(shares.sum(axis=1) > 0.0, best, -1)
     first = np.flatnonzero(np.diff(best, prepend=-2))
@@ -82,14 +82,19 @@ def _shares(labelling: Labelling, grid: Grid) -> tuple[list[str], Float64]:
 
 
 def disagreements(one: Spans, other: Spans) -> Spans:
-    """Find where two labellings say different things; the text is what both say."""
+    """Find where two labellings say different things; the text is what both say.
+
+    Two names of one sound (see `hearthlog.models.classes`) are the same thing.
+    """
     if not len(one) or not len(other):
         return no_spans()
     edges = np.unique(np.concatenate([one.starts, one.ends, other.starts, other.ends]))
     starts, ends = edges[:-1], edges[1:]
     a, b = _at(one, starts), _at(other, starts)
     differ = (a >= 0) & (b >= 0)
-    differ[differ] = one.texts[a[differ]] != other.texts[b[differ]]
+    names = translation(set(other.texts), set(one.texts))
+    said = np.array([names[text] for text in other.texts], object)
+    differ[differ] = one.texts[a[differ]] != said[b[differ]]
     first = differ & (np.diff(np.where(differ, a, -1), prepend=-2) != 0)
     first |= differ & (np.diff(np.where(differ, b, -1), prepend=-2) != 0)
     places = np.flatnonzero(first)

@@ -9,6 +9,7 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
+from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.sounds import (
     LABELS,
@@ -162,10 +163,10 @@ def _plan_day(minutes: float, seed: int) -> list[Event]:
     for seconds, sounds in _DAY:
         for start, length, label in _plan_part(rng, seconds * share, sounds.split()):
             first = round((part_start + start) * SAMPLE_RATE)
-            events.append((_end(events), first, "silence"))
+            events.append((_end(events), first, SILENCE))
             events.append((first, first + round(length * SAMPLE_RATE), label))
         part_start += seconds * share
-    return [*events, (_end(events), total, "silence")]
+    return [*events, (_end(events), total, SILENCE)]
 
 
 def _end(events: list[Event]) -> int:
@@ -194,7 +195,7 @@ def _perform(events: list[Event], seed: int) -> Iterator[NDArray[np.float64]]:
     # From 1: a seed (s, 0) gives the numbers of the seed s, which planned the day.
     room = RoomTone(generator(seed, 1))
     for number, (start, end, label) in enumerate(events, start=2):
-        if label == "silence":
+        if label == SILENCE:
             for block in range(start, end, _BLOCK_SAMPLES):
                 yield room(min(_BLOCK_SAMPLES, end - block))
         else:

@@ -1,0 +1,112 @@
+"""The classes of sound: the one table that says what each is called, drawn as, and lasts."""
+
+import re
+from collections.abc import Collection, Iterable
+from typing import NamedTuple
+
+SILENCE, SPEECH, MUSIC, PHONE_RING = "silence", "speech", "music", "phone_ring"
+COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing"
+FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
+OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
+OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
+OTHER, UNKNOWN = "other", "unknown"  # what models and people say; no sound is labelled so
+
+
+class SoundClass(NamedTuple):
+    """A class of sound.
+
+    Attributes
+    ----------
+    name : str
+    colour : (int, int, int)
+        Red, green and blue, 0 to 255.
+    seconds : float
+        How long such a sound is expected to go on.
+    words : str
+        What people call it.
+    several : str
+        What people call its events where they count them; empty where nobody does.
+    aliases : tuple of str
+        What others call it, as `find_class` spells it: names of the same, not of a kind of it.
+    """
+
+    name: str
+    colour: tuple[int, int, int]
+    seconds: float
+    words: str
+    several: str = ""
+    aliases: tuple[str, ...] = ()
+
+
+# Aliases are the names of AudioSet, and of FSD50K, which has "and" for their commas.
+#
+# The colours, but that of `other`, were optimised together: any two differ by at least 19 (CIE
+# 1976, in L*a*b*) for eyes that see all colours and for protanopia, deuteranopia and tritanopia
+# (as Machado et al., 2009, simulate them), and by 3 in lightness, which is what is left on a grey
+# print.
+# fmt: off
+CLASSES = (
+    SoundClass(SILENCE,          (112, 120, 130),  60.0, "Quiet"),
+    SoundClass(SPEECH,           (103, 166, 255),   5.0, "Talking"),
+    SoundClass(MUSIC,            (200, 129, 194),  60.0, "Music"),
+    SoundClass(PHONE_RING,       (246, 241,  66),   5.0, "Telephone ringing",
+               "Times the telephone rang", ("telephone_bell_ringing", "ringtone")),
+    SoundClass(COUGHING,         (210,  94,   1),   0.5, "Coughing",
+               "Bouts of coughing", ("cough",)),
+    SoundClass(CRYING,           ( 11, 112, 196),   5.0, "Crying",
+               "Times of crying", ("crying_sobbing", "crying_and_sobbing")),
+    SoundClass(YELLING,          (232, 160,   0),   2.0, "Shouting",
+               "Times of shouting", ("shout", "yell")),
+    SoundClass(LAUGHING,         (  0, 158,  82),   2.0, "Laughing",
+               "", ("laughter",)),
+    SoundClass(OBJECTS_ACTIVITY, (141,  76,  28),   2.0, "Household sounds"),
+    SoundClass(FLUSHING_WATER,   (107,  72, 224),  15.0, "Toilet flush",
+               "Toilet flushes", ("toilet_flush",)),
+    SoundClass(SHOWER,           ( 69, 215, 144), 300.0, "Shower", "Showers"),
+    SoundClass(TAP_WATER,        (169, 222, 251),  10.0, "Water tap",
+               "Water taps", ("water_tap", "water_tap_faucet", "water_tap_and_faucet")),
+    SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),   5.0, "Bathroom other"),
+    SoundClass(OTHER_NEGATIVE,   (195, 202, 199),   5.0, "Other negative"),
+    SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
+    SoundClass(UNKNOWN,          (255, 255, 255),   5.0, "Not sure"),
+)
+# fmt: on
+
+_BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
+
+
+def find_class(label: str) -> SoundClass | None:
+    """Return the class that a label means; None for a class of somebody's own.
+
+    The name or an alias may be spelt with capitals, and with spaces, commas and hyphens for `_`:
+    `Crying, sobbing` is `crying_sobbing`.
+    """
+    return _BY_NAME.get(_spelt(label))
+
+
+def class_name(label: str) -> str:
+    """Return the name of the class that a label means; a class of somebody's own has its own."""
+    row = find_class(label)
+    return label if row is None else row.name
+
+
+def meant_by(label: str, names: Collection[str]) -> list[str]:
+    """Return which of some names a label means: itself, however it is spelt, or all of its class.
+
+    Who lists two names of one class tells them apart, so another name of it means both.
+    """
+    if label in names:
+        return [label]
+    row = find_class(label)
+    same = [name for name in names if row is not None and find_class(name) == row]
+    return [name for name in same if _spelt(name) == _spelt(label)] or same
+
+
+def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
+    """Return what each of some labels is called among names; itself, if none or several mean it."""
+    meant = {label: meant_by(label, names) for label in labels}
+    return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}
+
+
+def _spelt(label: str) -> str:
+    return re.sub("[ ,-]+", "_", label.lower())
