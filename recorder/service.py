@@ -9,7 +9,6 @@ from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Protocol
 
-from hearthlog import __version__
 from hearthlog.models.modelfile import Model
 from hearthlog.recorder import features
 from hearthlog.recorder.config import Settings
@@ -21,6 +20,7 @@ from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.recorder.stream import FRAME_NANOSECONDS, Event, Frames, Gap
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import Attachment
 
@@ -202,15 +202,14 @@ def _describe(settings: Settings, source: Source, model: Model | None) -> LogDes
         attachments.append(Attachment("model_card.md", "text/markdown", model.card().encode()))
     classes = None if model is None else list(model.classes)
     info = stream_info(microphone, source.device, model)
-    metadata = {
-        "version": __version__,
-        "node": settings.node,
-        "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
-        "feature_set": features.NAME,
-        "model": info.model,
-        "model_sha256": info.model_sha256,
-        "timezone": settings.timezone,
-    }
+    metadata = provenance(
+        settings.node,
+        configuration_sha256=hashlib.sha256(configuration).hexdigest(),
+        feature_set=features.NAME,
+        model=info.model,
+        model_sha256=info.model_sha256,
+        timezone=settings.timezone,
+    )
     return LogDescription(
         root=settings.output,
         node=settings.node,

@@ -7,17 +7,22 @@ from collections import Counter
 from datetime import UTC, datetime
 from typing import Any
 
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.doctor.contract import NAME, Contract, place_of, type_of
 from hearthlog.analyzer.doctor.data import ATTACHMENTS, Data
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.models.inputs import WINDOW_FRAMES
 from hearthlog.recorder import features
-from hearthlog.schemas.messages import NANOSECONDS, definition, type_hash
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import difference, type_hash_of
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.provenance import METADATA, schema_version
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.topics import Topic, topics_of
-from hearthlog.schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
+from hearthlog.schemas.versions import SCHEMA_VERSION
+from hearthlog.schemas.writer import PROFILE, SCHEMA_ENCODING
 
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
@@ -160,12 +165,8 @@ class About:
         if (schema.name, schema.encoding) != (typename, SCHEMA_ENCODING):
             what = f"{channel.topic} is of type {schema.name} ({schema.encoding}), not {typename}"
             self._error("type", what)
-        elif schema.data != definition(typename).encode():
-            self._error(
-                "type", f"{channel.topic}: {typename} is defined otherwise than by hearthlog"
-            )
-        elif channel.metadata.get("topic_type_hash") != type_hash(typename):
-            self._error("type", f"{channel.topic}: topic_type_hash is not that of {typename}")
+        else:
+            self._check_definition(channel, schema)
         try:
             profiles = json.loads(channel.metadata.get("offered_qos_profiles", "[{}]"))
             good = isinstance(profiles, list) and all(isinstance(p, dict) for p in profiles)
@@ -173,6 +174,20 @@ class About:
             good = False
         if not good or not profiles:
             self._error("qos", f"{channel.topic}: offered_qos_profiles is no list of profiles")
+
+    def _check_definition(self, channel: Channel, schema: Schema) -> None:
+        """Compare a definition with those that were released, and its hash with what is said."""
+        records = self._data.metadata.get(METADATA, [{}])
+        try:
+            kind = message_type(schema.name, schema.encoding, schema.data)
+            what = difference(kind, schema_version(records[0]) or SCHEMA_VERSION)
+            if not what and channel.metadata.get("topic_type_hash") != type_hash_of(kind):
+                self._error("type", f"{channel.topic}: topic_type_hash is not that of {kind.name}")
+        except LogError as error:
+            what = str(error)
+        if what:
+            what = f"{channel.topic}: {schema.name} is defined otherwise than by hearthlog: {what}"
+            self._error("type", what)
 
     def _check_arrays(self, channel: Channel, topic: Topic) -> None:
         for key, names in topic.array_names.items():

@@ -17,10 +17,10 @@ from hearthlog.analyzer.doctor.definitions import Definitions, name_of, parse_st
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.walk import Record
 from hearthlog.schemas.chunks import MESSAGE_HEAD
+from hearthlog.schemas.provenance import METADATA
 from hearthlog.schemas.records import HEAD
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.rows import Int64
-from hearthlog.schemas.writer import METADATA
 
 ATTACHMENTS = ("configuration.json", "model_card.md")
 _NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept

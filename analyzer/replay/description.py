@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from hearthlog import __version__
 from hearthlog.analyzer.replay.origin import Origin
 from hearthlog.models.modelfile import Model
 from hearthlog.recorder import features
 from hearthlog.recorder.log import LogDescription
 from hearthlog.recorder.pipeline import stream_info
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import Attachment
 
@@ -47,8 +47,7 @@ def describe(
         info=info,
         metadata={
             **origin.metadata,
-            "version": __version__,
-            "node": origin.node,
+            **provenance(origin.node),
             "feature_set": features.NAME,
             "model": info.model,
             "model_sha256": info.model_sha256,
