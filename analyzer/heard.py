@@ -17,6 +17,7 @@ from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 
 _KIND = "features"
+_FIELDS = {"header.stamp"}
 _TAIL = 60 * NANOSECONDS
 
 
@@ -76,7 +77,7 @@ def find_heard(path: Path) -> dict[str, Heard]:
     for name, same in selection.channels.items():
         microphone = name.removeprefix("/").removesuffix(f"/{_KIND}")
         if name == topic(microphone, _KIND) and all(
-            is_of_type(*described, messages.FEATURES) for described in same
+            is_of_type(*described, messages.FEATURES, _FIELDS) for described in same
         ):
             spans = sorted(_spans(selection.logs, name))
             if spans:
@@ -111,6 +112,6 @@ def _spans(logs: Sequence[Path], name: str) -> Iterator[tuple[int, int, Path]]:
 
 def _stamps(log: Path, name: str, start: int | None = None) -> Iterator[int]:
     """Yield the first and the last stamp of every piece of a log."""
-    for batch in iterate_columns([log], {name}, start, fields={"header.stamp"}):
+    for batch in iterate_columns([log], {name}, start, fields=_FIELDS):
         for columns in batch:
             yield from columns["header.stamp"][[0, -1]].tolist()

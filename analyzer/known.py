@@ -1,5 +1,6 @@
 """The messages of a log that are of types this version knows, as columns."""
 
+import warnings
 from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -8,7 +9,8 @@ from mcap.records import Channel, Schema
 
 from hearthlog.schemas.chunks import RawMessages
 from hearthlog.schemas.columns import Columns, decode
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.fields import lacking
 from hearthlog.schemas.layout import message_type
 from hearthlog.schemas.writer import ENCODING
 
@@ -24,39 +26,50 @@ def decode_known(
         The log they are from.
     batch : iterable of RawMessages
     wanted : mapping of str to collection of str
-        Paths of the fields that are wanted, by type.
+        Paths of the fields that are wanted, by type; `is_of_type` says which they may be.
 
     Raises
     ------
     LogError
         If a message is not of the type that its channel says.
     """
-    found: list[Columns] = []
+    decoded: list[Columns] = []
     try:
         for kind, fields in wanted.items():
-            same = [raw for raw in batch if is_of_type(raw.channel, raw.schema, kind)]
-            found += decode(same, fields)
+            same = [raw for raw in batch if is_of_type(raw.channel, raw.schema, kind, fields)]
+            decoded += decode(same, fields)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
-    return found
+    return decoded
 
 
-def is_of_type(channel: Channel, schema: Schema | None, kind: str) -> bool:
-    """Tell whether a channel has messages of a type as this version knows it, or extended."""
-    return (
-        schema is not None
-        and schema.name == kind
-        and channel.message_encoding == ENCODING
-        and _has_its_fields(kind, schema.encoding, schema.data)
-    )
+def is_of_type(channel: Channel, schema: Schema | None, kind: str, fields: Collection[str]) -> bool:
+    """Tell whether a channel has messages of a type, of which some fields can be read.
+
+    Whatever version of a type of ours a log has, they can: there are defaults for those that were
+    appended since. A definition that is none of any version gives a `HearthlogWarning`.
+
+    Parameters
+    ----------
+    channel : Channel
+    schema : Schema or None
+    kind : str
+    fields : collection of str
+        Paths of the fields that the reader needs.
+    """
+    if schema is None or schema.name != kind or channel.message_encoding != ENCODING:
+        return False
+    missing = _lacking(kind, schema.encoding, schema.data, frozenset(fields))
+    if missing:
+        text = f"{kind} is defined without {missing} as hearthlog has it: not read"
+        warnings.warn(HearthlogWarning(text, channel.topic), stacklevel=2)
+    return not missing
 
 
 @lru_cache
-def _has_its_fields(kind: str, encoding: str, text: bytes) -> bool:
-    """Compare a definition from a file with ours, and all that it may build on."""
+def _lacking(kind: str, encoding: str, text: bytes, fields: frozenset[str]) -> str:
+    """Say which fields cannot be read; empty if all can."""
     try:
-        theirs = message_type(kind, encoding, text).types
+        return ", ".join(lacking(message_type(kind, encoding, text), fields))
     except LogError:
-        return False
-    ours = message_type(kind).types
-    return all(set(fields) <= set(theirs[name]) for name, fields in ours.items())
+        return "any field"

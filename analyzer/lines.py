@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.pieces import DURATION, TIME, Field, Piece
+from hearthlog.analyzer.pieces import Piece
+from hearthlog.schemas.fields import DURATION, TIME, Field
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.rows import Int64
 

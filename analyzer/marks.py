@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog import __version__
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.known import decode_known, is_of_type
 from hearthlog.analyzer.selection import select
@@ -24,6 +23,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import SUFFIX, replaced_file, stem
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import Topic, check_microphone_name, topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
@@ -93,7 +93,7 @@ def read_marks(log: Path) -> list[Mark]:
     if not complete:
         raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
     for name, same in selection.channels.items():
-        kind = next((kind for kind in _KINDS if all(is_of_type(*d, kind) for d in same)), "")
+        kind = next((k for k in _KINDS if all(is_of_type(*d, k, _FIELDS[k]) for d in same)), "")
         if not kind or not re.fullmatch(rf"/[^/]+/{_KINDS[kind]}", name):
             raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
     selection.verify()
@@ -146,11 +146,8 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) 
         if not left:
             path.unlink(missing_ok=True)
             return path
-        about = {
-            "version": __version__,
-            "node": next((found.get("node", "") for found in select([log]).metadata), ""),
-            "log": stem(log) + SUFFIX,
-        }
+        node = next((record.get("node", "") for record in select([log]).metadata), "")
+        about = provenance(node, log=stem(log) + SUFFIX)
         with replaced_file(path) as temporary:
             temporary.write_bytes(_layer(path.name, left, about))
     return path

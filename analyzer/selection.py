@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Schema
 
 from hearthlog.schemas.chunks import RawMessages, read_chunks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import CATALOG, find_logs
 from hearthlog.schemas.logfile import LogFile, time_span
+from hearthlog.schemas.provenance import read_provenance
 from hearthlog.schemas.ranges import map_logs, store_errors
 from hearthlog.schemas.series import iterate_messages, time_spans
-from hearthlog.schemas.writer import METADATA
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.catalog import Catalog
@@ -182,11 +181,7 @@ class _Content:
                 if not ids or not ids <= file.channels.keys():  # they are defined in the chunks
                     read_chunks(file, file.chunks[i : i + 1], topics=())
             self.channels = [(c, file.schemas.get(c.schema_id)) for c in file.channels.values()]
-            places = [place for place in file.places if place.opcode == Opcode.METADATA]
-            records = [file.record(place) for place in places]
-        self.metadata = [
-            r.metadata for r in records if isinstance(r, Metadata) and r.name == METADATA
-        ]
+            self.metadata = read_provenance(file)
 
 
 def identity(channel: Channel, schema: Schema | None) -> Hashable:

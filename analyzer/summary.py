@@ -20,6 +20,7 @@ from hearthlog.schemas.files import is_layer
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logfile import LogFile, Place
 from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.provenance import read_provenance, version_text
 from hearthlog.schemas.records import HEAD
 
 _STREAM = {
@@ -122,6 +123,8 @@ class Summary:
         Number of chunks, their bytes on disk and before compression.
     profiles, libraries, attachments, metadata : set of str
         Names that occur in the files.
+    schema_versions : set of str
+        As their `hearthlog` records say.
     topics : dict of str to TopicSummary
     label_seconds : dict of str to dict of str to float
         By microphone and label. The labels of a layer are under the name of its topic.
@@ -146,6 +149,7 @@ class Summary:
     libraries: set[str] = field(default_factory=set)
     attachments: set[str] = field(default_factory=set)
     metadata: set[str] = field(default_factory=set)
+    schema_versions: set[str] = field(default_factory=set)
     topics: dict[str, TopicSummary] = field(default_factory=dict)
     label_seconds: dict[str, Counter[str]] = field(default_factory=dict)
     segments: dict[str, Counter[str]] = field(default_factory=dict)
@@ -191,6 +195,7 @@ class Summary:
         self.libraries |= other.libraries
         self.attachments |= other.attachments
         self.metadata |= other.metadata
+        self.schema_versions |= other.schema_versions
         for name, topic in other.topics.items():
             mine = self.topics.setdefault(name, TopicSummary(topic.type, topic.encoding))
             mine.add(topic.messages, topic.bytes, topic.span)
@@ -217,7 +222,11 @@ def summarise(paths: Iterable[Path]) -> Summary:
 def _summarise(path: Path) -> Summary:
     with LogFile(path) as file:
         summary = _about(file)
-        ours = any(is_of_type(*about, kind) for about in _channels(file) for kind in _FIELDS)
+        ours = any(
+            is_of_type(*channel, *wanted)
+            for channel in _channels(file)
+            for wanted in _FIELDS.items()
+        )
         if _is_counted(file) and not ours:
             _count_by_index(file, summary)
         else:
@@ -247,6 +256,7 @@ def _about(file: LogFile) -> Summary:
     for place in file.places:
         names = summary.metadata if place.opcode == Opcode.METADATA else summary.attachments
         names.add(_name(file, place))
+    summary.schema_versions |= {version_text(record) for record in read_provenance(file)}
     return summary
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, time, timedelta
 from pathlib import Path
 
-from hearthlog import __version__
 from hearthlog.recorder.clips import PRIVATE_LIMIT, Sound
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.retention import find_clips
@@ -17,6 +16,7 @@ from hearthlog.schemas.files import audio_path
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS, encode, message, time_message
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import audio_topic
 from hearthlog.schemas.writer import LogWriter
 
@@ -143,14 +143,13 @@ class ClipLog:
         return ""
 
     def _metadata(self, log: Path) -> dict[str, str]:
-        return {
-            "version": __version__,
-            "node": self._settings.node,
-            "log": log.name,
-            "keep_audio": self._settings.keep_audio,
-            "never_keep": json.dumps(self._settings.never_keep),
-            "limit": str(PRIVATE_LIMIT),
-        }
+        return provenance(
+            self._settings.node,
+            log=log.name,
+            keep_audio=self._settings.keep_audio,
+            never_keep=json.dumps(self._settings.never_keep),
+            limit=str(PRIVATE_LIMIT),
+        )
 
     def _full(self, stamp: int, frames: int) -> str:
         """Tell why so many frames may not be written now."""

@@ -9,7 +9,6 @@ from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Any, Protocol
 
-from hearthlog import __version__
 from hearthlog.models.card import model_attachments
 from hearthlog.models.classifier import Classifier
 from hearthlog.models.features.feature_set import FeatureSet
@@ -26,6 +25,7 @@ from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.recorder.stream import Event, Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import Attachment
 
@@ -229,20 +229,20 @@ def describe_log(
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]
+    metadata = provenance(
+        settings.node,
+        configuration_sha256=hashlib.sha256(configuration).hexdigest(),
+        feature_set=features.name,
+        feature_set_version=str(features.version),
+        model=info.model,
+        model_sha256=info.model_sha256,
+        timezone=settings.timezone,
+    )
     return LogDescription(
         root=settings.output,
         node=settings.node,
         topics=topics_of(info.header.frame_id, features.feature_names, classes),
         infos=[info],
-        metadata={
-            "version": __version__,
-            "node": settings.node,
-            "configuration_sha256": hashlib.sha256(configuration).hexdigest(),
-            "feature_set": features.name,
-            "feature_set_version": str(features.version),
-            "model": info.model,
-            "model_sha256": info.model_sha256,
-            "timezone": settings.timezone,
-        },
+        metadata=metadata,
         attachments=attachments if model is None else [*attachments, *model_attachments(model)],
     )

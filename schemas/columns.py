@@ -28,7 +28,8 @@ class Columns:
     `columns["values"]` is the column of a field, by its path ("header.stamp" for one of a message
     in the message): numbers as they are; stamps and durations as int64 nanoseconds; strings as
     `str` objects; arrays as one row each, or as objects where their lengths differ; arrays of
-    messages as lists of dicts.
+    messages as lists of dicts. Of our types these are the fields that this version has: what a log
+    of an older one lacks has its default, and what a newer one appended is not there.
 
     Attributes
     ----------
@@ -53,7 +54,11 @@ class Columns:
         return len(self.log_times)
 
     def __getitem__(self, path: str) -> NDArray[Any]:
-        return self.fields[path]
+        """Return the column of a field; raise LogError if the messages have no such field."""
+        try:
+            return self.fields[path]
+        except KeyError:
+            raise LogError(f"{self.topic}: {self.type} has no field {path!r}") from None
 
     def between(self, start: int | None, end: int | None) -> "Columns":
         """Return the messages with start <= log time < end."""
@@ -96,7 +101,7 @@ def read_columns(
     -------
     dict of str to Columns
         By topic; a topic without a message is not there. Where the files of a topic do not agree
-        on its metadata, only what they agree on is kept.
+        on its metadata, or on its fields, only what they agree on is kept.
 
     Raises
     ------
@@ -127,14 +132,14 @@ def iterate_columns(
     ------
     list of Columns
         The next span of time: one for each topic that speaks in it, or more where its channels
-        differ in type or metadata. Nothing is older than what was yielded before.
+        differ in type, fields or metadata. Nothing is older than what was yielded before.
     """
     pieces = iterate_pieces(logs, topics, start, end, partial(decode, fields=fields))
     return map(_joined, pieces)
 
 
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
-    """Decode messages, those of one topic, type and metadata together.
+    """Decode messages, those of one topic, type, fields and metadata together.
 
     Raises
     ------
@@ -145,10 +150,11 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
 
 
 def _joined(pieces: Iterable[Columns]) -> list[Columns]:
-    """Join pieces of one topic, type and metadata, in the order of time."""
+    """Join pieces of one topic, type, fields and metadata, in the order of time."""
     parts: dict[Any, list[Columns]] = {}
     for columns in pieces:
-        key = columns.topic, columns.type, tuple(sorted(columns.metadata.items()))
+        about = tuple(sorted(columns.metadata.items()))
+        key = columns.topic, columns.type, tuple(columns.fields), about
         parts.setdefault(key, []).append(columns)
     return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
 
@@ -174,7 +180,7 @@ def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
 
 
 def join(parts: Sequence[Columns]) -> Columns:
-    """Put pieces of one topic one after the other.
+    """Put pieces of one topic one after the other; fields that not all of them have are left out.
 
     Raises
     ------
@@ -201,13 +207,16 @@ class _Pile:
         """Append a piece; it must be of the type of the others."""
         if self._first is None:
             self._first, self._metadata = part, dict(part.metadata)
+            self._fields = {path: _Growing(self._expected) for path in part.fields}
         if part.type != self._first.type:
             raise LogError(f"{part.topic}: is of type {self._first.type} and of type {part.type}")
         self._metadata = dict(self._metadata.items() & part.metadata.items())
         for name, growing in self._heads.items():
             growing.append(getattr(part, name))
-        for path, values in part.fields.items():
-            self._fields.setdefault(path, _Growing(self._expected)).append(values)
+        for path in self._fields.keys() - part.fields.keys():
+            del self._fields[path]
+        for path, growing in self._fields.items():
+            growing.append(part.fields[path])
 
     def columns(self) -> Columns:
         """Return all pieces as one; they are gone then."""

@@ -16,7 +16,6 @@ from hearthlog.schemas.topics import Topic
 PROFILE = "ros2"
 ENCODING = "cdr"
 SCHEMA_ENCODING = "ros2msg"
-METADATA = "hearthlog"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Errors whose message is meant for the user: one line that says what is wrong and what to do."""
+"""Errors and warnings for the user: one line that says what is wrong and what to do."""
 
 
 class HearthlogError(Exception):
@@ -7,3 +7,19 @@ class HearthlogError(Exception):
 
 class LogError(HearthlogError):
     """A log, or the folder of one, cannot be read or written."""
+
+
+class HearthlogWarning(UserWarning):
+    """Something is read in part only; the command line prints the line once, and exits with 3.
+
+    Parameters
+    ----------
+    text : str
+        Python shows each text once, so it names no file.
+    where : Path or str
+        The file or the topic.
+    """
+
+    def __init__(self, text: str, where: object) -> None:
+        super().__init__(text)
+        self.where = where

@@ -4,7 +4,7 @@ The payloads of a channel differ only in their numbers as long as their strings 
 keep their lengths, so one numpy record type describes all rows of the same lengths.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -14,8 +14,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import definition, typestore
+from hearthlog.schemas.messages import PACKAGE, definition, number_type, typestore
 from hearthlog.schemas.records import LIMIT
+from hearthlog.schemas.versions import APPENDED
 
 START = 4  # of the fields: alignment counts from here
 _ENCAPSULATION = {"<": b"\x00\x01", ">": b"\x00\x00"}  # plain CDR, by byte order
@@ -47,7 +48,17 @@ class Messages(NamedTuple):
     """One field that is an array of messages, and the leaves of each of them."""
 
     path: str
-    elements: tuple[tuple["Leaf | Messages", ...], ...]
+    elements: tuple[tuple["AnyLeaf", ...], ...]
+
+
+class Default(NamedTuple):
+    """One field that the messages of a file do not have, and the row that stands for it."""
+
+    path: str
+    row: NDArray[Any]
+
+
+AnyLeaf = Leaf | Messages | Default
 
 
 class Layout(NamedTuple):
@@ -58,13 +69,13 @@ class Layout(NamedTuple):
     dtype : np.dtype
         Of the whole payload. A field bears its path as name, and the word before a string or a
         sequence, which says how long it is, that name and " length".
-    leaves : tuple of Leaf or Messages
+    leaves : tuple of Leaf, Messages or Default
     fixed : dict of str to int or np.void
         What every payload of this layout has in common: byte order, lengths, ends of strings.
     """
 
     dtype: np.dtype[np.void]
-    leaves: tuple[Leaf | Messages, ...]
+    leaves: tuple[AnyLeaf, ...]
     fixed: dict[str, Any]
 
     def fits(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -75,21 +86,54 @@ class Layout(NamedTuple):
         return fitting
 
 
+class Growth(NamedTuple):
+    """How a file's definition of one of our types is an older or a newer one.
+
+    Attributes
+    ----------
+    later : frozenset of str
+        Fields that were appended by a later version, which are not read.
+    absent : list of (field, description)
+        Fields that were appended since, in whose place there are defaults.
+    """
+
+    later: frozenset[str]
+    absent: Sequence[tuple[str, Any]]
+
+
+_SAME = Growth(frozenset(), ())
+
+
 class MessageType:
     """A ROS 2 message type as a file defines it.
+
+    What is read of types of ours are the fields that this version has, whichever version wrote
+    them.
 
     Parameters
     ----------
     name : str
     types : mapping of str to list of (field, description)
         The fields of this type and of those it builds on, as rosbags describes them.
+    growth : mapping of str to Growth
+        By type, where this definition is of another version.
     """
 
-    def __init__(self, name: str, types: Mapping[str, Any]) -> None:
+    def __init__(
+        self, name: str, types: Mapping[str, Any], growth: Mapping[str, Growth] | None = None
+    ) -> None:
         self.name = name
         self.types = types
+        self.growth = growth or {}
         self._layouts: dict[int, list[Layout]] = {}
         self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
+
+    def read_fields(self, name: str) -> list[tuple[str, Any]]:
+        """List what is read of one of the types: field and description."""
+        if name not in self.growth:
+            return list(self.types[name])
+        later, absent = self.growth[name]
+        return [*(field for field in self.types[name] if field[0] not in later), *absent]
 
     def layouts(self, size: int) -> list[Layout]:
         """Return the layouts of payloads of this size that were met last."""
@@ -160,7 +204,58 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
             raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     except (TypesysError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise LogError(f"the definition of {name} cannot be read") from error
-    return MessageType(name, known | {key: fields for key, (_, fields) in own.items()})
+    theirs = {key: fields for key, (_, fields) in own.items()}
+    growth = {
+        key: _growth(key, fields, known[key])
+        for key, fields in theirs.items()
+        if key.startswith(f"{PACKAGE}/") and key in known and fields != known[key]
+    }
+    return MessageType(name, known | theirs, growth)
+
+
+def _growth(name: str, theirs: Sequence[Any], ours: Sequence[Any]) -> Growth:
+    """Compare a definition of one of our types with that of this version."""
+    appended = APPENDED.get(name, {})
+    there = {field for field, _ in theirs}
+    later = theirs[len(ours) :] if theirs[: len(ours)] == ours else []
+    absent = [field for field in ours if field[0] not in there and field[0] in appended]
+    return Growth(frozenset(field for field, _ in later), absent)
+
+
+def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "") -> list[Default]:
+    """Make what stands, in columns, for fields that were appended to a type."""
+    appended = APPENDED.get(name, {})
+    return [
+        leaf
+        for field, (node, kind) in fields
+        for leaf in _defaults(
+            f"{prefix}{field}", node, kind, appended[field].default if field in appended else None
+        )
+    ]
+
+
+def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -> Iterator[Default]:
+    if node is Nodetype.NAME and kind not in _STAMPS:
+        yield from default_rows(kind, typestore().fielddefs[kind][1], f"{path}.")
+        return
+    row: NDArray[Any]
+    if node is Nodetype.NAME:
+        row = np.zeros(1, np.int64)
+    elif node is Nodetype.BASE and kind[0] == "string":
+        row = np.array([value or ""], object)
+    elif node is Nodetype.BASE:
+        row = np.array([value or 0], number_type(kind[0]))
+    else:
+        (element, base), count = kind
+        length = count if node is Nodetype.ARRAY else 0
+        if element is Nodetype.NAME:
+            row = np.empty(1, object)
+            row[0] = []
+        elif base[0] == "string":
+            row = np.full((1, length), "", object)
+        else:
+            row = np.zeros((1, length), number_type(base[0]))
+    yield Default(path, row)
 
 
 class _Walk:
@@ -183,7 +278,7 @@ class _Walk:
         self._fields: dict[str, tuple[Any, int]] = {"encapsulation": ("V2", 0)}
         self._fixed: dict[str, Any] = {"encapsulation": np.void(_ENCAPSULATION[order])}
 
-    def layout(self, leaves: tuple[Leaf | Messages, ...], size: int) -> Layout:
+    def layout(self, leaves: tuple[AnyLeaf, ...], size: int) -> Layout:
         """Return what was noted, for payloads of this size."""
         about = {
             "names": list(self._fields),
@@ -193,7 +288,7 @@ class _Walk:
         }
         return Layout(np.dtype(about), leaves, self._fixed)  # type: ignore[call-overload]
 
-    def message(self, name: str, prefix: str = "") -> tuple[Leaf | Messages, ...]:
+    def message(self, name: str, prefix: str = "") -> tuple[AnyLeaf, ...]:
         """Walk through the fields of a message."""
         if name not in self._kind.types:
             raise LogError(f"{self._kind.name}: builds on {name}, which is not defined")
@@ -201,13 +296,16 @@ class _Walk:
         self._depth += 1
         if self._depth > _DEPTH_LIMIT:
             raise LogError(f"{self._kind.name}: contains itself")
-        leaves: list[Leaf | Messages] = []
+        growth = self._kind.growth.get(name, _SAME)
+        leaves: list[AnyLeaf] = []
         for field, description in self._kind.types[name]:
-            leaves += self._field(f"{prefix}{field}", *description)
+            walked = self._field(f"{prefix}{field}", *description)
+            leaves += walked if field not in growth.later else ()
+        leaves += default_rows(name, growth.absent, prefix)
         self._depth -= 1
         return tuple(leaves)
 
-    def _field(self, path: str, node: Nodetype, kind: Any) -> tuple[Leaf | Messages, ...]:
+    def _field(self, path: str, node: Nodetype, kind: Any) -> tuple[AnyLeaf, ...]:
         if node is Nodetype.NAME and kind in _STAMPS:
             self._add(path, [("sec", f"{self._order}i4"), ("nanosec", f"{self._order}u4")], 4)
             return (Leaf(path, "stamp", (path,)),)

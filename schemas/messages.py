@@ -4,8 +4,12 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
+
+from hearthlog.schemas.versions import APPENDED
 
 PACKAGE = "hearthlog_msgs"
 STREAM_INFO = f"{PACKAGE}/msg/AudioStreamInfo"
@@ -35,8 +39,33 @@ def typestore() -> Typestore:
 
 
 def message(typename: str, **fields: Any) -> Any:
-    """Make a message of the given type."""
+    """Make a message of the given type; fields that were appended to it may be left out."""
+    absent = APPENDED.get(typename, {}).keys() - fields.keys()
+    if absent:
+        descriptions = dict(typestore().fielddefs[typename][1])
+        for name in absent:
+            fields[name] = _default(descriptions[name], APPENDED[typename][name].default)
     return typestore().types[typename](**fields)
+
+
+def _default(description: tuple[Nodetype, Any], value: float | str | None = None) -> Any:
+    """Return what stands for a field in a message, as `default_rows` does for one in columns."""
+    node, kind = description
+    if node is Nodetype.BASE:
+        return ("" if kind[0] == "string" else 0) if value is None else value
+    if node is Nodetype.NAME:
+        fields = [f for f in typestore().fielddefs[kind][1] if f[0] not in APPENDED.get(kind, {})]
+        return message(kind, **{name: _default(described) for name, described in fields})
+    (element, base), count = kind
+    length = count if node is Nodetype.ARRAY else 0
+    if element is Nodetype.BASE and base[0] != "string":
+        return np.zeros(length, number_type(base[0]))
+    return [_default((element, base)) for _ in range(length)]
+
+
+def number_type(name: str) -> np.dtype[Any]:
+    """Return the dtype of numbers, by the name that message definitions have for them."""
+    return np.dtype("uint8" if name in {"byte", "char"} else name)
 
 
 def header(stamp: int, frame_id: str) -> Any:

@@ -1,18 +1,28 @@
 """Read logs message by message, finished ones, those being written and those cut short."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Attachment, Channel, Metadata
+from mcap.records import Attachment, Channel, Metadata, Schema
+from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from hearthlog.schemas.chunks import RawMessages, read_chunks
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import DURATION, TIME
+from hearthlog.schemas.layout import message_type
 from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import decode
+from hearthlog.schemas.messages import (
+    decode,
+    duration_message,
+    number_type,
+    time_message,
+    typestore,
+)
+from hearthlog.schemas.rows import decode_rows
 
 
 @dataclass(frozen=True)
@@ -23,9 +33,13 @@ class LogMessage:
     type: str
     log_time: int
     data: bytes
+    schema: Schema | None = None
 
     def decode(self) -> Any:
         """Decode the message, if its type is one of ROS 2's or ours.
+
+        It has the fields that this version knows: defaults for those that were appended since it
+        was written, and none that a later version appended.
 
         Raises
         ------
@@ -33,9 +47,39 @@ class LogMessage:
             If it is of another type, or its bytes are not of its type.
         """
         try:
+            if self.schema is not None:
+                schema = self.schema
+                kind = message_type(schema.name, schema.encoding, schema.data)
+                if kind.growth:
+                    data = np.frombuffer(self.data, np.uint8)
+                    columns = decode_rows(kind, data, np.array([0]), np.array([len(data)]))
+                    return _message(self.type, {path: row[0] for path, row in columns.items()})
             return decode(self.data, self.type)
         except (SerdeError, KeyError) as error:
             raise LogError(f"{self.topic}: no message of type {self.type} ({error})") from error
+
+
+def _message(typename: str, values: Mapping[str, Any], prefix: str = "") -> Any:
+    """Make a message of the values of its columns."""
+    fields = typestore().fielddefs[typename][1]
+    return typestore().types[typename](
+        *(_field(described, values, f"{prefix}{name}") for name, described in fields)
+    )
+
+
+def _field(description: tuple[Nodetype, Any], values: Mapping[str, Any], path: str) -> Any:
+    node, kind = description
+    if node is Nodetype.NAME and kind not in {TIME, DURATION}:
+        return _message(kind, values, f"{path}.")
+    value = values[path]
+    if node is Nodetype.NAME:
+        return (time_message if kind == TIME else duration_message)(int(value))
+    if node is Nodetype.BASE:
+        return value.item() if isinstance(value, np.generic) else value
+    (element, base), _ = kind
+    if element is Nodetype.NAME:
+        return [_message(base, each) for each in value]
+    return list(value) if base[0] == "string" else np.asarray(value, number_type(base[0]))
 
 
 class LogReader:
@@ -93,4 +137,4 @@ def _as_written(found: list[RawMessages]) -> Iterator[LogMessage]:
     for offset, size, time, raw in sorted(places, key=lambda place: place[0]):
         name = "" if raw.schema is None else raw.schema.name
         data = raw.buffer[offset : offset + size].tobytes()
-        yield LogMessage(raw.channel.topic, name, time, data)
+        yield LogMessage(raw.channel.topic, name, time, data, raw.schema)

@@ -7,8 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.layout import Layout, Leaf, Messages, MessageType, message_type
+from hearthlog.schemas.layout import (
+    AnyLeaf,
+    Default,
+    Layout,
+    Leaf,
+    Messages,
+    MessageType,
+    default_rows,
+    message_type,
+)
 from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.versions import APPENDED
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
@@ -29,6 +39,7 @@ def encode_groups(
     columns : mapping from field path, such as "header.frame_id", to its values
         An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
         for an array of numbers; for a string, one for all messages or a sequence of `count`.
+        Fields that were appended to the type may be left out.
     count : int
 
     Yields
@@ -41,7 +52,7 @@ def encode_groups(
     kind = message_type(typename)
     arrays: dict[str, NDArray[Any]] = {}
     texts: dict[str, _Texts] = {}
-    for path, values in columns.items():
+    for path, values in _completed(typename, columns, count).items():
         if isinstance(values, np.ndarray) and values.dtype != object:
             arrays[path] = values
         else:
@@ -68,14 +79,29 @@ def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> lis
     return payloads
 
 
+def _completed(typename: str, columns: Mapping[str, Column], count: int) -> Mapping[str, Column]:
+    """Add the defaults of fields that were appended to a type, where they are not given."""
+    appended = APPENDED.get(typename)
+    if not appended:
+        return columns
+    fields = [field for field in message_type(typename).types[typename] if field[0] in appended]
+    defaults: dict[str, Column] = {}
+    for path, row in default_rows(typename, fields):
+        is_empty = row.dtype == object and not isinstance(row[0], str)
+        defaults[path] = np.empty((count, 0)) if is_empty else np.repeat(row, count, axis=0)
+    return defaults | dict(columns)
+
+
 def _fill(
     block: NDArray[np.void],
-    leaf: Leaf | Messages,
+    leaf: AnyLeaf,
     arrays: Mapping[str, NDArray[Any]],
     texts: Mapping[str, "_Texts"],
     rows: Indices,
 ) -> None:
-    if isinstance(leaf, Messages) or leaf.kind == "texts":
+    if leaf.path in arrays and arrays[leaf.path].shape[1:] == (0,):
+        return
+    if not isinstance(leaf, Leaf) or leaf.kind == "texts":
         raise LogError(f"{leaf.path}: arrays of texts or messages are encoded one by one")
     if leaf.kind == "text":
         if block.dtype.fields and leaf.path in block.dtype.fields:
@@ -220,14 +246,16 @@ def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[
 
 
 def _decode(
-    leaves: Sequence[Leaf | Messages], block: NDArray[np.void], fields: Collection[str] | None
+    leaves: Sequence[AnyLeaf], block: NDArray[np.void], fields: Collection[str] | None
 ) -> Fields:
     return {
         leaf.path: _values(leaf, block) for leaf in leaves if fields is None or leaf.path in fields
     }
 
 
-def _values(leaf: Leaf | Messages, block: NDArray[np.void]) -> NDArray[Any]:
+def _values(leaf: AnyLeaf, block: NDArray[np.void]) -> NDArray[Any]:
+    if isinstance(leaf, Default):
+        return np.repeat(leaf.row, len(block), axis=0)
     if isinstance(leaf, Messages):
         return _messages(leaf, block)
     if leaf.kind == "texts":

@@ -9,7 +9,6 @@ from typing import BinaryIO
 
 from hearthlog.schemas.content import (
     ENCODING,
-    METADATA,
     PROFILE,
     SCHEMA_ENCODING,
     Attachment,
@@ -18,9 +17,10 @@ from hearthlog.schemas.content import (
 )
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import active_path, sync_folder
+from hearthlog.schemas.provenance import METADATA
 from hearthlog.schemas.topics import Topic
 
-__all__ = ["ENCODING", "METADATA", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
+__all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
 
 
 class LogWriter:

@@ -3,12 +3,14 @@
 import struct
 import zlib
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -55,16 +57,18 @@ class Log:
     """The data section of a log: records, chunks as lists of records.
 
     What refers to other parts of the file (chunks, indexes, statistics, the counts of rosbag2) is
-    made anew when it is written.
+    made anew when it is written. A log without an end is written without one.
     """
 
     def __init__(self, path: Path) -> None:
         self.items: list = []
-        with path.open("rb") as stream:
+        self._finished = False
+        with path.open("rb") as stream, suppress(EndOfFile):
             for record in StreamReader(stream, emit_chunks=True).records:
                 if isinstance(record, Chunk):
                     self.items.append(Chunked(breakup_chunk(record)))
                 elif isinstance(record, DataEnd):
+                    self._finished = True
                     break
                 elif not isinstance(record, MessageIndex):
                     self.items.append(record)
@@ -117,6 +121,10 @@ class Log:
             self._recount(path.name)
         records = _Layout(self).records
         edit(records)
+        if not self._finished:
+            end = next(i for i, raw in enumerate(records) if raw.opcode == Opcode.DATA_END)
+            path.write_bytes(MAGIC + joined(records[:end], ends=False))
+            return path
         path.write_bytes(joined(records))
         return path
 

@@ -22,6 +22,7 @@ from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.schemas import messages
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.files import active_path, find_logs
 from hearthlog.schemas.messages import (
     NANOSECONDS,
@@ -325,7 +326,9 @@ def test_a_type_that_only_has_the_name_of_ours_is_counted(tmp_path):
         channel = writer.register_channel("/mic/label", "cdr", schema)
         writer.add_message(channel, START, b"\x00\x01\x00\x00\x05\x00\x00\x00", START)
         writer.finish()
-    summary = summarise([path])
+    with pytest.warns(HearthlogWarning, match="AudioLabel is defined without label as") as warned:
+        summary = summarise([path])
+    assert warned[0].message.where == "/mic/label"
     assert summary.topics["/mic/label"].messages == 1
     assert summary.label_seconds == {}
 

@@ -2,13 +2,11 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Metadata
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.known import decode_known, is_of_type
@@ -18,16 +16,17 @@ from hearthlog.schemas.columns import Columns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logfile import LogFile, time_span
 from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.writer import METADATA
+from hearthlog.schemas.provenance import read_provenance
 
 _FEATURES: dict[str, Sequence[str]] = {messages.FEATURES: ("header.stamp", "frame")}
 _EVENTS: dict[str, Sequence[str]] = {
     messages.SEGMENT: ("duration", "label"),
     messages.GAP: ("duration",),
 }
-_OURS = (messages.STREAM_INFO, messages.STATISTICS, messages.LABEL, *_FEATURES, *_EVENTS)
+_OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
+    (messages.STREAM_INFO, messages.STATISTICS, messages.LABEL), ()
+)
 _BATCH = 2 << 20  # bytes, before compression, that are read at once
-_RECORD_LIMIT = 1 << 20  # bytes of a metadata record; ours has less than 1000
 _MOST_CLASSES = 100
 _LONGEST = 1000  # characters of what a log says of itself
 
@@ -96,7 +95,7 @@ def read_contents(path: Path, segment_topic: str) -> Contents:
             counts = file.statistics.channel_message_counts
             ids = reading.channels_of(_FEATURES)
             found.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
-        ours = [file.channels[i].topic for i in reading.channels_of(_OURS)]
+        ours = [file.channels[i].topic for i in reading.channels_of(_OTHERS | _FEATURES | _EVENTS)]
         found.microphones = sorted({topic.split("/")[1][:_LONGEST] for topic in ours})
         if len(reading.channels_of(_FEATURES)) > 1:
             found.first = found.last = None
@@ -106,13 +105,9 @@ def read_contents(path: Path, segment_topic: str) -> Contents:
 def _about(file: LogFile) -> dict[str, str]:
     """Read what the file says of itself, so far as its records agree."""
     said: dict[str, set[str]] = {}
-    for place in file.places:
-        if place.opcode != Opcode.METADATA or place.length > _RECORD_LIMIT:
-            continue
-        record = file.record(place)
-        if isinstance(record, Metadata) and record.name == METADATA:
-            for name, value in record.metadata.items():
-                said.setdefault(name, set()).add(value[:_LONGEST])
+    for record in read_provenance(file):
+        for name, value in record.items():
+            said.setdefault(name, set()).add(value[:_LONGEST])
     return {name: values.pop() for name, values in said.items() if len(values) == 1}
 
 
@@ -129,16 +124,16 @@ class _Reading:
         self._found = found
         self._segment_topic = segment_topic
 
-    def channels_of(self, kinds: Iterable[str]) -> set[int]:
-        """Return the channels of some types."""
-        kinds, schemas = set(kinds), self._file.schemas
+    def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
+        """Return the channels of some types, of which some fields are wanted."""
+        schemas = self._file.schemas
         return {
             number
             for number, channel in self._file.channels.items()
-            if any(is_of_type(channel, schemas.get(channel.schema_id), kind) for kind in kinds)
+            if any(is_of_type(channel, schemas.get(channel.schema_id), *k) for k in kinds.items())
         }
 
-    def chunks_with(self, kinds: Collection[str]) -> NDArray[np.void]:
+    def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
         """Return the chunks that hold messages of some types."""
         channels = self.channels_of(kinds)
         holds = [not ids or not ids.isdisjoint(channels) for ids in self._file.channel_sets]

@@ -10,8 +10,6 @@ from hearthlog.analyzer.evaluation.events import Int64
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.schemas.columns import Columns
 
-FIELDS = {"header.stamp", "novelty", "probabilities"}
-
 Float64 = NDArray[np.float64]
 
 

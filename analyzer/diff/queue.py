@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.diff.difference import DAY, events_of
-from hearthlog.analyzer.diff.doubt import FIELDS, Doubt
-from hearthlog.analyzer.diff.sources import Side, Sources, label_topic
+from hearthlog.analyzer.diff.doubt import Doubt
+from hearthlog.analyzer.diff.sources import LABEL_FIELDS, Side, Sources, label_topic
 from hearthlog.analyzer.diff.windows import Windows, other_labels, windows_of, without
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.events import Int64
@@ -151,7 +151,7 @@ def _add_frames(
     logs = sources.with_topic(topic, start, end)
     for i, log in enumerate(logs):
         try:
-            for batch in iterate_columns([log.path], {topic}, start, end, FIELDS):
+            for batch in iterate_columns([log.path], {topic}, start, end, LABEL_FIELDS):
                 for frames in batch:
                     doubt.add(frames)
         except LogError as error:

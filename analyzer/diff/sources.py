@@ -24,6 +24,7 @@ from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.ranges import map_logs
 
 LIVE, REVIEW, RELABEL = "live", "review", "relabel"
+LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
 _TOPIC = re.compile(
     r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)(?:/(?P<name>review|relabel/\w+))?/segment", re.ASCII
 )
@@ -97,7 +98,7 @@ class Sources:
         known = ", ".join(sorted(found))
         if not found:
             raise LogError(
-                "no segments: the log was recorded without a model; relabel it with one"
+                "no segments; if the log was recorded without a model, relabel it with one"
                 f"{self._first_loss()}"
             )
         if wanted is None and len(found) > 1:
@@ -276,9 +277,9 @@ def _opened(path: Path) -> Log | LogError | None:
 def _log(path: Path, selection: Selection) -> Log:
     segments, classes = set(), {}
     for topic, same in selection.channels.items():
-        if all(is_of_type(*described, messages.SEGMENT) for described in same):
+        if all(is_of_type(*described, messages.SEGMENT, FIELDS) for described in same):
             segments.add(topic)
-        elif all(is_of_type(*described, messages.LABEL) for described in same):
+        elif all(is_of_type(*described, messages.LABEL, LABEL_FIELDS) for described in same):
             names = [names_of(channel.metadata, "probabilities") for channel, _ in same]
             classes[topic] = [name for each in names for name in each]
     return Log(path, *selection.span, not selection.unfinished, frozenset(segments), classes)

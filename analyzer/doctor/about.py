@@ -8,22 +8,28 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.doctor.contract import NAME, Contract, place_of, type_of
 from hearthlog.analyzer.doctor.data import ATTACHMENTS, Data
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import difference, type_hash_of
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.schemas.messages import NANOSECONDS, definition, type_hash
+from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.provenance import METADATA, schema_version
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.topics import Topic, topics_of
-from hearthlog.schemas.writer import METADATA, PROFILE, SCHEMA_ENCODING
+from hearthlog.schemas.versions import SCHEMA_VERSION
+from hearthlog.schemas.writer import PROFILE, SCHEMA_ENCODING
 
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
 _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS
+_WITH_DESCRIPTION = 2  # the first schema version whose logs have one
 
 
 class About:
@@ -77,12 +83,14 @@ class About:
         if missing := sorted(_KEYS - records[0].keys()):
             self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
         found = self._data.attachments
-        with_model = 1 if records[0].get("model") else 0
-        wanted = {_CONFIGURATION: {1}, _MODEL_CARD: {with_model}, _MODEL: {0, with_model}}
-        for name, counts in wanted.items():
+        described = (schema_version(records[0]) or SCHEMA_VERSION) >= _WITH_DESCRIPTION
+        wanted = {_CONFIGURATION}
+        if records[0].get("model"):
+            wanted |= {_MODEL_CARD, _MODEL} if described else {_MODEL_CARD}
+        for name in ATTACHMENTS:
             count = len(found.get(name, ()))
-            if count not in counts:
-                what = f"there are {count} attachments {name}, not {max(counts)}"
+            if count != (name in wanted):
+                what = f"there are {count} attachments {name}, not {int(name in wanted)}"
                 self._error("attachments", what)
         if len(found.get(_CONFIGURATION, ())) == 1:
             digest = hashlib.sha256(found[_CONFIGURATION][0]).hexdigest()
@@ -164,12 +172,8 @@ class About:
         if (schema.name, schema.encoding) != (typename, SCHEMA_ENCODING):
             what = f"{channel.topic} is of type {schema.name} ({schema.encoding}), not {typename}"
             self._error("type", what)
-        elif schema.data != definition(typename).encode():
-            self._error(
-                "type", f"{channel.topic}: {typename} is defined otherwise than by hearthlog"
-            )
-        elif channel.metadata.get("topic_type_hash") != type_hash(typename):
-            self._error("type", f"{channel.topic}: topic_type_hash is not that of {typename}")
+        else:
+            self._check_definition(channel, schema)
         try:
             profiles = json.loads(channel.metadata.get("offered_qos_profiles", "[{}]"))
             good = isinstance(profiles, list) and all(isinstance(p, dict) for p in profiles)
@@ -177,6 +181,20 @@ class About:
             good = False
         if not good or not profiles:
             self._error("qos", f"{channel.topic}: offered_qos_profiles is no list of profiles")
+
+    def _check_definition(self, channel: Channel, schema: Schema) -> None:
+        """Compare a definition with those that were released, and its hash with what is said."""
+        records = self._data.metadata.get(METADATA, [{}])
+        try:
+            kind = message_type(schema.name, schema.encoding, schema.data)
+            what = difference(kind, schema_version(records[0]) or SCHEMA_VERSION)
+            if not what and channel.metadata.get("topic_type_hash") != type_hash_of(kind):
+                self._error("type", f"{channel.topic}: topic_type_hash is not that of {kind.name}")
+        except LogError as error:
+            what = str(error)
+        if what:
+            what = f"{channel.topic}: {schema.name} is defined otherwise than by hearthlog: {what}"
+            self._error("type", what)
 
     def _check_arrays(self, channel: Channel, topic: Topic) -> None:
         for key, names in topic.array_names.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Footer, Metadata
+from mcap.records import Footer
 
 from hearthlog.analyzer.doctor.about import About
 from hearthlog.analyzer.doctor.batch import Batch
@@ -22,12 +22,11 @@ from hearthlog.schemas.columns import decode
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import ACTIVE_SUFFIX
 from hearthlog.schemas.logfile import FOOTER_SIZE, LogFile
+from hearthlog.schemas.provenance import METADATA, provenance_records, unknown_version
 from hearthlog.schemas.records import HEAD, MAGIC, parse
-from hearthlog.schemas.writer import METADATA
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
-_METADATA_SIZE = 1 << 20  # bytes
 _ENCODINGS = ("ros2msg", "ros2idl")
 
 Progress = Callable[[float], None]
@@ -110,6 +109,8 @@ def _examine(source: Source, examined: Examined, progress: Progress) -> None:
         findings.error("footer", "there is no Footer at the end", RECOVER)
     else:
         _say_unfinished(findings, active=active)
+    for text in {unknown_version(record) for record in data.metadata.get(METADATA, [])} - {""}:
+        findings.warning("newer", text)
     if isinstance(contract, Contract):
         contract.finish()
         whole = data.whole and not walk.damaged
@@ -143,12 +144,7 @@ def _is_ours(file: LogFile) -> bool:
     """Tell whether a recorder wrote this file, and not what merges logs or cuts parts out."""
     if _LAYER.fullmatch(file.path.name):
         return False
-    records: list[dict[str, str]] = []
-    for place in file.places:
-        if place.opcode == Opcode.METADATA and place.length < _METADATA_SIZE and len(records) < 2:
-            record = file.record(place)
-            if isinstance(record, Metadata) and record.name == METADATA:
-                records += [record.metadata] if record.metadata not in records else []
+    records = provenance_records(file)
     made = file.header is not None and file.header.library == LIBRARY
     if NAME.fullmatch(file.path.name):
         return made or len(records) > 0

@@ -18,8 +18,9 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, decode
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import difference
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
-from hearthlog.schemas.messages import definition
+from hearthlog.schemas.layout import message_type
 from hearthlog.schemas.rows import Int64
 from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT
 
@@ -108,13 +109,15 @@ class Contract:
             frames.interrupt()
 
     def _is_ours(self, channel: Channel, typename: str) -> bool:
+        """Tell whether a channel is of a type as any version has it; `About` says what is not."""
         schema = self._data.definitions.schemas.get(channel.schema_id)
-        return (
-            schema is not None
-            and schema.name == typename
-            and schema.data == definition(typename).encode()
-            and channel.message_encoding == "cdr"
-        )
+        if schema is None or schema.name != typename or channel.message_encoding != "cdr":
+            return False
+        try:
+            kind = message_type(schema.name, schema.encoding, schema.data)
+            return not difference(kind, version=1)
+        except LogError:
+            return False
 
     def _check_times(self, batch: Batch) -> None:
         heads = batch.heads

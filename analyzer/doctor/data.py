@@ -18,10 +18,10 @@ from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.walk import Record
 from hearthlog.models.card import CARD, DESCRIPTION
 from hearthlog.schemas.chunks import MESSAGE_HEAD
+from hearthlog.schemas.provenance import METADATA
 from hearthlog.schemas.records import HEAD
 from hearthlog.schemas.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.rows import Int64
-from hearthlog.schemas.writer import METADATA
 
 ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
 _NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept

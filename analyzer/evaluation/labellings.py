@@ -159,11 +159,11 @@ def _segment_topic(selection: Selection, wanted: str | None) -> str:
     known = sorted(
         topic
         for topic, channels in selection.channels.items()
-        if all(is_of_type(*described, messages.SEGMENT) for described in channels)
+        if all(is_of_type(*described, messages.SEGMENT, FIELDS) for described in channels)
     )
     recorded = [topic for topic in known if topic.count("/") == 2]
     if not known:
-        raise LogError("no segments: the log was recorded without a model; relabel it with one")
+        raise LogError("no segments; if the log was recorded without a model, relabel it with one")
     if wanted is None and len(recorded) != 1:
         raise LogError(f"choose one with --topic: {', '.join(known)}")
     topic = recorded[0] if wanted is None else wanted

@@ -11,9 +11,10 @@ from pyarrow import csv
 from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
 from hearthlog.analyzer.export.names import names_of
 from hearthlog.analyzer.lines import json_texts
-from hearthlog.analyzer.pieces import DURATION, Field, Piece
+from hearthlog.analyzer.pieces import Piece
 from hearthlog.analyzer.selection import Selection
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import DURATION, Field
 from hearthlog.schemas.messages import NANOSECONDS
 
 _OPTIONS = csv.WriteOptions(quoting_style="needed")

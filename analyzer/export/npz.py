@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.export.names import file_stem, names_of
 from hearthlog.analyzer.lines import json_texts
-from hearthlog.analyzer.pieces import DURATION, TIME, Field, fields_of
 from hearthlog.analyzer.selection import Selection
 from hearthlog.schemas.columns import Columns, read_columns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.fields import DURATION, TIME, Field, fields_of
 from hearthlog.schemas.layout import message_type
 
 _TEXTS_LIMIT = 1 << 30  # bytes

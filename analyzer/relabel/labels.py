@@ -1,7 +1,7 @@
 """The task of a worker: the labels and segments of one log."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -34,9 +34,10 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.model import Model
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.segments import Run, Segment
-from hearthlog.schemas.content import METADATA, LogContent, Rows
+from hearthlog.schemas.content import LogContent, Rows
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import new_file, replaced_file, stem
+from hearthlog.schemas.provenance import METADATA
 from hearthlog.schemas.rows import Column
 
 
@@ -79,6 +80,8 @@ class Labelled(NamedTuple):
         That has written it.
     source : Source
     microphone, node : str
+    provenance : mapping of str to str
+        What the log says of what made it.
     segments : list of Segment
     began : Run or None
         What was open when the log began.
@@ -96,6 +99,7 @@ class Labelled(NamedTuple):
     source: Source
     microphone: str
     node: str
+    provenance: Mapping[str, str]
     segments: list[Segment]
     began: Run | None
     begins: bool
@@ -185,6 +189,7 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Labelle
         source=Source(model.name, model.sha256, digest(job.log), before, behind),
         microphone=origin.microphone,
         node=origin.node,
+        provenance=origin.metadata,
         segments=stream.segments,
         began=None if begins else began,
         begins=begins,

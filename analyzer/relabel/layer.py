@@ -11,16 +11,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.opcode import Opcode
-from mcap.records import Metadata
-
-from hearthlog import __version__
 from hearthlog.models.segments import Run
 from hearthlog.schemas import messages
-from hearthlog.schemas.content import METADATA
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import SUFFIX, stem
 from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.provenance import provenance, read_provenance
 from hearthlog.schemas.topics import Topic, topic
 
 _TAIL = 1 << 16  # bytes
@@ -103,19 +99,14 @@ def read_about(layer: Path) -> About | None:
     """
     if not layer.exists():
         return None
-    found: Mapping[str, str] = {}
     try:
         with LogFile(layer) as file:
-            places = [place for place in file.places if place.opcode == Opcode.METADATA]
-            records = [file.record(place) for place in places]
-        for record in records:
-            if isinstance(record, Metadata) and record.name == METADATA:
-                found = record.metadata
+            record = {key: text for each in read_provenance(file) for key, text in each.items()}
         return About(
-            Source(*(found[name] for name in Source._fields)),
-            _read_run(found["began"]),
-            _read_run(found["ended"]),
-            found["lost"],
+            Source(*(record[name] for name in Source._fields)),
+            _read_run(record["began"]),
+            _read_run(record["ended"]),
+            record["lost"],
         )
     except (KeyError, ValueError, TypeError, LogError) as error:
         why = error if isinstance(error, LogError) else f"{layer}: is no layer of `relabel`"
@@ -136,17 +127,16 @@ def delete_parts(layer: Path) -> None:
 
 def metadata_of(about: About, log: str, node: str, more: Mapping[str, str]) -> dict[str, str]:
     """Make the `hearthlog` record of a layer."""
-    return {
-        "version": __version__,
-        "node": node,
-        "log": log,
+    return provenance(
+        node,
+        log=log,
         **more,
         **about.source._asdict(),
-        "began": _run_text(about.began),
-        "ended": _run_text(about.ended),
-        "lost": about.lost,
-        "made": _now(),
-    }
+        began=_run_text(about.began),
+        ended=_run_text(about.ended),
+        lost=about.lost,
+        made=_now(),
+    )
 
 
 def _now() -> str:

@@ -16,6 +16,7 @@ from hearthlog.models.model import Model
 from hearthlog.models.segments import Run
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import stem
+from hearthlog.schemas.provenance import check_version
 from hearthlog.schemas.ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
@@ -222,6 +223,7 @@ class _Relabelling:
             self._fail(line, item, error)
         elif isinstance(found := future.result(), Labelled):
             item.running, item.labelled = False, found
+            check_version(found.provenance, item.job.log)
             self._waiting.add(found.part)
         else:
             self._note(item)

@@ -7,13 +7,16 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.known import is_of_type
 from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas import messages
-from hearthlog.schemas.columns import Columns, iterate_columns
+from hearthlog.schemas.columns import Columns, decode
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.series import iterate_messages
 
+CLIP_FIELDS = ("timestamp", "data", "format", "sample_rate", "number_of_channels")
 _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)
 _RATES = range(1_000, 768_001)
@@ -128,10 +131,12 @@ def read_clips(
     LogError
         If the log is damaged, or a clip is of another format.
     """
-    for batch in iterate_columns([path], [name], start, end):
-        for columns in batch:
-            if columns.type != messages.RAW_AUDIO:
-                raise LogError(f"{path}: {name}: holds {columns.type}, not clips")
+    for batch in iterate_messages([path], [name], start, end):
+        for raw in batch:
+            if not is_of_type(raw.channel, raw.schema, messages.RAW_AUDIO, CLIP_FIELDS):
+                kind = "no messages of ROS 2" if raw.schema is None else raw.schema.name
+                raise LogError(f"{path}: {name}: holds {kind}, not clips")
+        for columns in decode(batch, CLIP_FIELDS):
             for row in range(len(columns)):
                 yield _clip(columns, row, f"{path}: {name}")
 

@@ -4,13 +4,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from hearthlog import __version__
 from hearthlog.analyzer.replay.origin import Origin
 from hearthlog.models.card import CARD, DESCRIPTION, model_attachments
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.model import Model
 from hearthlog.recorder.log import LogDescription
 from hearthlog.recorder.pipeline import stream_info
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.topics import topics_of
 
 
@@ -49,8 +49,7 @@ def describe(
         infos=[info],
         metadata={
             **origin.metadata,
-            "version": __version__,
-            "node": origin.node,
+            **provenance(origin.node),
             "feature_set": features.name,
             "feature_set_version": str(features.version),
             "model": info.model,

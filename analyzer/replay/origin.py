@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from mcap import records
+from mcap.opcode import Opcode
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.known import decode_known, is_of_type
+from hearthlog.analyzer.replay.clips import CLIP_FIELDS
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
@@ -18,11 +20,15 @@ from hearthlog.schemas.chunks import read_chunks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import check_node_name
 from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.provenance import read_provenance
 from hearthlog.schemas.topics import check_microphone_name, topic
-from hearthlog.schemas.writer import METADATA, Attachment
+from hearthlog.schemas.writer import Attachment
 
 CONFIGURATION = "configuration.json"
-TYPES = {"features": messages.FEATURES, "audio": messages.RAW_AUDIO}
+TYPES = {
+    "features": (messages.FEATURES, ("frame", "header.stamp", "values")),
+    "audio": (messages.RAW_AUDIO, CLIP_FIELDS),
+}
 _DIGEST = re.compile("[0-9a-f]{64}")
 _FRAME = ("frame", "header.stamp")
 _INFO = ("device", "feature_set", "model", "model_sha256")
@@ -102,14 +108,17 @@ def read_origin(path: Path, kind: str) -> Origin | None:
         if len(microphones) > 1:
             names = ", ".join(sorted(microphones))
             raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
-        found = [file.record(place) for place in file.places]
+        attached = [file.record(p) for p in file.places if p.opcode == Opcode.ATTACHMENT]
+        # What was merged is of the last of its recorders.
+        about = next(reversed(read_provenance(file)), {})
         complete = file.complete
         (microphone,) = microphones
         info = _first(file, topic(microphone, "info"), messages.STREAM_INFO, _INFO)
         heard = _first(file, topic(microphone, "features"), messages.FEATURES, _FRAME)
-    about = {r.name: r.metadata for r in found if isinstance(r, records.Metadata)}.get(METADATA, {})
     attachments = [
-        Attachment(r.name, r.media_type, r.data) for r in found if isinstance(r, records.Attachment)
+        Attachment(r.name, r.media_type, r.data)
+        for r in attached
+        if isinstance(r, records.Attachment)
     ]
     info = {**about, **info}
     digest = info.get("model_sha256", "")
@@ -164,7 +173,7 @@ def _microphones(file: LogFile, kind: str) -> set[str]:
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
         name = channel.topic.removeprefix("/").removesuffix("/" + kind)
-        if channel.topic == topic(name, kind) and is_of_type(channel, schema, TYPES[kind]):
+        if channel.topic == topic(name, kind) and is_of_type(channel, schema, *TYPES[kind]):
             found.add(name)
     return found
 

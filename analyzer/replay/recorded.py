@@ -19,6 +19,13 @@ from hearthlog.schemas.topics import DIAGNOSTICS, topic
 
 _HEARD = {"features": messages.FEATURES, "gap": messages.GAP}
 _TYPES = _HEARD | {"label": messages.LABEL, "segment": messages.SEGMENT}
+_FIELDS = {
+    messages.FEATURES: ("header.stamp", "frame", "values"),
+    messages.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
+    messages.DIAGNOSTICS: ("status",),
+    messages.LABEL: ("label",),
+    messages.SEGMENT: ("label",),
+}
 _LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be made of
 _LARGEST_FRAME = 1 << 62
 _PLACE_BITS = 40
@@ -79,7 +86,7 @@ def read_recorded(
         found: _Found = {type_: [] for type_ in (*_TYPES.values(), messages.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
-            if is_of_type(raw.channel, raw.schema, type_):
+            if is_of_type(raw.channel, raw.schema, type_, _FIELDS[type_]):
                 found[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
         try:
@@ -127,7 +134,7 @@ def _runs(frames: Fields, rows: NDArray[np.intp]) -> Iterator[Features]:
 
 
 def _features(raw: RawMessages, width: int) -> Fields:
-    (columns,) = decode([raw], ("header.stamp", "frame", "values"))
+    (columns,) = decode([raw], _FIELDS[messages.FEATURES])
     values, numbers = columns["values"], columns["frame"]
     if values.shape[1:] != (width,):
         raise LogError(f"{columns.topic}: frames are not of {width} values")
@@ -140,7 +147,7 @@ def _features(raw: RawMessages, width: int) -> Fields:
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:
-    (columns,) = decode([raw], ("header.stamp", "duration", "reason", "frames_lost"))
+    (columns,) = decode([raw], _FIELDS[messages.GAP])
     starts = columns["header.stamp"]
     ends = starts + columns["duration"]
     _check_times(columns, ends)
@@ -150,7 +157,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
 
 def _health(raw: RawMessages, microphone: str) -> list[Health | None]:
     """Read the states of the source; None for messages about something else."""
-    (columns,) = decode([raw], ("status",))
+    (columns,) = decode([raw], _FIELDS[messages.DIAGNOSTICS])
     name = f"hearthlog: {microphone}"
     return [
         next((_state(time, status) for status in array if status["name"] == name), None)

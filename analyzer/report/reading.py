@@ -1,7 +1,7 @@
 """What the logs of a home say: segments, with what a reviewer says; gaps; trouble."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,7 @@ _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a 
 _LATEST = 1 << 61
 _MOST_CLASSES = 100
 _FIELDS = {"header.stamp", "duration", "label", "confidence"}
+_OF_GAPS = {"header.stamp", "duration", "reason"}
 _SEGMENTS = re.compile(r"/(?P<microphone>[^/]+)/segment")
 Progress = Callable[[float], None]
 Source = tuple[str, str]  # node, microphone
@@ -168,8 +169,8 @@ def _look_closely(heard: Heard, entries: Sequence[Entry], close: tuple[int, int]
     for entry in entries:
         try:
             selection = select([entry.path])
-            gaps = _topics_of(selection, messages.GAP)
-            health = _topics_of(selection, messages.DIAGNOSTICS)
+            gaps = _topics_of(selection, messages.GAP, _OF_GAPS)
+            health = _topics_of(selection, messages.DIAGNOSTICS, {"status"})
             columns = read_columns([entry.path], {*gaps, *health}, *close)
         except LogError as error:
             _lose(heard, str(error))
@@ -178,7 +179,7 @@ def _look_closely(heard: Heard, entries: Sequence[Entry], close: tuple[int, int]
             _lose(heard, f"{entry.path}: unfinished, and nothing of it is whole")
         if selection.unfinished:
             _lose(heard, f"unfinished, read up to the last whole chunk: {entry.path}")
-        for topic in (*gaps, *_topics_of(selection, messages.STREAM_INFO)):
+        for topic in (*gaps, *_topics_of(selection, messages.STREAM_INFO, ())):
             microphones.add(topic.split("/")[1])
         nodes |= dict.fromkeys(record["node"] for record in selection.metadata if "node" in record)
         for topic in set(gaps) & columns.keys():
@@ -202,28 +203,30 @@ def _read_late_gaps(heard: Heard, shelf: Shelf, end: int) -> None:
         if number and entry.start > end + _LATE:
             return
         try:
-            topics = _topics_of(select([entry.path]), messages.GAP)
+            topics = _topics_of(select([entry.path]), messages.GAP, _OF_GAPS)
             for columns in read_columns([entry.path], topics).values():
                 heard.gaps += [gap for gap in gaps_of(entry.node, columns) if gap.start < end]
         except LogError:
             continue  # it is not of these days
 
 
-def _topics_of(selection: Selection, kind: str) -> list[str]:
+def _topics_of(selection: Selection, kind: str, fields: Collection[str]) -> list[str]:
     channels = selection.channels.items()
-    return [t for t, same in channels if all(is_of_type(*described, kind) for described in same)]
+    return [t for t, same in channels if all(is_of_type(*d, kind, fields) for d in same)]
 
 
 def _segments(
     heard: Heard, entry: Entry, topics: set[str], limits: tuple[int, int]
 ) -> Iterator[Columns]:
     try:
-        found = read_columns([entry.path], topics, *limits, fields=_FIELDS)
-        for topic, columns in found.items():
-            if columns.type == messages.SEGMENT:
-                yield columns
-            else:
-                _lose(heard, f"{entry.path}: {topic} is of type {columns.type}")
+        selection = select([entry.path])
+        segments = topics.intersection(_topics_of(selection, messages.SEGMENT, _FIELDS))
+        for topic in topics & selection.channels.keys() - segments:
+            kinds = {
+                "" if schema is None else schema.name for _, schema in selection.channels[topic]
+            }
+            _lose(heard, f"{entry.path}: {topic} is of type {', '.join(sorted(kinds))}")
+        yield from read_columns([entry.path], segments, *limits, fields=_FIELDS).values()
     except LogError as error:
         _lose(heard, str(error))
 

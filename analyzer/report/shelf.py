@@ -8,9 +8,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.opcode import Opcode
-from mcap.records import Metadata
-
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.labellings import with_layers
 from hearthlog.analyzer.hometime import day_span, local_time
@@ -18,7 +15,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import find_logs, is_layer, stem
 from hearthlog.schemas.logfile import LogFile, time_span
 from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.writer import METADATA
+from hearthlog.schemas.provenance import read_provenance
 
 REVIEW, RELABEL = "review", "relabel-"
 _NAME = re.compile(
@@ -188,7 +185,4 @@ def _closed(entries: Iterable[Entry]) -> Iterator[Entry]:
 
 def _record(path: Path) -> Mapping[str, str] | None:
     with LogFile(path) as file:
-        places = [place for place in file.places if place.opcode == Opcode.METADATA]
-        records = [file.record(place) for place in places]
-    ours = (r.metadata for r in records if isinstance(r, Metadata) and r.name == METADATA)
-    return next(ours, None)
+        return next(iter(read_provenance(file)), None)

@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from datetime import tzinfo
 from pathlib import Path
 
-from mcap.opcode import Opcode
-from mcap.records import Metadata
-
 from hearthlog.analyzer.hometime import home_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import find_logs, is_layer, stem
 from hearthlog.schemas.logfile import LogFile, time_span
-from hearthlog.schemas.writer import METADATA
+from hearthlog.schemas.provenance import read_provenance
 
 
 @dataclass(frozen=True)
@@ -62,11 +59,7 @@ def find_files(
 
 def metadata_of(file: LogFile) -> Mapping[str, str]:
     """Return what a log says of itself."""
-    records = (file.record(place) for place in file.places if place.opcode == Opcode.METADATA)
-    for record in records:
-        if isinstance(record, Metadata) and record.name == METADATA:
-            return record.metadata
-    return {}
+    return next(iter(read_provenance(file)), {})
 
 
 def _with_layers(path: Path) -> list[Path]:

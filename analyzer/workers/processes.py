@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -14,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.calls import attempt, pack_call, read_reply
+from hearthlog.schemas.errors import HearthlogWarning
 
 LIVES = 3  # workers that a task may cost
 _TIDY_SECONDS = 3.0  # to remove what is half-written
@@ -145,6 +147,7 @@ def serve() -> None:
     os.dup2(nothing, 0)
     os.dup2(2, 1)  # what a task prints is no reply
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can tidy up
+    warnings.simplefilter("ignore", HearthlogWarning)  # who gave the task says it once
     waiting: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
     while True:

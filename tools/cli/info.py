@@ -103,6 +103,7 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
         "health": _health(summary),
         "attachments": sorted(summary.attachments),
         "metadata": sorted(summary.metadata),
+        "schema_versions": sorted(summary.schema_versions),
     }
 
 
@@ -163,6 +164,7 @@ def _lines(summary: "Summary") -> Iterator[str]:
         "written by": summary.libraries,
         "profile": summary.profiles,
         "metadata": summary.metadata,
+        "schema version": summary.schema_versions,
         "attachments": summary.attachments,
     }
     yield "; ".join(f"{what} {', '.join(sorted(names))}" for what, names in about.items() if names)

@@ -2,14 +2,17 @@
 
 import os
 import sys
-from typing import Annotated
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
 
 # Before numpy is imported: the products here are small, and idle BLAS threads burn a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.cat import cat
 from hearthlog.tools.cli.cut import cut
@@ -29,6 +32,7 @@ from hearthlog.tools.cli.relabel import relabel
 from hearthlog.tools.cli.replay import replay
 from hearthlog.tools.cli.report import report
 from hearthlog.tools.cli.review import review
+from hearthlog.tools.cli.text import printable
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.cli.watch import watch
 
@@ -81,7 +85,8 @@ _debug = {"on": False}
 def main() -> None:
     """Run the command line; an error is one line, and exit status 1."""
     try:
-        app()
+        with _warnings_shown():
+            app()
     except (HearthlogError, ModuleNotFoundError) as error:
         if _debug["on"]:
             raise
@@ -90,6 +95,30 @@ def main() -> None:
             message = f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
         print(f"hearthlog: {message}", file=sys.stderr)
         sys.exit(1)
+
+
+@contextmanager
+def _warnings_shown() -> Iterator[None]:
+    """Print each of our warnings once, in one line; with one, what is done is done with 3."""
+    shown: set[str] = set()
+    others = warnings.showwarning
+
+    def show(message: Any, *about: Any, **more: Any) -> None:
+        if not isinstance(message, HearthlogWarning):
+            others(message, *about, **more)
+        elif str(message) not in shown:
+            shown.add(str(message))
+            print(f"hearthlog: {printable(f'{message.where}: {message}')}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", HearthlogWarning)
+        warnings.showwarning = show
+        try:
+            yield
+        except SystemExit as end:
+            if shown and not end.code:
+                sys.exit(3)
+            raise
 
 
 if __name__ == "__main__":

@@ -1,0 +1,27 @@
+"""How our messages grow: what was appended to them, since when, and what stands for it in old logs.
+
+Fields are only ever appended to `msg/*.msg`; none is renamed, moved, removed, or given another
+type. Who appends one raises `SCHEMA_VERSION` and enters the field in `APPENDED`: docs/log.md.
+"""
+
+from typing import NamedTuple
+
+SCHEMA_VERSION = 2  # of the messages and records that this version writes
+
+
+class Appended(NamedTuple):
+    """A field that messages did not have from the beginning.
+
+    Attributes
+    ----------
+    since : int
+        The first schema version that has it.
+    default : float, str or None
+        What a message without it says; None: a number of 0, no time, an empty text or sequence.
+    """
+
+    since: int
+    default: float | str | None = None
+
+
+APPENDED: dict[str, dict[str, Appended]] = {}  # by type and name of the field

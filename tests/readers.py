@@ -1,0 +1,252 @@
+"""What each reader makes of golden files, in a form that can be compared.
+
+They read `logs`, `left` and `models` in the current folder, and get what runs the command line.
+"""
+
+import csv
+import json
+from collections import Counter
+from collections.abc import Callable
+from datetime import UTC
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from growing import plain
+from rosbags.highlevel import AnyReader
+from spliced import Result
+
+from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.timeline.live import Live
+from hearthlog.analyzer.timeline.reading import read_timeline
+from hearthlog.models.modelfile import load_model
+from hearthlog.schemas import messages
+from hearthlog.schemas.columns import iterate_columns, read_columns
+from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.schemas.follow import follow
+from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.series import iterate_messages
+
+Run = Callable[..., Result]
+_NO_SOUND = ["--topics", "/hall/[!a]*", "--topics", "/[dr]*"]
+
+
+def by_info(run: Run) -> Any:
+    said = json.loads(run("info", "logs", "--json").stdout)
+    sizes = {"size_bytes", "compression_ratio", "chunks", "schema_versions"}
+    topics = {
+        name: (about["type"], about["messages"], round(about["rate_hz"], 9))
+        for name, about in said.pop("topics").items()
+    }
+    return {key: value for key, value in said.items() if key not in sizes} | {"topics": topics}
+
+
+def by_cat(run: Run) -> Any:
+    lines = run("cat", "logs", "--format", "ndjson").stdout.splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def by_messages(_: Run) -> Any:
+    return {
+        path.name: [(m.topic, m.log_time, plain(m.decode())) for m in LogReader(path).messages()]
+        for path in [*find_logs(Path("logs")), *find_logs(Path("left"))]
+    }
+
+
+def by_columns(_: Run) -> Any:
+    read = read_columns(find_logs(Path("logs")))
+    for batch in iterate_columns(find_logs(Path("logs"))):
+        assert all(columns.fields.keys() == read[columns.topic].fields.keys() for columns in batch)
+    return {topic: plain(columns.fields) for topic, columns in read.items()}
+
+
+def by_follow(_: Run) -> Any:
+    stop = Event()
+    frames: Counter[str] = Counter()
+    labels = []
+    for folder in ("logs", "left"):
+        stop.clear() if folder == "left" else stop.set()
+        for batch in follow(Path(folder), start=0, stop=stop):
+            for columns in batch:
+                frames[f"{folder} {columns.topic}"] += len(columns)
+                if columns.type == messages.LABEL:
+                    labels += columns["label"].tolist()
+            stop.set()
+    return frames, labels
+
+
+def by_parquet(run: Run) -> Any:
+    run("export", "logs", "-o", "parquet", "--format", "parquet", *_NO_SOUND)
+    return {path.name: plain(pq.read_table(path).to_pylist()) for path in files_in("parquet")}
+
+
+def by_csv(run: Run) -> Any:
+    run("export", "logs", "-o", "csv", "--format", "csv", *_NO_SOUND)
+    return {
+        path.name: list(csv.DictReader(path.read_text().splitlines())) for path in files_in("csv")
+    }
+
+
+def by_npz(run: Run) -> Any:
+    run("export", "logs", "-o", "npz", "--format", "npz", *_NO_SOUND)
+    return {
+        path.name: {name: plain(array) for name, array in np.load(path).items()}
+        for path in files_in("npz")
+    }
+
+
+def by_text_and_sound(run: Run) -> Any:
+    run("export", "logs", "-o", "day.txt", "--topics", "/hall/segment")
+    run("export", "logs", "-o", "clips", "--format", "wav")
+    return Path("day.txt").read_text(), {path.name: path.read_bytes() for path in files_in("clips")}
+
+
+def by_bags(run: Run) -> Any:
+    run("export", "logs", "-o", "bag", "--format", "rosbag2")
+    run("export", "logs", "-o", "day.bag", "--format", "bag")
+    counts = []
+    for bag in ("bag", "day.bag"):
+        with AnyReader([Path(bag)]) as reader:
+            counts.append({topic: about.msgcount for topic, about in reader.topics.items()})
+    return counts
+
+
+def by_doctor(run: Run) -> Any:
+    found = []
+    for folder in ("logs", "left"):
+        said = json.loads(run("doctor", folder, "--json").stdout)
+        assert not said["more"]
+        found += [
+            (each["path"], each["level"], each["rule"], each["what"]) for each in said["findings"]
+        ]
+    return sorted(each for each in found if each[2] != "newer")
+
+
+def by_replay(run: Run) -> Any:
+    made = run("replay", "logs", "--model", "models/smoothed.safetensors", "--json")
+    said = json.loads(made.stdout)
+    assert said["compared"]["bit_for_bit"]
+    del said["took_seconds"]
+    run("replay", "logs", "--model", "models/smoothed.safetensors", "-o", "again")
+    again = read_columns(find_logs(Path("again")))
+    return said, {topic: plain(columns.fields) for topic, columns in again.items()}
+
+
+def by_relabel(run: Run) -> Any:
+    same = run("relabel", "logs", "--model", "models/merged.safetensors", "--workers", "1")
+    new = run("relabel", "logs", "--model", "models/smoothed.safetensors", "--workers", "1")
+    layers = sorted(path for path in find_logs(Path("logs")) if ".relabel-smoothed" in path.name)
+    labels = read_columns(layers)
+    for layer in layers:
+        layer.unlink()
+    fields = {topic: plain(columns.fields) for topic, columns in labels.items()}
+    return same.stdout, new.stdout, fields
+
+
+def by_diff(run: Run) -> Any:
+    queue = run("diff", "logs", "live", "merged", "--queue", "--json")
+    return json.loads(run("diff", "logs", "live", "merged", "--json").stdout), queue.stdout
+
+
+def by_report(run: Run) -> Any:
+    run("report", "logs", "--day", "2026-03-01", "-o", "day.html")
+    return Path("day.html").read_text()
+
+
+def by_evaluate(run: Run) -> Any:
+    return json.loads(run("evaluate", "logs", "--reference", "review", "--json").stdout)
+
+
+def by_training(run: Run) -> Any:
+    base = ["--base", "models/smoothed.safetensors", "--home", "logs"]
+    run("train", *base, "--output", "adapted.safetensors")
+    return load_model(Path("adapted.safetensors")).sha256
+
+
+def by_timeline(_: Run) -> Any:
+    return plain(read_timeline([Path("logs")])), plain(read_timeline([Path("left")]))
+
+
+def by_watching(_: Run) -> Any:
+    live = Live(UTC)
+    logs = [path for path in find_logs(Path("logs")) if not is_layer(path)]
+    return [
+        plain(news)
+        for path in logs
+        for batch in iterate_messages([path])
+        for news in live.take(path, batch)
+    ]
+
+
+def by_marks(run: Run) -> Any:
+    run("annotate", "export", "logs", "-o", "marks.csv")
+    marks = [plain(mark) for path in find_logs(Path("logs")) for mark in read_marks(path)]
+    return marks, Path("marks.csv").read_text()
+
+
+def by_enrolment(run: Run) -> Any:
+    span = ["--start", "2026-03-01T06:59:38", "--end", "2026-03-01T06:59:41"]
+    made = run("enrol", "coughing", "--home", "home", "--log", "logs", *span)
+    by_topic = read_columns(find_logs(Path("home")))
+    return made.stdout, {topic: plain(columns.fields) for topic, columns in by_topic.items()}
+
+
+def by_recovery(run: Run) -> Any:
+    (left,) = find_logs(Path("left"))
+    made = run("recover", left, "-o", "recovered.mcap")
+    by_topic = read_columns([Path("recovered.mcap")])
+    Path("recovered.mcap").unlink()
+    return made.returncode, {topic: plain(columns.fields) for topic, columns in by_topic.items()}
+
+
+def by_splicing(run: Run) -> Any:
+    start, end = "2026-03-01T06:59:40", "2026-03-01T07:00:05"
+    logs = [path for path in find_logs(Path("logs")) if not is_layer(path)]
+    run("merge", *logs, "-o", "both.mcap")
+    run("cut", "both.mcap", "-o", "part.mcap", "--start", start, "--end", end)
+    by_topic = read_columns([Path("part.mcap")])
+    return {topic: plain(columns.fields) for topic, columns in by_topic.items()}
+
+
+def by_catalog(run: Run) -> Any:
+    said = json.loads(run("info", "logs", "--catalog", "--json").stdout)
+    rows = pq.read_table("logs/catalog.parquet").to_pylist()
+    Path("logs/catalog.parquet").unlink()
+    of_files = {"size", "mtime", "input_sha256"}
+    return said["labels"], [
+        {key: value for key, value in row.items() if key not in of_files} for row in rows
+    ]
+
+
+READERS = [
+    by_info,
+    by_cat,
+    by_messages,
+    by_columns,
+    by_follow,
+    by_parquet,
+    by_csv,
+    by_npz,
+    by_text_and_sound,
+    by_bags,
+    by_doctor,
+    by_replay,
+    by_relabel,
+    by_diff,
+    by_report,
+    by_evaluate,
+    by_training,
+    by_timeline,
+    by_watching,
+    by_marks,
+    by_enrolment,
+    by_recovery,
+    by_splicing,
+    by_catalog,
+]
+
+
+def files_in(folder: str) -> list[Path]:
+    return sorted(Path(folder).iterdir())
