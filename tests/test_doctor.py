@@ -441,6 +441,7 @@ DATA = {
     "another model": (metadata("hearthlog", model_sha256="0"), {"info"}),
     "no configuration": (drop_attachment("configuration.json"), {"attachments"}),
     "no model card": (drop_attachment("model_card.md"), {"attachments"}),
+    "two models": (twice(lambda log: attachment(log, "model.json")), {"attachments"}),
     "two model cards": (twice(lambda log: attachment(log, "model_card.md")), {"attachments"}),
     "no rosbag2": (lambda log: log.drop(log.metadata("rosbag2")), {"rosbag2"}),
     "info of another rate": (change(INFO, 0, sample_rate=8000), {"info"}),

@@ -63,7 +63,7 @@ def test_a_log_has_the_features_and_labels_of_the_example(logs):
     info, features, labels = (columns[f"/mic/{kind}"] for kind in ("info", "features", "label"))
     assert info["feature_set"][0] == "octaves"
     assert info["window_seconds"][0] == pytest.approx(1.2)
-    assert info["feature_names"][0][:2] == ["level", "octave_62"]
+    assert list(info["feature_names"][0][:2]) == ["level", "octave_62"]
     assert features["values"].shape[1] == 8
     assert len(features) - len(labels) == 23  # labels begin with the first whole window
     assert set(labels["label"]) == {"silence", "flushing_water", "shower", "tap_water", "other"}

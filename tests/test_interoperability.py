@@ -186,7 +186,7 @@ def test_the_file_has_the_profile_the_metadata_and_the_attachments_of_the_contra
         assert metadata["hearthlog"]["node"] == "home"
         assert metadata["hearthlog"]["feature_set"] == "auros21"
         assert metadata["hearthlog"]["model_sha256"] == model.sha256
-        assert attachments.keys() == {"configuration.json", "model_card.md"}
+        assert attachments.keys() == {"configuration.json", "model.json", "model_card.md"}
         assert json.loads(attachments["configuration.json"].data)["node"] == "home"
         assert attachments["model_card.md"].data.decode() == model_card(model)
         found = ours(path)

@@ -109,7 +109,7 @@ def test_files_begin_at_the_full_hour_and_each_says_what_it_is(day, model_file, 
         reader = LogReader(log)
         assert next(reader.messages()).topic == "/mic/info"
         assert reader.metadata["hearthlog"]["model_sha256"] == load_model(model_file).sha256
-        assert set(reader.attachments) == {"configuration.json", "model_card.md"}
+        assert set(reader.attachments) == {"configuration.json", "model.json", "model_card.md"}
 
 
 def test_several_files_in_a_row_are_one_sound(tmp_path, recorded):

@@ -63,7 +63,7 @@ def test_a_log_cut_anywhere_is_completed_with_all_that_is_whole(log, tmp_path, s
     about = json.loads(reader.metadata["rosbag2"]["serialized_metadata"])
     assert about["message_count"] == len(kept)
     assert sum(t["message_count"] for t in about["topics_with_message_count"]) == len(kept)
-    assert set(reader.attachments) == {"configuration.json", "model_card.md"}
+    assert set(reader.attachments) == {"configuration.json", "model.json", "model_card.md"}
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 

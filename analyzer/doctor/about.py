@@ -29,7 +29,6 @@ from hearthlog.schemas.writer import PROFILE, SCHEMA_ENCODING
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
 _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS
-_WITH_DESCRIPTION = 2  # the first schema version whose logs have one
 
 
 class About:
@@ -83,14 +82,12 @@ class About:
         if missing := sorted(_KEYS - records[0].keys()):
             self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
         found = self._data.attachments
-        described = (schema_version(records[0]) or SCHEMA_VERSION) >= _WITH_DESCRIPTION
-        wanted = {_CONFIGURATION}
-        if records[0].get("model"):
-            wanted |= {_MODEL_CARD, _MODEL} if described else {_MODEL_CARD}
-        for name in ATTACHMENTS:
+        one = 1 if records[0].get("model") else 0
+        counts = {_CONFIGURATION: (1, 1), _MODEL_CARD: (one, one), _MODEL: (0, one)}
+        for name, (least, most) in counts.items():
             count = len(found.get(name, ()))
-            if count != (name in wanted):
-                what = f"there are {count} attachments {name}, not {int(name in wanted)}"
+            if not least <= count <= most:
+                what = f"there are {count} attachments {name}, not {most}"
                 self._error("attachments", what)
         if len(found.get(_CONFIGURATION, ())) == 1:
             digest = hashlib.sha256(found[_CONFIGURATION][0]).hexdigest()
