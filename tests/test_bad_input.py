@@ -215,6 +215,7 @@ def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, 
         ("record", "--realtime"),
         ("record", "x.wav", "--start", "yesterday"),
         ("record", "--what"),
+        ("replay",),
         ("listen",),
     ],
 )
