@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Self
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.extras import remedy
 
 HOST = "127.0.0.1"
 _WAIT_SECONDS = 60
@@ -30,7 +31,7 @@ def program() -> Path:
     spec = find_spec("rerun_cli")
     found = Path(spec.origin).with_name("rerun") if spec and spec.origin else Path("rerun")
     if not found.exists():
-        raise DataError("Rerun's viewer is not installed; `pip install 'hearthlog[analyzer]'`")
+        raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
     return found
 
 
