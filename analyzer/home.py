@@ -30,14 +30,14 @@ def home_recordings(folder: Path) -> Iterator[Recording]:
     Parameters
     ----------
     folder : Path
-        Of logs, with review layers beside them.
+        Of logs, with review layers beside them, and of enrolled sounds.
 
     Raises
     ------
     LogError
         If a log or a layer is damaged.
     """
-    for log in find_logs(folder):
+    for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
         if not marks:
             continue
@@ -65,7 +65,7 @@ def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
     """
     numbers = {name: number for number, name in enumerate(classes)}
     found: list[Int64] = []
-    for log in find_logs(folder):
+    for log in find_logs(folder, enrolled=True):
         runs: list[list[Mark]] = []
         for mark in sorted(read_marks(log)):
             last = runs[-1][-1] if runs else None
