@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from hearthlog.analyzer.extras import remedy
 HOST = "127.0.0.1"
 _WAIT_SECONDS = 60
 _STOP_SECONDS = 5
+_BACKTRACE = re.compile(r"\s*\d+: ")
 
 
 def program() -> Path:
@@ -127,6 +129,7 @@ class Process:
     def failed(self) -> DataError:
         """Make the error that says why it does not run."""
         lines = self._log.read_text(errors="replace").splitlines()
+        lines = [line for line in lines if not _BACKTRACE.match(line)]
         why = [
             line for line in lines if "rror" in line or "panick" in line or "No graphics" in line
         ]
