@@ -29,13 +29,12 @@ from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.recorder.stream import Event, Frames
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import SUFFIX, log_path, new_file
+from hearthlog.schemas.files import ENROLLED, SUFFIX, log_path, new_file
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import time_span
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 
-FOLDER = "enrolled"
 SECONDS = 5.0  # of a microphone, unless it is said
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
@@ -145,7 +144,7 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
     selection = select([log], start=start, end=end)
     stamps, energies = _frames(selection.logs, microphone, start, end)
     _check_sound(label, energies)
-    path = log_path(home / FOLDER, label, int(stamps[0]))
+    path = log_path(home / ENROLLED, label, int(stamps[0]))
     # Not a name as of a recorder's log: this one has not all of its topics.
     path = path.with_stem(f"{path.stem}_cut")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -195,7 +194,7 @@ def _enrol(
         for log, (stamps, _) in heard.items():
             if not len(stamps):
                 continue
-            path = home / FOLDER / log.relative_to(folder)
+            path = home / ENROLLED / log.relative_to(folder)
             path.parent.mkdir(parents=True, exist_ok=True)
             with new_file(path) as temporary:
                 shutil.copyfile(log, temporary)
@@ -249,7 +248,7 @@ def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) 
 def _free_start(home: Path, label: str, seconds: float) -> int:
     """Return the start of the last span of time that ends by now and is not taken."""
     length = int(seconds * NANOSECONDS)
-    logs = (home / FOLDER).rglob(f"{label}_*{SUFFIX}")
+    logs = (home / ENROLLED).rglob(f"{label}_*{SUFFIX}")
     spans = [span for log in logs if (span := time_span(log)) is not None]
     end = time.time_ns()
     for first, last in sorted(spans, reverse=True):

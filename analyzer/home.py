@@ -33,7 +33,7 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
     Parameters
     ----------
     folder : Path
-        Of logs, with review layers beside them.
+        Of logs, with review layers beside them, and of enrolled sounds.
     features : FeatureSet
         Of other features a recording has none.
 
@@ -42,7 +42,7 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
     LogError
         If a log or a layer is damaged.
     """
-    for log in find_logs(folder):
+    for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
         if not marks:
             continue
@@ -70,7 +70,7 @@ def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
     """
     numbers = {name: number for number, name in enumerate(classes)}
     found: list[Int64] = []
-    for log in find_logs(folder):
+    for log in find_logs(folder, enrolled=True):
         runs: list[list[Mark]] = []
         marks = read_marks(log)
         names = translation({mark.label for mark in marks}, classes)

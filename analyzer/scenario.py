@@ -1,6 +1,5 @@
 """Scenarios: which labels of a manifest make up which class of a model."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +7,7 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models import classes as sound
 from hearthlog.models.description import CLASS_NAME, MOST_CLASSES, TEXT
-
-_SIZE_LIMIT = 1 << 20
+from hearthlog.schemas.smallfile import read_toml
 
 _GENERAL = (
     *(sound.SILENCE, sound.SPEECH, sound.MUSIC, sound.PHONE_RING, sound.COUGHING, sound.CRYING),
@@ -93,7 +91,7 @@ def load_scenario(name: str) -> Scenario:
         raise DataError(f"unknown scenario {name!r}: use {', '.join(BUILTIN)} or a .toml file")
     if not path.stem.isprintable():
         raise DataError(f"{name!a}: give the scenario a name that can be printed")
-    content = _read_toml(path)
+    content = read_toml(path, "scenario file", DataError)
     unknown = content.keys() - {"classes", "ignore"}
     if unknown:
         raise DataError(f"{path}: unknown key {min(unknown)[:64]!r}; known are classes, ignore")
@@ -107,19 +105,6 @@ def load_scenario(name: str) -> Scenario:
     if twice:
         raise DataError(f"{path}: label {twice[0][:64]!r} is in two places")
     return Scenario(path.stem, table, frozenset(ignored))
-
-
-def _read_toml(path: Path) -> dict[str, object]:
-    try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such scenario file")
-        if path.stat().st_size > _SIZE_LIMIT:
-            raise DataError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no scenario")
-        return tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: is not TOML in UTF-8 ({str(error)[:200]})") from error
 
 
 def _class_name(path: Path, name: str) -> str:

@@ -4,11 +4,13 @@ import re
 from pathlib import Path
 from typing import Any, cast
 
+from hearthlog.analyzer.extras import remedy
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.ranges import store_errors
 
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _FILES = {"file", "local"}
+_OURS = {"fsspec", "s3fs", "upath", ""}  # what the extra `cluster` installs, or nobody knows
 # A listing that is kept hides what others put there since.
 _FRESH: dict[str, Any] = {"use_listings_cache": False}
 # s3fs tries five times whatever botocore tried: a silent server is given up after three minutes.
@@ -57,13 +59,13 @@ def _stored(scheme: str, rest: str) -> Path:
             path = UPath(text, **options)
             path.fs.root_marker  # noqa: B018  makes it
     except ImportError as error:
-        raise LogError(f"{text}: {error}; try: pip install {_package(error)}") from error
+        raise LogError(f"{text}: {error}; {_remedy(error)}") from error
     # It does all that is asked of a Path here, but is none for the type checker.
     return cast("Path", path)
 
 
-def _package(error: ImportError) -> str:
-    """Name the package that has what could not be imported."""
+def _remedy(error: ImportError) -> str:
+    """Say how to install what could not be imported: our extra, or a package of fsspec's."""
     missing = error if error.__cause__ is None else error.__cause__
     name = getattr(missing, "name", None) or ""
-    return "'hearthlog[cluster]'" if name in {"fsspec", "upath", ""} else name
+    return f"try: pip install {name}" if name not in _OURS else remedy("fsspec")

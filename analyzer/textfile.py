@@ -6,6 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.smallfile import read_whole
+
+_MOST_LINES = 1_000_000  # blank ones too: each takes a microsecond
+_LONGEST = 1 << 20  # characters of a record: fields take fifty times as much memory
 
 
 def read_text(path: Path, what: str, size_limit: int) -> str:
@@ -24,15 +28,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
     DataError
         If it cannot be read, is larger, or is not UTF-8.
     """
-    try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such {what}")
-        with path.open("rb") as stream:
-            raw = stream.read(size_limit + 1)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    if len(raw) > size_limit:
-        raise DataError(f"{path}: larger than {size_limit >> 20} MB; this is no {what}")
+    raw = read_whole(path, what, size_limit, DataError)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -46,10 +42,24 @@ def csv_records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
     Raises
     ------
     DataError
-        If the text is not CSV.
+        If the text is not CSV, or has more than a million lines.
     """
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    count = max(text.count("\n"), text.count("\r"))
+    if count > _MOST_LINES:
+        raise DataError(f"{path}: has {count:,} lines; at most {_MOST_LINES:,} are read")
+    length = 0
+
+    def lines() -> Iterator[str]:
+        nonlocal length
+        for text_line in io.StringIO(text, newline=""):
+            length += len(text_line)
+            if length > _LONGEST:
+                raise csv.Error(f"a record is longer than {_LONGEST >> 20} MB")
+            yield text_line
+
+    reader = csv.reader(lines(), strict=True)
     while True:
+        length = 0
         line = reader.line_num + 1
         try:
             record = next(reader)

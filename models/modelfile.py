@@ -20,6 +20,7 @@ from hearthlog.models.features.installed import feature_set
 from hearthlog.models.model import Array, Model
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import check_new, new_file
+from hearthlog.schemas.smallfile import read_whole
 
 SUFFIX = ".safetensors"
 _KEY = "hearthlog"
@@ -78,7 +79,9 @@ def load_model(path: Path) -> Model:
         If it is missing, too large, damaged, inconsistent, or made for another feature set.
     """
     path = _pointed_to(path)
-    data = _read(path)
+    if not path.stem.isprintable():
+        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+    data = read_whole(path, "model file", _SIZE_LIMIT, ModelError)
     _check_header(path, data)
     try:
         arrays = load(data)
@@ -99,20 +102,6 @@ def _pointed_to(path: Path) -> Path:
         return Path(os.path.realpath(path)) if path.is_symlink() else path
     except OSError:
         return path  # why, reading it will say
-
-
-def _read(path: Path) -> bytes:
-    try:
-        if not path.is_file():
-            raise ModelError(f"{path}: no such model file")
-        if not path.stem.isprintable():
-            raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
-        if path.stat().st_size > _SIZE_LIMIT:
-            raise ModelError(f"{path}: larger than {_SIZE_LIMIT >> 20} MB; this is no model file")
-        with path.open("rb") as stream:
-            return stream.read(_SIZE_LIMIT)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _check_header(path: Path, data: bytes) -> None:

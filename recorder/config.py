@@ -1,11 +1,17 @@
 """What the recorder was asked to do: command line, then environment, then file, then defaults."""
 
-import tomllib
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_settings import BaseSettings, InitSettingsSource, SettingsConfigDict
+from pydantic.fields import FieldInfo
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    InitSettingsSource,
+    SettingsConfigDict,
+)
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
 from hearthlog.recorder.clips import Keep
@@ -13,7 +19,10 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.zone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import check_node_name
+from hearthlog.schemas.smallfile import read_toml
 from hearthlog.schemas.topics import check_microphone_name
+
+_PREFIX = "HEARTHLOG_"
 
 
 def _checked(check: Any) -> AfterValidator:
@@ -35,12 +44,29 @@ class Microphone(BaseModel):
     device: str = ""  # as `hearthlog devices` lists it; empty: the default one
 
 
+class _Environment(EnvSettingsSource):
+    """The variables of the environment: one that is unknown, or no JSON, is refused by name."""
+
+    def __call__(self) -> dict[str, Any]:
+        fields = {_PREFIX + name.upper() for name in self.settings_cls.model_fields}
+        ours = [name for name in os.environ if name.upper().startswith(_PREFIX)]
+        unknown = min((name for name in ours if name.upper() not in fields), default=None)
+        if unknown is not None:
+            raise ConfigurationError(f"environment: unknown variable {unknown[:64]!r}")
+        return super().__call__()
+
+    def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
+        try:
+            return super().decode_complex_value(field_name, field, value)
+        except (ValueError, RecursionError) as error:
+            name = _PREFIX + field_name.upper()
+            raise ConfigurationError(f"environment: {name} is not JSON ({error})") from error
+
+
 class Settings(BaseSettings):
     """Everything that can be configured; the field names are the keys of the TOML file."""
 
-    model_config = SettingsConfigDict(
-        extra="forbid", env_prefix="HEARTHLOG_", validate_default=True
-    )
+    model_config = SettingsConfigDict(extra="forbid", env_prefix=_PREFIX, validate_default=True)
 
     node: Annotated[str, _checked(check_node_name)] = "home"
     output: Path = Path("logs")
@@ -69,10 +95,10 @@ class Settings(BaseSettings):
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Put the file, which arrives as one of the arguments, below the environment."""
-        del dotenv_settings, file_secret_settings
+        del env_settings, dotenv_settings, file_secret_settings
         assert isinstance(init_settings, InitSettingsSource)
         file = init_settings.init_kwargs.pop("file", {})
-        return init_settings, env_settings, InitSettingsSource(settings_cls, file)
+        return init_settings, _Environment(settings_cls), InitSettingsSource(settings_cls, file)
 
 
 def load_settings(
@@ -94,7 +120,7 @@ def load_settings(
     ConfigurationError
         Naming the key that is unknown or whose value makes no sense.
     """
-    content = {} if file is None else _read_toml(file)
+    content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     try:
         settings = Settings(file=content, **command_line)  # type: ignore[call-arg]
         merged = settings.microphone[0].model_dump() | microphone
@@ -103,14 +129,6 @@ def load_settings(
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise ConfigurationError(f"{file}: unknown key {key!r}") from error
+            raise ConfigurationError(f"{file or 'configuration'}: unknown key {key!r}") from error
         message = first["msg"].removeprefix("Value error, ")
         raise ConfigurationError(f"configuration: {key}: {message}") from error
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as stream:
-            return tomllib.load(stream)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigurationError(f"{path}: cannot be read as TOML ({error})") from error

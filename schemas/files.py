@@ -18,6 +18,7 @@ ACTIVE_SUFFIX = SUFFIX + ".active"
 AUDIO_SUFFIX = ".audio" + SUFFIX
 _LAYER = re.compile(r"\.(relabel-.+|review|audio)\.mcap(\.active)?")
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
+ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
 
 
 def check_node_name(name: str) -> str:
@@ -56,16 +57,32 @@ def is_layer(path: Path) -> bool:
     return _LAYER.search(path.name) is not None
 
 
-def find_logs(path: Path) -> list[Path]:
+def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     """List the logs in a folder, or the log itself; those still being written come too.
+
+    Parameters
+    ----------
+    path : Path
+    enrolled : bool
+        Whether the sounds in folders `enrolled` of it come too, which are no time of the home.
 
     Raises
     ------
     LogError
         If there is none.
     """
-    if not is_local(path):
-        return _find_stored(path)
+    logs = _find_local(path) if is_local(path) else _find_stored(path)
+    depth = len(path.parts)
+    found = [log for log in logs if enrolled or ENROLLED not in log.parts[depth:-1]]
+    if logs and not found:
+        raise LogError(
+            f"{path}: no log (*{SUFFIX}) in this folder but enrolled sounds; name their folder "
+            f"{ENROLLED!r} to read those"
+        )
+    return found
+
+
+def _find_local(path: Path) -> list[Path]:
     if path.is_dir():
         found = [p for p in path.rglob("*") if p.name.endswith((SUFFIX, ACTIVE_SUFFIX))]
         if not found:

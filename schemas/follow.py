@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.chunks import RawMessages, read_chunks
 from hearthlog.schemas.columns import Columns, decode
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, stem
+from hearthlog.schemas.files import ACTIVE_SUFFIX, ENROLLED, SUFFIX, stem
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.series import iterate_messages
 
@@ -218,7 +218,7 @@ class _Folder:
             for entry in entries:
                 path = Path(entry.path)
                 if entry.is_dir(follow_symlinks=False):
-                    if path not in self._listed:
+                    if path not in self._listed and entry.name != ENROLLED:
                         self._listed[path] = -1
                         todo.append(path)
                 elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)):

@@ -197,7 +197,7 @@ def _need(package: str, present: object):
     if present:
         return
     reason = f"sound without hardware needs the Debian package {package}"
-    if os.environ.get("HEARTHLOG_REQUIRE_AUDIO") == "1":
+    if os.environ.get("TESTS_REQUIRE_AUDIO") == "1":
         pytest.fail(reason)
     pytest.skip(reason)
 

@@ -199,6 +199,10 @@ def test_no_microphone(refused, labmic, tmp_path):
         ('[[microphone]]\nname = "Bad Room"', "microphone.0.name: microphone name 'Bad Room'"),
         ("[[microphone]]\nnoise = 1", "unknown key 'microphone.0.noise'"),
         ("flush_seconds = -1", "flush_seconds: Input should be greater"),
+        ("node = " + "[" * 100_000, "cannot be read as TOML (it is nested too deeply)"),
+        ("a." * 400_000 + "a = 1", "cannot be read as TOML (it is nested too deeply)"),
+        ("flush_seconds = " + "1" * 5000, "cannot be read as TOML"),
+        ("#" * (1 << 20) + "#", "larger than 1 MB; this is no configuration"),
     ],
 )
 def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, words):
@@ -209,12 +213,53 @@ def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, 
     assert not (tmp_path / "logs").exists()
 
 
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/tty", "/", "none.toml"])
+def test_a_configuration_that_is_no_regular_file(refused, sound, tmp_path, path):
+    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs")
+    assert message == f"{path}: no such configuration"
+
+
+def test_a_configuration_may_have_a_line_of_dots_in_a_comment(hearthlog, sound, tmp_path):
+    path = tmp_path / "hearthlog.toml"
+    path.write_text(f"# {'.' * 200}\nnode = 'flat'  # {'.' * 90}\n")
+    result = hearthlog("record", sound, "--config", path, "-o", tmp_path / "logs")
+    assert (result.returncode, "/flat_" in result.stdout) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("variable", "words"),
+    [
+        ("HEARTHLOG_NODEE=flat", "environment: unknown variable 'HEARTHLOG_NODEE'"),
+        ("hearthlog_nodee=flat", "environment: unknown variable 'hearthlog_nodee'"),
+        ("HEARTHLOG_=flat", "environment: unknown variable 'HEARTHLOG_'"),
+        ("HEARTHLOG_MICROPHONE=mic", "environment: HEARTHLOG_MICROPHONE is not JSON (Expecting"),
+        ("HEARTHLOG_NEVER_KEEP=" + "[" * 100_000, "environment: HEARTHLOG_NEVER_KEEP is not JSON"),
+        ('HEARTHLOG_MICROPHONE=[{"noise": 1}]', "unknown key 'microphone.0.noise'"),
+        ("HEARTHLOG_FLUSH_SECONDS=never", "configuration: flush_seconds: Input should be"),
+    ],
+)
+def test_a_variable_of_the_environment_that_makes_no_sense(
+    refused, sound, tmp_path, variable, words
+):
+    message = refused("record", sound, "-o", tmp_path / "logs", env=dict([variable.split("=")]))
+    assert message.startswith(words) or message == f"configuration: {words}"
+    assert not (tmp_path / "logs").exists()
+
+
+def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlog, sound, tmp_path):
+    env = {"HEARTHLOGS": "1", "_HEARTHLOG": "1", "HEARTHLOG_NODE": "flat"}
+    env |= {"HEARTHLOG_MICROPHONE": '[{"name": "hall"}]', "hearthlog_statistics_every": "7"}
+    result = hearthlog("record", sound, "-o", tmp_path / "logs", env=env)
+    assert (result.returncode, "/flat_" in result.stdout) == (0, True)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ("record", "--realtime"),
         ("record", "x.wav", "--start", "yesterday"),
         ("record", "--what"),
+        ("replay",),
         ("listen",),
     ],
 )

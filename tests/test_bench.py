@@ -1,6 +1,7 @@
 """The benchmark runs to its end on a little sound; how fast is not for a test to say."""
 
 import math
+import re
 import subprocess
 import sys
 
@@ -97,6 +98,24 @@ def test_an_unknown_measurement_is_refused_and_the_known_ones_are_listed():
     done = bench("speed")
     assert done.returncode == 2
     assert "features, recording, live, inference, size" in " ".join(done.stderr.split())
+
+
+def test_where_no_viewer_runs_the_others_are_measured_and_the_end_says_what_is_missing(
+    tmp_path, monkeypatch
+):
+    write_training_set(tmp_path, 3, seed=1)
+    nothing_to_draw_with = {"WGPU_BACKEND": "vulkan", "VK_DRIVER_FILES": "/none"}
+    for name, value in (nothing_to_draw_with | {"VK_ICD_FILENAMES": "/none"}).items():
+        monkeypatch.setenv(name, value)
+    done = bench("review", "size", "--audio", tmp_path)
+    assert done.returncode == 3, done.stderr
+    tables = done.stdout.split("\n\n")
+    day = next(line for line in tables[0].splitlines() if line.startswith("  a day "))
+    assert re.search(r" - .*Rerun's viewer does not run here", day)
+    assert figures(tables[1])["the whole log"] > 0
+    assert done.stderr.splitlines()[-1] == (
+        "hearthlog bench: not measured: a day (review); a month, a sample of it (review)"
+    )
 
 
 def test_a_folder_without_sound_is_one_clear_line(tmp_path):

@@ -11,14 +11,16 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 from spliced import run
+from stores import put
 
 from hearthlog.analyzer.enrol import enrol_file
 from hearthlog.analyzer.heard import find_heard
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.home import home_recordings
+from hearthlog.analyzer.marks import Mark, read_marks, write_marks
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.recorder.sources.files import read_audio
 from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.files import find_logs, is_layer
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
@@ -48,7 +50,7 @@ def cough(household, tmp_path):
 
 
 def enrolled(home):
-    return [path for path in find_logs(home) if not path.name.endswith(".review.mcap")]
+    return [path for path in find_logs(home / "enrolled") if not is_layer(path)]
 
 
 def values(log):
@@ -128,6 +130,66 @@ def test_a_span_of_logs_is_enrolled_as_it_was_recorded(hearthlog, recorded, home
     again = hearthlog(*command)
     assert (again.returncode, "exists already" in again.stderr) == (1, True)
     assert log.read_bytes() == before
+
+
+@pytest.fixture
+def logs(recorded, tmp_path):
+    """Logs of a home, without its enrolled sounds."""
+    return shutil.copytree(recorded, tmp_path / "logs")
+
+
+def test_enrolled_sounds_are_no_time_of_the_home(hearthlog, logs, cough):
+    verbs = (
+        ("info", logs, "--json"),
+        ("cat", logs, "--format", "ndjson", "--topics", "/mic/info"),
+        ("evaluate", logs, "--reference", "review"),
+    )
+    first = find_heard(logs)["mic"].starts[0]
+    write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])
+    before = find_heard(logs), [hearthlog(*verb) for verb in verbs]
+    at = ("--start", "2026-03-01T06:59:40", "--end", "2026-03-01T06:59:42")
+    assert hearthlog("enrol", "silence", "--home", logs, "--log", logs, *at).returncode == 0
+    assert hearthlog("enrol", "coughing", "--home", logs, "--file", cough).returncode == 0
+    assert len(enrolled(logs)) == 2
+    assert (find_heard(logs), [hearthlog(*verb) for verb in verbs]) == before
+
+
+def test_a_home_is_learned_from_with_its_enrolled_sounds(logs, cough):
+    first = find_heard(logs)["mic"].starts[0]
+    write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])
+    enrol_file(logs, "coughing", cough)
+    assert {recording.label for recording in home_recordings(logs)} == {"speech", "coughing"}
+
+
+def test_a_home_may_have_nothing_but_enrolled_sounds(hearthlog, cough, home):
+    enrol_file(home, "coughing", cough)
+    assert [recording.label for recording in home_recordings(home)] == ["coughing"]
+    result = hearthlog("info", home)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert result.stderr == (
+        f"hearthlog: {home}: no log (*.mcap) in this folder but enrolled sounds; name their folder "
+        "'enrolled' to read those\n"
+    )
+    assert hearthlog("info", home / "enrolled").returncode == 0
+
+
+def test_enrolled_sounds_are_checked_by_the_doctor(hearthlog, logs, cough):
+    (made,) = enrol_file(logs, "coughing", cough)
+    made.log.write_bytes(made.log.read_bytes()[:-100])
+    result = hearthlog("doctor", logs)
+    assert (result.returncode, str(made.log) in result.stdout) == (1, True)
+
+
+def test_enrolled_sounds_in_a_store_are_no_time_of_the_home(logs, cough, in_memory):
+    names = [path.relative_to(logs).as_posix() for path in find_logs(logs)]
+    enrol_file(logs, "coughing", cough)
+    put(logs, in_memory / "anna")
+    for folder in (in_memory, in_memory / "anna"):
+        assert [str(path) for path in find_logs(folder)] == [
+            str(in_memory / "anna" / name) for name in names
+        ]
+        assert len(find_logs(folder, enrolled=True)) == len(names) + 2
+    assert len(find_logs(in_memory / "anna" / "enrolled")) == 2
 
 
 def test_what_is_no_sound_to_learn_from_is_refused(hearthlog, recorded, cough, home, tmp_path):

@@ -66,7 +66,7 @@ def test_a_log_has_the_features_and_labels_of_the_example(logs):
     assert list(info["feature_names"][0][:2]) == ["level", "octave_62"]
     assert features["values"].shape[1] == 8
     assert len(features) - len(labels) == 23  # labels begin with the first whole window
-    assert set(labels["label"]) == {"silence", "flushing_water", "shower", "tap_water", "other"}
+    assert set(labels["label"]) <= {"silence", "flushing_water", "shower", "tap_water", "other"}
     assert (labels["novelty"] < 1).all()
 
 

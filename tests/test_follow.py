@@ -88,6 +88,17 @@ def test_a_log_that_is_finished_before_it_was_seen_is_read_too(tmp_path):
         assert sorted(followed.wait_for(range(400))) == list(range(400))
 
 
+def test_a_sound_that_is_enrolled_is_no_news_of_the_home(tmp_path):
+    with Followed(tmp_path, start=0) as followed:
+        for number, folder in enumerate(("enrolled/2026", "logs", "enrolled/2025", "logs")):
+            writer = log(tmp_path / folder, f"home_{number}.mcap")
+            write(writer, 20 * number)
+            writer.finish()
+            if folder == "logs":
+                followed.wait_for(range(10 * number + 10))
+        assert followed.frames == [*range(20, 40), *range(60, 80)]
+
+
 def test_without_a_start_only_what_is_written_from_now_on_is_given(tmp_path):
     old = log(tmp_path, "home_0.mcap")
     write(old, 0)

@@ -88,6 +88,24 @@ def test_a_manifest_beyond_reason_is_refused_unread(tmp_path):
     assert "larger than 64 MB" in refusal(path)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r"])
+def test_a_manifest_of_blank_lines_is_refused_by_their_number(tmp_path, end):
+    path = manifest(tmp_path, HEADER + end * 3_000_000)
+    assert refusal(path).startswith(f"{path}: has 3,000,00")
+    assert refusal(path).endswith(" lines; at most 1,000,000 are read")
+
+
+def test_a_manifest_with_many_blank_lines_is_read(tmp_path):
+    path = manifest(tmp_path, HEADER + "\n" * 100_000 + "a.wav,speech,anna,,\n")
+    assert len(read_manifest(path, LABELS)) == 1
+
+
+@pytest.mark.parametrize("field", ["aa,", '"aa\n",'], ids=["in a line", "over lines"])
+def test_a_record_of_any_number_of_fields_is_not_held(tmp_path, field):
+    path = manifest(tmp_path, HEADER + field * 400_000)
+    assert refusal(path) == f"{path}:2: is not CSV (a record is longer than 1 MB)"
+
+
 @settings(deadline=None)
 @given(raw=st.binary(max_size=200))
 def test_any_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw):

@@ -194,7 +194,7 @@ def test_pulseaudio_plays_the_newer_samples_after_a_change(pulse_microphone, rec
     ("required", "outcome"), [("", pytest.skip.Exception), ("1", pytest.fail.Exception)]
 )
 def test_missing_sound_skips_on_a_desk_and_fails_where_required(required, outcome, monkeypatch):
-    monkeypatch.setenv("HEARTHLOG_REQUIRE_AUDIO", required)
+    monkeypatch.setenv("TESTS_REQUIRE_AUDIO", required)
     # Both are caught: a skip that escaped would skip this test instead of failing it.
     with pytest.raises((pytest.skip.Exception, pytest.fail.Exception), match="package gcc") as end:
         _need("gcc", present=None)

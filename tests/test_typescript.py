@@ -29,7 +29,7 @@ def need_node(modules):
     if shutil.which("node") and modules.is_dir():
         return
     reason = "needs Node.js and, once, `npm ci --prefix tests/typescript`"
-    if os.environ.get("HEARTHLOG_REQUIRE_NODE") == "1":
+    if os.environ.get("TESTS_REQUIRE_NODE") == "1":
         pytest.fail(reason)
     pytest.skip(reason)
 
@@ -183,7 +183,7 @@ def test_the_file_carries_the_checksums_that_the_typescript_readers_check(logs, 
 def test_missing_node_skips_on_a_desk_and_fails_where_required(
     required, outcome, monkeypatch, tmp_path
 ):
-    monkeypatch.setenv("HEARTHLOG_REQUIRE_NODE", required)
+    monkeypatch.setenv("TESTS_REQUIRE_NODE", required)
     # Both are caught: a skip that escaped would skip this test instead of failing it.
     with pytest.raises((pytest.skip.Exception, pytest.fail.Exception), match="npm ci") as end:
         need_node(tmp_path / "node_modules")

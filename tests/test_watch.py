@@ -85,7 +85,7 @@ def looking(url):
         try:
             run.wait_until_it_listens()
         except DataError as error:
-            if os.environ.get("HEARTHLOG_REQUIRE_AUDIO") == "1":
+            if os.environ.get("TESTS_REQUIRE_AUDIO") == "1":
                 raise
             pytest.skip(f"Rerun's viewer does not run here: {error}")
         yield Eye(run)

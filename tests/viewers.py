@@ -104,7 +104,7 @@ def free_port():
 
 def _missing(why):
     """Skip what cannot be tried here; where everything must be there, fail."""
-    if os.environ.get("HEARTHLOG_REQUIRE_AUDIO") == "1":
+    if os.environ.get("TESTS_REQUIRE_AUDIO") == "1":
         pytest.fail(why)
     pytest.skip(why)
 

@@ -33,7 +33,7 @@ def examine(path: Path, progress: Callable[[float], None] = lambda _: None) -> l
     """
     left = list(check_leftovers(path)) if path.is_dir() else []
     try:
-        logs = find_logs(path)
+        logs = find_logs(path, enrolled=True)
     except LogError:
         if not left:
             raise

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -13,10 +14,12 @@ from pathlib import Path
 from typing import Self
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.extras import remedy
 
 HOST = "127.0.0.1"
 _WAIT_SECONDS = 60
 _STOP_SECONDS = 5
+_BACKTRACE = re.compile(r"\s*\d+: ")
 
 
 def program() -> Path:
@@ -30,7 +33,7 @@ def program() -> Path:
     spec = find_spec("rerun_cli")
     found = Path(spec.origin).with_name("rerun") if spec and spec.origin else Path("rerun")
     if not found.exists():
-        raise DataError("Rerun's viewer is not installed; `pip install 'hearthlog[analyzer]'`")
+        raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
     return found
 
 
@@ -126,6 +129,7 @@ class Process:
     def failed(self) -> DataError:
         """Make the error that says why it does not run."""
         lines = self._log.read_text(errors="replace").splitlines()
+        lines = [line for line in lines if not _BACKTRACE.match(line)]
         why = [
             line for line in lines if "rror" in line or "panick" in line or "No graphics" in line
         ]

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
+from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.workers.calls import pack_call, read_reply
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def connected(scheduler: str) -> Iterator["Client"]:
     try:
         from distributed import Client  # noqa: PLC0415  part of the extra `cluster`
     except ModuleNotFoundError as error:
-        raise WorkerError("Dask is not installed; try: pip install 'hearthlog[cluster]'") from error
+        raise WorkerError(f"Dask is not installed; {remedy('distributed')}") from error
     with _silence():
         client = None
         with suppress(OSError, ValueError):

@@ -45,17 +45,26 @@ def bench(
         typer.Option(help="Folder of recordings to use instead of the simulated home."),
     ] = None,
 ) -> None:
-    """Measure hearthlog against its peers and its targets."""
+    """Measure hearthlog against its peers and its targets.
+
+    Exit status 3: something could not be measured; the tables say why.
+    """
     chosen = names or list(MEASUREMENTS)
     if unknown := [name for name in chosen if name not in MEASUREMENTS]:
         raise typer.BadParameter(f"{unknown[0]}: known are {', '.join(MEASUREMENTS)}")
+    missing: list[str] = []
     source = "the simulated home" if audio is None else audio
     with tempfile.TemporaryDirectory(prefix="hearthlog-bench-") as folder:
         work = Workload(Path(folder), audio)
         typer.echo(f"hearthlog bench: sound of {source}", err=True)
         for number, name in enumerate(chosen, start=1):
             typer.echo(f"hearthlog bench: {number} of {len(chosen)}, {name} ...", err=True)
-            print(f"{MEASUREMENTS[name](work)}\n", flush=True)
+            table = MEASUREMENTS[name](work)
+            print(f"{table}\n", flush=True)
+            missing += [f"{what} ({name})" for what in table.missing]
+    if missing:
+        typer.echo(f"hearthlog bench: not measured: {'; '.join(missing)}", err=True)
+        raise typer.Exit(3)
 
 
 if __name__ == "__main__":

@@ -58,6 +58,11 @@ class Table:
     title: str
     rows: list[Row]
 
+    @property
+    def missing(self) -> list[str]:
+        """What could not be measured."""
+        return [row.what.strip() for row in self.rows if row.value is None]
+
     def __str__(self) -> str:
         """Align the rows in columns."""
         lines = [_HEAD, *map(_cells, self.rows)]

@@ -17,7 +17,7 @@ def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to make.")] = Path("demo"),
     minutes: Annotated[
         float, typer.Option(min=1, max=1440, help="Length of the simulated day.")
-    ] = 24,
+    ] = 24.0,
 ) -> None:
     """Simulate a home, learn its sounds, record and label a day of it, and draw the result."""
     from hearthlog.analyzer.timeline.reading import read_timeline

@@ -12,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 
+from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.cat import cat
@@ -38,7 +39,6 @@ from hearthlog.tools.cli.watch import watch
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -68,14 +68,27 @@ app.add_typer(annotate, name="annotate")
 app.add_typer(models, name="models")
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"hearthlog {__version__}")
+        raise typer.Exit
+
+
 @app.callback()
 def options(
     *,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", is_eager=True, callback=_print_version
+        ),
+    ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show where in the code an error came from.")
     ] = False,
 ) -> None:
     """Listen to a home: sound to features and labels, in logs that anyone can open."""
+    del version  # shown by now
     _debug["on"] = debug
 
 
@@ -92,7 +105,9 @@ def main() -> None:
             raise
         message = str(error)
         if isinstance(error, ModuleNotFoundError):
-            message = f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
+            from hearthlog.analyzer.extras import remedy
+
+            message = f"{error.name} is not installed; {remedy(error.name or '')}"
         print(f"hearthlog: {message}", file=sys.stderr)
         sys.exit(1)
 

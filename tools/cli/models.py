@@ -30,7 +30,7 @@ class Alias(StrEnum):
 _Folder = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of model files.  [default: that of the configured model, else models]"
+        help="Folder of model files.", show_default="that of the configured model, else models"
     ),
 ]
 _Json = Annotated[bool, typer.Option("--json", help="Print it as JSON.")]

@@ -21,7 +21,7 @@ def record(
         typer.Argument(help="Audio files, one after the other; without any, the microphone."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder of logs.  [default: logs]")
+        Path | None, typer.Option("--output", "-o", help="Folder of logs.", show_default="logs")
     ] = None,
     model: Annotated[
         Path | None,
@@ -34,16 +34,17 @@ def record(
         str | None, typer.Option(help="Microphone, as `hearthlog devices` lists it.")
     ] = None,
     name: Annotated[
-        str | None, typer.Option(help="Name of the microphone in the log.  [default: mic]")
+        str | None, typer.Option(help="Name of the microphone in the log.", show_default="mic")
     ] = None,
     node: Annotated[
-        str | None, typer.Option(help="Name of this recorder.  [default: home]")
+        str | None, typer.Option(help="Name of this recorder.", show_default="home")
     ] = None,
     start: Annotated[
         str | None,
         typer.Option(
             help="Time of the files' first sample, as 2026-03-01T07:00:00 (UTC unless it says "
-            "otherwise).  [default: the first file's modification time]"
+            "otherwise).",
+            show_default="the first file's modification time",
         ),
     ] = None,
     realtime: Annotated[
@@ -51,13 +52,14 @@ def record(
     ] = False,
     max_bag_duration: Annotated[
         int | None,
-        typer.Option("--max-bag-duration", "-d", help="Seconds a file.  [default: 3600]"),
+        typer.Option("--max-bag-duration", "-d", help="Seconds a file.", show_default="3600"),
     ] = None,
     keep_audio: Annotated[
         str | None,
         typer.Option(
             help="Keep sound beside the log: off, events, unsure (of what it is) or always; but "
-            "never speech.  [default: off]"
+            "never speech.",
+            show_default="off",
         ),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="Configuration, a TOML file.")] = None,

@@ -15,7 +15,9 @@ def recover(
     *,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Name of the new log.  [default: LOG.recovered.mcap]"),
+        typer.Option(
+            "--output", "-o", help="Name of the new log.", show_default="LOG.recovered.mcap"
+        ),
     ] = None,
     in_place: Annotated[
         bool,

@@ -57,10 +57,11 @@ def review(
         str | None, typer.Option(help="Its name, where there are several.")
     ] = None,
     reviewer: Annotated[
-        str | None, typer.Option(help="Who makes the marks.  [default: the login name]")
+        str | None, typer.Option(help="Who makes the marks.", show_default="the login name")
     ] = None,
     timezone: Annotated[
-        str | None, typer.Option(help="Of the home, as Europe/Vienna.  [default: the logs say it]")
+        str | None,
+        typer.Option(help="Of the home, as Europe/Vienna.", show_default="the logs say it"),
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Of the viewer.")] = None,
 ) -> None:

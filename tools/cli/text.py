@@ -2,8 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
 _SHOWN = 10  # of a list
 
@@ -20,6 +18,8 @@ def number(count: int, what: str) -> str:
 
 def moment(stamp: int | None) -> str | None:
     """Write a time (ns of UTC) down to the millisecond."""
+    import numpy as np
+
     return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
 
 

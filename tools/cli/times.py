@@ -2,8 +2,6 @@
 
 import typer
 
-from hearthlog.schemas.times import read_time
-
 _LAST = (1 << 63) - 1  # log time
 
 
@@ -15,6 +13,8 @@ def parse_time(text: str, option: str) -> int:
     typer.BadParameter
         If it is none.
     """
+    from hearthlog.schemas.times import read_time
+
     try:
         return read_time(text)
     except ValueError as error:

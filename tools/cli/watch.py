@@ -37,7 +37,8 @@ def watch(
     ] = _LOOPBACK,
     minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 5,
     timezone: Annotated[
-        str | None, typer.Option(help="Of the home, as Europe/Vienna.  [default: the logs say it]")
+        str | None,
+        typer.Option(help="Of the home, as Europe/Vienna.", show_default="the logs say it"),
     ] = None,
 ) -> None:
     """Show in Rerun what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.

@@ -1,0 +1,161 @@
+"""The command says what it is, what its options are, and what is missing where it cannot run."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from hearthlog import __version__
+from hearthlog.recorder.config import Settings
+from hearthlog.tools.cli.main import app
+
+_WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
+_TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
+_HEAVY = {"numpy", "rosbags", "mcap", "soundfile", "sounddevice"}
+
+
+def commands(command, name=()):
+    """Every verb, by its words, and the command itself."""
+    yield name, command
+    for word, verb in getattr(command, "commands", {}).items():
+        yield from commands(verb, (*name, word))
+
+
+VERBS = dict(commands(typer.main.get_command(app)))
+
+
+def help_of(*verb):
+    """What --help says, without frames and line breaks."""
+    result = CliRunner().invoke(app, [*verb, "--help"], env=_WIDE)
+    assert result.exit_code == 0, result.output
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", result.output).split())
+
+
+def shown_default(option):
+    """The default that a verb has, or says that it has, as text."""
+    if isinstance(option.show_default, str):
+        return option.show_default
+    default = option.default
+    if callable(default) or default in (None, False, (), []) or not option.show_default:
+        return None
+    return str(getattr(default, "value", default))
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: " ".join(verb) or "hearthlog")
+def test_the_help_of_a_verb_shows_the_defaults_that_it_documents(verb):
+    text = help_of(*verb)
+    for option in VERBS[verb].params:
+        default = shown_default(option)
+        if default is not None:
+            assert f"[default: {default}]" in text or f"[default: ({default})]" in text
+        assert "[" not in (getattr(option, "help", None) or "")  # would be taken for markup
+
+
+@pytest.mark.parametrize(
+    ("verb", "default"),
+    [
+        ("record", "the first file's modification time"),
+        ("recover", "LOG.recovered.mcap"),
+        ("review", "the login name"),
+        ("review", "the logs say it"),
+        ("watch", "the logs say it"),
+        ("models list", "that of the configured model, else models"),
+    ],
+)
+def test_a_default_that_is_found_out_later_is_shown_in_words(verb, default):
+    assert f"[default: ({default})]" in help_of(*verb.split())
+
+
+def test_the_help_of_record_shows_the_defaults_of_the_configuration(monkeypatch):
+    for name in [name for name in os.environ if name.upper().startswith("HEARTHLOG_")]:
+        monkeypatch.delenv(name)
+    text, settings = help_of("record"), Settings()
+    for field in ("output", "node", "max_bag_duration", "keep_audio"):
+        assert f"[default: ({getattr(settings, field)})]" in text
+    assert f"[default: ({settings.microphone[0].name})]" in text
+
+
+def test_the_version_is_told_and_nothing_is_done(hearthlog, tmp_path):
+    result = hearthlog("--version", "record", "-o", tmp_path / "logs")
+    assert (result.returncode, result.stdout) == (0, f"hearthlog {__version__}\n")
+    assert not (tmp_path / "logs").exists()
+
+
+def completed(*words):
+    """What bash would offer behind these words, by the script that the command gives it."""
+    typed = " ".join(f"'{word}'" for word in words)
+    script = (
+        'eval "$(_HEARTHLOG_COMPLETE=source_bash hearthlog)"\n'
+        f"COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}\n"
+        '_hearthlog_completion hearthlog; printf "%s\\n" "${COMPREPLY[@]}"\n'
+    )
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    result = subprocess.run(
+        ["bash", "-c", script],
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stderr == ""
+    return result.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (("hearthlog", "re"), ["record", "recover", "review", "report", "replay", "relabel"]),
+        (("hearthlog", "models", "pro"), ["promote"]),
+        (("hearthlog", "record", "--max"), ["--max-bag-duration"]),
+        (("hearthlog", "cat", "--format", ""), ["text", "ndjson", "csv"]),
+    ],
+)
+def test_bash_completes_verbs_options_and_choices(words, offered):
+    assert sorted(completed(*words)) == sorted(offered)
+
+
+def test_completing_a_word_imports_nothing_that_takes_long():
+    code = (
+        "import sys\n"
+        "from hearthlog.tools.cli.main import main\n"
+        "sys.argv = ['hearthlog']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print(*sys.modules)\n"
+    )
+    asked = {"COMP_WORDS": "hearthlog rec", "COMP_CWORD": "1"}
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | asked | {"_HEARTHLOG_COMPLETE": "complete_bash"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stdout.startswith("record\nrecover")
+    loaded = set(result.stdout.split())
+    assert not loaded & _HEAVY
+    assert not {f"hearthlog.{name}" for name in ("analyzer", "recorder", "models")} & loaded
+
+
+@pytest.mark.parametrize(
+    ("missing", "extra", "verb"),
+    [
+        ("rerun", "viewer", ("review", "none", "--save", "day.rrd")),
+        ("distributed", "cluster", (*_TRAIN, "--scheduler", "tcp://127.0.0.1:1")),
+        ("upath", "cluster", ("info", "s3://homes/anna")),
+        ("sklearn", "analyzer", _TRAIN),
+    ],
+)
+def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
+    hearthlog, tmp_path, missing, extra, verb
+):
+    (tmp_path / "sitecustomize.py").write_text(f"import sys\nsys.modules[{missing!r}] = None\n")
+    path = f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"
+    result = hearthlog(*verb, env={"PYTHONPATH": path})
+    assert result.returncode == 1
+    assert result.stderr.endswith(f"; try: pip install '.[{extra}]' in a clone of hearthlog\n")
+    assert result.stderr.count("\n") == 1
