@@ -46,30 +46,29 @@ def fields_of(kind: MessageType) -> dict[str, Field]:
     LogError
         If it contains itself, or is too large.
     """
-    found: dict[str, Field] = {}
-    for path, field in _fields(kind, kind.name, "", 0):
-        found[path] = field
-        if len(found) > _FIELDS_LIMIT:
-            raise LogError(f"{kind.name}: has too many fields")
-    return found
+    return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
 
 
-def _fields(kind: MessageType, name: str, prefix: str, depth: int) -> Iterator[tuple[str, Field]]:
+def _fields(
+    kind: MessageType, name: str, prefix: str, depth: int, left: Iterator[int]
+) -> Iterator[tuple[str, Field]]:
     if depth > _DEPTH_LIMIT or name not in kind.types:
         raise LogError(f"{kind.name}: contains itself, or {name}, which is not defined")
     for field, (node, about) in kind.read_fields(name):
+        if next(left, None) is None:
+            raise LogError(f"{kind.name}: has too many fields")
         path = f"{prefix}{field}"
         if node is Nodetype.BASE:
             yield path, Field(about[0])
         elif node is Nodetype.NAME and about in {TIME, DURATION}:
             yield path, Field(about)
         elif node is Nodetype.NAME:
-            yield from _fields(kind, about, f"{path}.", depth + 1)
+            yield from _fields(kind, about, f"{path}.", depth + 1, left)
         else:
             (element, base), count = about
             size = count if node is Nodetype.ARRAY else 0
             if element is Nodetype.NAME:
-                yield path, Field("", size, dict(_fields(kind, base, "", depth + 1)))
+                yield path, Field("", size, dict(_fields(kind, base, "", depth + 1, left)))
             else:
                 yield path, Field(base[0], size)
 
@@ -166,10 +165,9 @@ def type_hash_of(kind: MessageType) -> str:
     LogError
         If it cannot be understood.
     """
-    fields_of(kind)  # or it may contain itself
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})
     try:
         return store.hash_rihs01(kind.name)
-    except KeyError as error:
-        raise LogError(f"{kind.name}: builds on {error}, which has no type hash") from error
+    except (KeyError, RecursionError) as error:
+        raise LogError(f"{kind.name}: contains itself, or what is not defined") from error

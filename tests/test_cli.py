@@ -57,7 +57,7 @@ def test_info_says_in_json_what_the_files_are_and_carry(logs, hearthlog):
     assert found["profiles"] == ["ros2"]
     assert found["libraries"] == ["hearthlog"]
     assert found["metadata"] == ["hearthlog", "rosbag2"]
-    assert len(found["attachments"]) == 2
+    assert len(found["attachments"]) == 3
     assert found["chunks"] > 10
     assert found["compression_ratio"] > 1
     assert sum(found["segments"]["hall"].values()) == found["topics"]["/hall/segment"]["messages"]
