@@ -1,0 +1,153 @@
+"""What is built: the sdist has all that its tests need, the wheel one name and no benchmarks."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib.metadata import packages_distributions
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
+DATA = {"py.typed", "page.html"}
+CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PROJECT = CONFIGURATION["project"]
+
+
+def installed_as(path):
+    """Name what a file of the checkout is in the wheel, or None."""
+    path = PurePosixPath(path)
+    if path.parts[0] not in FOLDERS or path.parts[:2] == ("tools", "bench"):
+        return None
+    if path.suffix not in {".py", ".msg"} and path.name not in DATA:
+        return None
+    inner = path.relative_to("tools/package") if path.parts[1] == "package" else path
+    return f"hearthlog/{inner}"
+
+
+def build(kind, source, folder):
+    code = f"from setuptools import build_meta; print(build_meta.build_{kind}({str(folder)!r}))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return folder / result.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    if not (ROOT / ".git").exists():
+        pytest.skip("an sdist is built from a checkout")
+    command = ["git", "-c", "safe.directory=*", "-C", ROOT, "ls-files", "-z"]
+    names = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\0")
+    return {name for name in names if name and (ROOT / name).exists()}
+
+
+@pytest.fixture(scope="module")
+def sdist(tracked, tmp_path_factory):
+    """The sdist, unpacked, of a checkout in which somebody has worked."""
+    folder = tmp_path_factory.mktemp("sdist")
+    litter = ["tests/typescript/node_modules/a/b.js", "tests/__pycache__/c.pyc", "demo/day.rrd"]
+    for name in [*tracked, *litter]:
+        target = folder / "checkout" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name in tracked:
+            shutil.copy(ROOT / name, target)
+        else:
+            target.touch()
+    archive = build("sdist", folder / "checkout", folder)
+    subprocess.run(["tar", "-xf", archive, "-C", folder], check=True)
+    return folder / archive.name.removesuffix(".tar.gz")
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist, tmp_path_factory):
+    """The wheel, unpacked, that is built from the sdist."""
+    folder = tmp_path_factory.mktemp("wheel")
+    with zipfile.ZipFile(build("wheel", sdist, folder)) as file:
+        file.extractall(folder / "wheel")
+    return folder / "wheel"
+
+
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_every_folder_with_code_is_a_package_but_the_benchmarks():
+    folders = {path.parent for name in FOLDERS for path in (ROOT / name).rglob("*.py")}
+    names = {".".join(("hearthlog", *path.relative_to(ROOT).parts)) for path in folders}
+    without = {"hearthlog.tools.bench", "hearthlog.tools.package"}
+    assert set(CONFIGURATION["tool"]["setuptools"]["packages"]) == names - without | {"hearthlog"}
+
+
+def test_the_sdist_holds_what_its_tests_need_and_no_litter(sdist, tracked):
+    made = {"PKG-INFO", "setup.cfg"}
+    names = {name for name in files(sdist) if not name.startswith("hearthlog.egg-info/")}
+    assert names - made == tracked - {".gitignore"}
+
+
+def test_the_wheel_holds_one_name_and_all_that_is_under_it(wheel, tracked):
+    assert len(list(wheel.glob("*.dist-info"))) == 1
+    names = {name for name in files(wheel) if ".dist-info/" not in name}
+    assert names == {installed_as(name) for name in tracked} - {None}
+
+
+def test_the_modules_of_the_wheel_find_each_other_under_its_name_alone(wheel, tmp_path):
+    code = (
+        "import importlib, pkgutil, sys, hearthlog\n"
+        "for module in pkgutil.walk_packages(hearthlog.__path__, 'hearthlog.'):\n"
+        "    importlib.import_module(module.name)\n"
+        "for name, module in sys.modules.items():\n"
+        "    if name.partition('.')[0] == 'hearthlog':\n"
+        "        print(module.__file__)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(wheel)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert set(result.stdout.splitlines()) == {str(path) for path in wheel.rglob("*.py")}
+
+
+BOX = ("schemas", "models", "recorder")
+EXTRAS = ("headless", "viewer", "cluster")
+
+
+def asked_for(*extras):
+    """Name the distributions that hearthlog needs itself, with some extras."""
+    texts = list(PROJECT["dependencies"])
+    for extra in extras:
+        texts += PROJECT["optional-dependencies"][extra]
+    return {normal(re.match(r"[\w.-]+", text)[0]) for text in texts}
+
+
+def normal(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def imported(folders):
+    """Name what the modules of some folders import of others."""
+    for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                yield from (alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                yield node.module
+
+
+@pytest.mark.parametrize(
+    ("folders", "extras"), [(BOX, ()), (("analyzer", "tools/cli", "tools/home"), EXTRAS)]
+)
+def test_what_is_imported_is_asked_for(folders, extras):
+    names = {name.partition(".")[0] for name in imported(folders)}
+    names -= sys.stdlib_module_names | {"hearthlog"}
+    owners = packages_distributions()
+    asked = asked_for(*extras)
+    assert {name for name in names if not asked & set(map(normal, owners.get(name, [])))} == set()
