@@ -21,6 +21,7 @@ from hearthlog.schemas.files import check_new, new_file
 from hearthlog.schemas.smallfile import read_whole
 
 SUFFIX = ".safetensors"
+SIMULATED = "hearthlog simulated home"  # the collection of what `hearthlog.tools.home` makes up
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
 _FEATURE_COUNTS = {"auros21": 21}
@@ -95,6 +96,12 @@ class TrainingData(_Record):
     collections: list[Collection]
     home: dict[_ClassName, Amount] = {}
     base_sha256: _Text = ""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether all of it was made up: the model has never learned from a real sound."""
+        names = {item.name for item in self.collections}
+        return names == {SIMULATED} and not any(amount.segments for amount in self.home.values())
 
 
 class ClassMetrics(_Record):
@@ -256,6 +263,8 @@ class Model:
                 f"- {name}: {amount.segments} segments from {amount.sources} sources"
                 for name, amount in about.training_data.home.items()
             ]
+        if about.training_data.simulated:
+            lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
         lines += ["", "Learned from recordings of:", ""]
         lines += [
             f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
