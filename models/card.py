@@ -63,6 +63,8 @@ def model_card(model: Model) -> str:
             f"- {name}: {amount.segments} segments from {amount.sources} sources"
             for name, amount in about.training_data.home.items()
         ]
+    if about.training_data.simulated:
+        lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += ["", "Learned from recordings of:", ""]
     lines += [
         f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"

@@ -12,6 +12,7 @@ CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 FORMAT: Final = 3
+SIMULATED = "hearthlog simulated home"  # the collection of what `hearthlog.tools.home` makes up
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
 
 _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
@@ -59,6 +60,12 @@ class TrainingData(_Record):
     collections: list[Collection]
     home: dict[_ClassName, Amount] = {}
     base_sha256: _Text = ""
+
+    @property
+    def simulated(self) -> bool:
+        """Whether all of it was made up: the model has never learned from a real sound."""
+        names = {item.name for item in self.collections}
+        return names == {SIMULATED} and not any(amount.segments for amount in self.home.values())
 
 
 class ClassMetrics(_Record):

@@ -56,6 +56,7 @@ class ModelWatch:
         self.first = _load(path)
         self.ready: Loaded | None = None
         self._last = self.first.model
+        _warn_if_simulated(self._last)
         self._found: SimpleQueue[Loaded | str] = SimpleQueue()
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
@@ -109,14 +110,27 @@ class ModelWatch:
         model = loaded.model
         if (model.name, model.sha256) != (self._last.name, self._last.sha256):
             self._last = model
+            _warn_if_simulated(model)
             self._found.put(loaded)
 
     def _refuse(self, reason: str) -> None:
         text = f"model {self._path.stem} refused: {reason}; going on with {self._last.name}"
         self._found.put(text)
-        with suppress(OSError):  # the log says it too
-            sys.stderr.write(f"hearthlog: {text}\n")
-            sys.stderr.flush()
+        _say(text)
+
+
+def _warn_if_simulated(model: Model) -> None:
+    if model.description.training_data.simulated:
+        _say(
+            f"model {model.name} has learned from simulated sounds alone and is mostly wrong about "
+            "real ones, however sure it is; train one from recordings"
+        )
+
+
+def _say(text: str) -> None:
+    with suppress(OSError):  # the log says it too
+        sys.stderr.write(f"hearthlog: {text}\n")
+        sys.stderr.flush()
 
 
 def _load(path: Path) -> Loaded:

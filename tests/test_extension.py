@@ -3,8 +3,10 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +137,33 @@ def test_a_model_for_other_features_than_the_log_is_refused(installed, day, trai
     done = command(asked, "record", day, "--model", trained, "-o", tmp_path / "other")
     assert done.returncode == 1
     assert "the model is for feature set octaves, not 'auros21'" in done.stderr
+
+
+def test_a_model_for_other_features_does_not_take_over_while_recording(
+    installed, day, trained, model_file, tmp_path
+):
+    link = tmp_path / "champion.safetensors"
+    link.symlink_to(model_file)
+    code = "from hearthlog.tools.cli.main import main; main()"
+    asked = ["record", day, "--realtime", "--model", link, "-o", tmp_path / "logs"]
+    recorder = subprocess.Popen(
+        [sys.executable, "-P", "-c", code, *map(str, asked)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | installed,
+    )
+    while not list(tmp_path.rglob("*.mcap.active")):
+        assert recorder.poll() is None
+        time.sleep(0.05)
+    link.unlink()
+    link.symlink_to(trained)
+    assert recorder.stderr is not None
+    refusal = recorder.stderr.readline()
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(60) == 3
+    assert "octaves refused" in refusal or "champion refused" in refusal
+    assert "it is for feature set octaves, not auros21" in refusal
 
 
 @pytest.mark.parametrize("verb", ["replay", "relabel", "record", "doctor"])

@@ -239,7 +239,7 @@ def _row(entry: "Entry") -> tuple[str, ...]:
         alias,
         f"{about.scenario_name} ({len(about.classes)})",
         f"{about.feature_set} {about.inputs}",
-        f"{about.metrics.macro_f1:.3f}",
+        f"{about.metrics.macro_f1:.3f}{' simulated' * about.training_data.simulated}",
         f"{about.metrics.expected_calibration_error:.3f}",
         entry.model.sha256[:12],
         size,
@@ -261,6 +261,7 @@ def _as_json(entry: "Entry") -> dict[str, object]:
             "classes": about.classes,
             "feature_set": about.feature_set,
             "inputs": about.inputs,
+            "simulated": about.training_data.simulated,
             "macro_f1": about.metrics.macro_f1,
             "expected_calibration_error": about.metrics.expected_calibration_error,
         }

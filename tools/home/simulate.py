@@ -10,6 +10,7 @@ import soundfile
 from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
+from hearthlog.models.description import SIMULATED
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.sounds import (
     LABELS,
@@ -20,7 +21,6 @@ from hearthlog.tools.home.sounds import (
     synthesize,
 )
 
-_SOURCE = "hearthlog simulated home"
 _CLIP_SECONDS = (3.0, 5.0)
 _BLOCK_SAMPLES = 10 * SAMPLE_RATE
 _MAX_MINUTES = 1440.0
@@ -100,7 +100,7 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
                 path = f"{label}/{name}.flac"
                 soundfile.write(folder / path, clip, SAMPLE_RATE, "PCM_16", format="FLAC")
                 seconds = f"{len(clip) / SAMPLE_RATE:.3f}"
-                rows.append((path, label, f"simulated_{name}", _SOURCE, "CC0", seconds))
+                rows.append((path, label, f"simulated_{name}", SIMULATED, "CC0", seconds))
         with manifest.open("x", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(("path", "label", "source_group", "source", "licence", "seconds"))
