@@ -160,6 +160,7 @@ def test_a_model_for_other_features_does_not_take_over_while_recording(
     link.symlink_to(trained)
     assert recorder.stderr is not None
     refusal = recorder.stderr.readline()
+    time.sleep(1.0)  # until the log says it too
     recorder.send_signal(signal.SIGINT)
     assert recorder.wait(60) == 3
     assert "octaves refused" in refusal or "champion refused" in refusal
