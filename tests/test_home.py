@@ -11,7 +11,8 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.recorder.statistics import WINDOW_FRAMES, RollingStatistics
+from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
+from hearthlog.recorder.statistics import RollingStatistics
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.home.simulate import _perform, _plan_day, write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS, SimulationError, synthesize

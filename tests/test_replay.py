@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from threading import Event as Flag
 
@@ -180,18 +181,8 @@ def test_agreement_counts_the_labels_of_the_same_name(folder, model_file, tmp_pa
     for old, new in names.items():
         text = text.replace(f'"{old}"', f'"{new}"')
     renamed = tmp_path / "renamed.safetensors"
-    save_model(
-        type(model)(
-            type(model.description).model_validate_json(text),
-            model.arrays["scaler_mean"],
-            model.arrays["scaler_scale"],
-            model.arrays["support_vectors"],
-            model.arrays["support_counts"],
-            model.arrays["dual_coefficients"],
-            model.arrays["intercepts"],
-        ),
-        renamed,
-    )
+    description = type(model.description).model_validate_json(text)
+    save_model(replace(model, description=description), renamed)
     compared = replay(folder, model=renamed).compared
     recorded = [m.label for m in read(folder, "label")]
     assert compared.labels == len(recorded)
@@ -568,7 +559,7 @@ SOUND = np.ones((30, 21))
         (SOUND * 1e35, {}, "values that no sound has"),
         (SOUND[:, :20], {}, "not of 21 values"),
         (SOUND[:0], {}, "no features to replay"),
-        (SOUND, {"feature_set": "mel64"}, "features of set 'mel64'"),
+        (SOUND, {"feature_set": "mel64"}, "feature set 'mel64' is not installed"),
         (SOUND, {"microphones": ("mic", "hall")}, "several microphones"),
         (SOUND, {"metadata": {"node": "../../etc"}}, "node name"),
         (SOUND, {"configuration": b'{"statistics_every": 0}'}, "configuration.json.statistics_"),

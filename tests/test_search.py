@@ -131,7 +131,7 @@ def test_a_model_learned_with_a_cluster_is_the_same_file(cluster, clips, tmp_pat
         done = hearthlog("train", *words, *more, "-o", tmp_path / f"{name}.safetensors")
         assert done.returncode == 0, done.stderr
     here, there = (load_model(tmp_path / f"{name}.safetensors") for name in ("here", "there"))
-    assert here.description.cost == 2
+    assert here.description.parameters["cost"] == 2
     assert here.description.parameters["gamma"] == pytest.approx(PAPER.gamma / 42)
     assert here.sha256 == there.sha256
 
