@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 # Before numpy is imported: the products here are small, and idle BLAS threads burn a core.
@@ -23,6 +24,7 @@ from hearthlog.tools.cli.export import export
 from hearthlog.tools.cli.info import info
 from hearthlog.tools.cli.merge import merge
 from hearthlog.tools.cli.models import models
+from hearthlog.tools.cli.output import OutputClosedError, checked_output
 from hearthlog.tools.cli.record import record
 from hearthlog.tools.cli.recover import recover
 from hearthlog.tools.cli.relabel import relabel
@@ -79,9 +81,21 @@ _debug = {"on": False}
 
 
 def main() -> None:
-    """Run the command line; an error is one line, and exit status 1."""
+    """Run the command line."""
+    with checked_output():
+        status = _status_of(app)
+        status = _status_of(sys.stdout.flush) or status
+    sys.exit(status)
+
+
+def _status_of(step: Callable[[], object]) -> str | int | None:
+    """Return the exit status of a step; an error is one line, and exit status 1."""
     try:
-        app()
+        step()
+    except SystemExit as end:
+        return end.code
+    except OutputClosedError:
+        return 0  # `| head` has seen enough
     except (HearthlogError, ModuleNotFoundError) as error:
         if _debug["on"]:
             raise
@@ -89,7 +103,8 @@ def main() -> None:
         if isinstance(error, ModuleNotFoundError):
             message = f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
         print(f"hearthlog: {message}", file=sys.stderr)
-        sys.exit(1)
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
