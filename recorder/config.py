@@ -1,5 +1,6 @@
 """What the recorder was asked to do: command line, then environment, then file, then defaults."""
 
+import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.zone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import check_node_name
+from hearthlog.schemas.regular import open_regular
 from hearthlog.schemas.topics import check_microphone_name
 
 
@@ -109,7 +111,9 @@ def load_settings(
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as stream:
+        with os.fdopen(open_regular(path), "rb") as stream:
             return tomllib.load(stream)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
         raise ConfigurationError(f"{path}: cannot be read as TOML ({error})") from error
