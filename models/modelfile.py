@@ -24,6 +24,7 @@ CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
 _FEATURE_COUNTS = {"auros21": 21}
 _KEY = "hearthlog"
+_SHOWN = 200  # characters of an error of others
 _SIZE_LIMIT = 64 << 20  # a hundred times what a home needs
 _HEADER_LIMIT = 4 << 20  # parsed, it takes many times its size
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
@@ -311,7 +312,7 @@ def load_model(path: Path) -> Model:
     try:
         arrays = load(data)
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
-        raise ModelError(f"{path}: is no model file ({_one_line(error)})") from error
+        raise ModelError(f"{path}: is no model file ({str(error)[:_SHOWN]})") from error
     description = _description(path, data)
     if not _DTYPES.keys() <= arrays.keys() <= (_DTYPES | _OPTIONAL).keys():
         raise ModelError(f"{path}: has other arrays than a model of hearthlog")
@@ -359,7 +360,7 @@ def _description(path: Path, data: bytes) -> Description:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
-        raise ModelError(f"{path}: {_one_line(where)}: {_one_line(first['msg'])}") from error
+        raise ModelError(f"{path}: {where[:_SHOWN]}: {first['msg'][:_SHOWN]}") from error
 
 
 def _problem(about: Description) -> str | None:
@@ -441,7 +442,3 @@ def _shapes(about: Description, arrays: dict[str, NDArray[Any]]) -> dict[str, tu
         shapes["training_windows"] = (kept, WINDOW_FRAMES, len(about.feature_names))
         shapes["training_target"] = shapes["training_group"] = (kept,)
     return shapes
-
-
-def _one_line(text: object) -> str:
-    return "".join(c if c.isprintable() else " " for c in str(text))[:200]

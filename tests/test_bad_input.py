@@ -199,6 +199,7 @@ def test_no_microphone(refused, labmic, tmp_path):
         ('[[microphone]]\nname = "Bad Room"', "microphone.0.name: microphone name 'Bad Room'"),
         ("[[microphone]]\nnoise = 1", "unknown key 'microphone.0.noise'"),
         ("flush_seconds = -1", "flush_seconds: Input should be greater"),
+        ("node = " + "[" * 100_000, "cannot be read as TOML"),
     ],
 )
 def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, words):
@@ -227,6 +228,11 @@ def test_info_of_what_is_no_log(refused, tmp_path, content):
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
     assert refused("info", path).startswith(f"{path}: is no MCAP file")
+
+
+@pytest.mark.parametrize("verb", ["info", "doctor", "cat", "record", "report", "watch"])
+def test_a_name_that_no_file_can_have(refused, verb):
+    assert refused(verb, "a" * 5000) == f"{'a' * 5000}: File name too long"
 
 
 def test_info_of_an_empty_folder(refused, tmp_path):

@@ -31,6 +31,7 @@ from hearthlog.tools.cli.relabel import relabel
 from hearthlog.tools.cli.replay import replay
 from hearthlog.tools.cli.report import report
 from hearthlog.tools.cli.review import review
+from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.cli.watch import watch
 
@@ -96,15 +97,20 @@ def _status_of(step: Callable[[], object]) -> str | int | None:
         return end.code
     except OutputClosedError:
         return 0  # `| head` has seen enough
-    except (HearthlogError, ModuleNotFoundError) as error:
+    except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        message = str(error)
-        if isinstance(error, ModuleNotFoundError):
-            message = f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
-        print(f"hearthlog: {message}", file=sys.stderr)
+        tell(_message(error))
         return 1
     return 0
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error.name} is not installed; try: pip install 'hearthlog[analyzer]'"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 if __name__ == "__main__":

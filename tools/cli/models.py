@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.text import printable
+
 if TYPE_CHECKING:
     from hearthlog.analyzer.compare import Comparison
     from hearthlog.analyzer.dataset import Recording
@@ -66,7 +68,7 @@ def show(
         about = {"name": model.name, "sha256": model.sha256}
         print(json.dumps(about | model.description.model_dump(), indent=2))
     else:
-        print(model.card(), end="")
+        print(*map(printable, model.card().splitlines()), sep="\n")
 
 
 @models.command()
