@@ -29,7 +29,7 @@ from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.recorder.stream import Event, Frames
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import ENROLLED, SUFFIX, log_path, new_file
+from hearthlog.schemas.files import ENROLLED, SUFFIX, is_log, log_path, new_file
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logfile import time_span
 from hearthlog.schemas.messages import NANOSECONDS
@@ -248,7 +248,7 @@ def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) 
 def _free_start(home: Path, label: str, seconds: float) -> int:
     """Return the start of the last span of time that ends by now and is not taken."""
     length = int(seconds * NANOSECONDS)
-    logs = (home / ENROLLED).rglob(f"{label}_*{SUFFIX}")
+    logs = filter(is_log, (home / ENROLLED).rglob(f"{label}_*{SUFFIX}"))
     spans = [span for log in logs if (span := time_span(log)) is not None]
     end = time.time_ns()
     for first, last in sorted(spans, reverse=True):

@@ -60,12 +60,12 @@ def text_lines(piece: Piece) -> list[str]:
     texts = [_moments(columns.log_times)]
     texts += [_short_texts(values, piece.fields[path]) for path, values in fields.items()]
     names = [path.removeprefix("header.") for path in fields]
-    topic = printable(columns.topic).replace("%", "%%")
+    topic = quoted(columns.topic).replace("%", "%%")
     line = " ".join(["%s", topic, *(f"{name}=%s" for name in names)])
     return [line % row for row in zip(*texts, strict=True)]
 
 
-def printable(text: str) -> str:
+def quoted(text: str) -> str:
     """Return a text as it is, or in quotes where it has spaces or could upset a terminal."""
     harmless = text.isprintable()
     plain = harmless and text and not set(text) & set(' "')
@@ -112,7 +112,7 @@ def _short_texts(values: NDArray[Any], field: Field) -> list[str]:
     if field.size is None and field.type == DURATION:
         return [f"{value / NANOSECONDS:.3f}s" for value in values.tolist()]
     if field.size is None and field.type == "string":
-        return [_cut(text) for text in _each(printable, values)]
+        return [_cut(text) for text in _each(quoted, values)]
     if values.dtype == object:
         return [_cut(_json(value, field)) for value in values]
     count = values.shape[1] if values.ndim == 2 else 0

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from pydantic_core import from_json
 
 from hearthlog.models.errors import ModelError
+from hearthlog.schemas.text import printable
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
@@ -211,4 +212,4 @@ def first_problem(error: ValidationError) -> str:
 
 def one_line(text: object) -> str:
     """Return a text that can be part of a message, whatever a file put into it."""
-    return "".join(c if c.isprintable() else " " for c in str(text))[:200]
+    return printable(text)[:200]

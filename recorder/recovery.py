@@ -16,10 +16,19 @@ from hearthlog.schemas.chunks import read_chunks
 from hearthlog.schemas.chunkwriter import ChunkWriter
 from hearthlog.schemas.damage import Damage
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, check_new, is_layer, stem, sync_folder
+from hearthlog.schemas.files import (
+    ACTIVE_SUFFIX,
+    SUFFIX,
+    check_new,
+    is_layer,
+    is_log,
+    stem,
+    sync_folder,
+)
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.intact import FoundAttachment, FoundChunk
 from hearthlog.schemas.logfile import LogFile
+from hearthlog.schemas.regular import open_regular
 from hearthlog.schemas.salvage import Definition, Piece, Salvage
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
@@ -283,7 +292,7 @@ class _Copy:
             topic.messages += self._counts.get(number, 0)
         try:
             return rosbag2.file_metadata(name, topics, self._span if self._counts else (0, 0))
-        except (KeyError, ValueError):  # other writers describe their channels in other ways
+        except (KeyError, ValueError, RecursionError):  # other writers describe channels otherwise
             return None
 
 
@@ -347,7 +356,7 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
     layer of sound, which is to be forgotten some day, and which keeps nobody from recording.
     """
     found = []
-    for active in sorted(root.rglob(f"{node}_*{ACTIVE_SUFFIX}")):
+    for active in sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}"))):
         with _abandoned(active) as is_abandoned:
             if is_abandoned:
                 found += _recover_clips(active) if is_layer(active) else _recover(active)
@@ -423,7 +432,7 @@ def _put_in_place(copy: Path, path: Path, recovery: Recovery) -> None:
 def _abandoned(path: Path) -> Iterator[bool]:
     """Hold the file's lock, unless a recorder does."""
     try:
-        stream = path.open("rb")
+        stream = os.fdopen(open_regular(path), "rb")
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror})") from error
     with stream:

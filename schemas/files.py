@@ -12,6 +12,7 @@ from typing import Any
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.ranges import is_local, store_errors
+from hearthlog.schemas.regular import may_be_regular
 
 SUFFIX = ".mcap"
 ACTIVE_SUFFIX = SUFFIX + ".active"
@@ -57,6 +58,12 @@ def is_layer(path: Path) -> bool:
     return _LAYER.search(path.name) is not None
 
 
+def is_log(path: Path) -> bool:
+    """Tell whether this is a log by its name, and a file; in a store there is nothing else."""
+    named = path.name.endswith((SUFFIX, ACTIVE_SUFFIX))
+    return named and (not is_local(path) or may_be_regular(path))
+
+
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     """List the logs in a folder, or the log itself; those still being written come too.
 
@@ -69,7 +76,7 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     Raises
     ------
     LogError
-        If there is none.
+        If there is none, or the path is that of a pipe, a socket or a device.
     """
     logs = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
@@ -84,12 +91,14 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
 
 def _find_local(path: Path) -> list[Path]:
     if path.is_dir():
-        found = [p for p in path.rglob("*") if p.name.endswith((SUFFIX, ACTIVE_SUFFIX))]
+        found = sorted(filter(is_log, path.rglob("*")))
         if not found:
             raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
-        return sorted(found)
+        return found
     if not path.exists():
         raise LogError(f"{path}: no such log")
+    if not may_be_regular(path):
+        raise LogError(f"{path}: cannot be read (Not a regular file)")
     return [path]
 
 

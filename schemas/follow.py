@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.chunks import RawMessages, read_chunks
 from hearthlog.schemas.columns import Columns, decode
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import ACTIVE_SUFFIX, ENROLLED, SUFFIX, stem
+from hearthlog.schemas.files import ACTIVE_SUFFIX, ENROLLED, SUFFIX, is_log, stem
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.series import iterate_messages
 
@@ -221,7 +221,7 @@ class _Folder:
                     if path not in self._listed and entry.name != ENROLLED:
                         self._listed[path] = -1
                         todo.append(path)
-                elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)):
+                elif is_log(path):
                     name = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
                     if name not in self._known:
                         found[name] = path

@@ -285,7 +285,7 @@ class LogFile:
         first += entries
         index_length, text = _CHUNK_INDEX_REST.unpack_from(content, first)
         (size,) = struct.unpack_from("<Q", content, first + _CHUNK_INDEX_REST.size + text + 8)
-        if max(offset + length + index_length, start, end) >= 1 << 63:
+        if max(offset + length + index_length, start, end, size) >= 1 << 63:
             raise McapError("a number is out of range")
         return offset, length, index_length, size, start, end, self._channel_set(ids)
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from hearthlog.schemas.ahead import map_ahead
 from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.regular import open_regular
 
 _BLOCK = 1 << 17  # bytes: a store hands them out in hardly more time than a few
 _KEPT = 4  # blocks
@@ -61,7 +62,7 @@ class LocalFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._descriptor = open_regular(path)
         except OSError as error:
             raise self._unreadable(error) from error
 

@@ -31,6 +31,7 @@ from hearthlog.schemas.intact import (
     messages_of,
 )
 from hearthlog.schemas.records import HEAD, LIMIT, MAGIC, McapError
+from hearthlog.schemas.regular import open_regular
 
 _VAIN = 8
 _HELD = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
@@ -137,7 +138,7 @@ class Salvage:
         self.definitions = Definitions()
         self.unnamed: dict[int, Unnamed] = {}
         try:
-            self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            self._descriptor = open_regular(path)
         except OSError as error:
             raise LogError(f"{path}: cannot be read ({error.strerror})") from error
         self.size = os.fstat(self._descriptor).st_size

@@ -1,10 +1,13 @@
 """Files that people write or pass on: read whole within limits, or refused with one line."""
 
+import os
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.ranges import is_local
+from hearthlog.schemas.regular import open_regular
 
 _TOML_LIMIT = 1 << 20
 _DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
@@ -25,15 +28,20 @@ def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -
         What is raised if there is no such file, or it is larger or cannot be read.
     """
     try:
-        if not path.is_file():
+        if not path.exists():
             raise error(f"{path}: no such {what}")
-        with path.open("rb") as stream:
+        with _opened(path) as stream:
             data = stream.read(limit + 1)
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror})") from reason
     if len(data) > limit:
         raise error(f"{path}: larger than {limit >> 20} MB; this is no {what}")
     return data
+
+
+def _opened(path: Path) -> IO[bytes]:
+    """Open a file, which in a store is a regular one."""
+    return os.fdopen(open_regular(path), "rb") if is_local(path) else path.open("rb")
 
 
 def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:

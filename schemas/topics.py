@@ -59,6 +59,12 @@ def topic(microphone: str, kind: str) -> str:
     return f"/{microphone}/{kind}"
 
 
+def microphone_of(topic: str) -> str:
+    """Return the microphone of a topic; empty if it is of none."""
+    parts = topic.split("/")
+    return parts[1] if len(parts) > 2 else ""
+
+
 def topics_of(
     microphone: str, feature_names: Sequence[str], classes: Sequence[str] | None
 ) -> list[Topic]:

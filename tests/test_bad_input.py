@@ -274,6 +274,11 @@ def test_info_of_what_is_no_log(refused, tmp_path, content):
     assert refused("info", path).startswith(f"{path}: is no MCAP file")
 
 
+@pytest.mark.parametrize("verb", ["info", "doctor", "cat", "record", "report", "watch"])
+def test_a_name_that_no_file_can_have(refused, verb):
+    assert refused(verb, "a" * 5000) == f"{'a' * 5000}: File name too long"
+
+
 def test_info_of_an_empty_folder(refused, tmp_path):
     assert refused("info", tmp_path) == f"{tmp_path}: no log (*.mcap) in this folder"
 

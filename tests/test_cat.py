@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spliced import run, write_log
 
-from hearthlog.analyzer.lines import in_order, json_lines, printable, text_lines
+from hearthlog.analyzer.lines import in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.pieces import pieces
 from hearthlog.schemas.chunkwriter import ChunkWriter
 from hearthlog.schemas.files import find_logs
@@ -239,7 +239,7 @@ def test_text_leaves_the_terminal_alone(foreign):
 
 @given(st.text())
 def test_printable_texts_are_printable_and_one_word_or_quoted(text):
-    shown = printable(text)
+    shown = quoted(text)
     assert shown.isprintable()
     assert shown
     assert shown == text or json.loads(shown) == text

@@ -34,9 +34,7 @@ SOME = [
     Mark("hall", START + 2 * SECOND, START + 3 * SECOND, "coughing", "Bob"),
     Mark("kitchen", START + 2 * SECOND, START + 4 * SECOND, "tap_water", "Ann", 0, "paper-1"),
 ]
-TEXT = st.characters(
-    min_codepoint=32, exclude_categories=["Cs"], exclude_characters="\x7f\ufffe\uffff"
-)
+TEXT = st.characters(exclude_categories=["Cs", "Cc"], exclude_characters="\ufffe\uffff")
 NAMES = st.text(TEXT, max_size=20).map(str.strip)
 
 
@@ -578,6 +576,16 @@ def test_what_xml_cannot_hold_of_a_name_is_replaced(tmp_path):
         tmp_path / "a.eaf", [SOME[0]._replace(reviewer="A\uffffn")], heard_in(tmp_path)
     )
     assert found.reviewer == "A\N{REPLACEMENT CHARACTER}n"
+
+
+@pytest.mark.parametrize("suffix", SAYING)
+def test_what_would_steer_a_terminal_is_replaced(tmp_path, suffix):
+    mark = SOME[0]._replace(reviewer="A\x9b31mn", corrects="\x8flive")
+    (found,) = there_and_back(tmp_path / f"a{suffix}", [mark], heard_in(tmp_path))
+    assert (found.reviewer, found.corrects) == (
+        "A\N{REPLACEMENT CHARACTER}31mn",
+        "\N{REPLACEMENT CHARACTER}live",
+    )
 
 
 def test_a_mark_before_the_first_frame_is_written_as_it_is():

@@ -5,6 +5,7 @@ import zlib
 from threading import Event as Flag
 
 import lz4.frame
+import numpy as np
 import pytest
 import soundfile
 import zstandard
@@ -19,6 +20,7 @@ from rewriting import HEAD, Raw, as_raw, joined, parsed, split
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.messages import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
@@ -199,6 +201,7 @@ CHUNKS = st.one_of(
     ),
 )
 
+DAMAGED_END = b"\0\0\0\1\x89MCAP0\r\n"  # another checksum of the summary
 NAMES = st.sampled_from(["home_20260301T070000Z.mcap", "home_20260301T070000Z.mcap.active"])
 FEW = settings(
     max_examples=40,
@@ -251,6 +254,34 @@ def test_a_file_that_consists_of_anything(log, victim, tail, content, name):
     data = bytearray(data[:8] + content + data[-3000:])
     of_bytes(data, tail)
     assert not victim.read(bytes(data), name)
+
+
+# What such mutations have brought to light, one by one.
+
+
+def test_the_name_of_a_compression_that_is_no_text(log, victim):
+    records = split(log.read_bytes())
+    for raw in records:
+        if raw.opcode == Opcode.CHUNK:
+            content = bytearray(raw.content)
+            content[content.index(b"zstd") + 2] = 0xFF
+            raw.content = bytes(content)
+            break
+    assert not victim.read(joined(records), log.name)
+
+
+@pytest.mark.parametrize("written", [joined, lambda records: joined(records)[:-12] + DAMAGED_END])
+def test_a_size_in_the_index_that_is_too_large_for_a_number(log, victim, tmp_path, written):
+    records = split(log.read_bytes())
+    for raw in records:
+        if raw.opcode == Opcode.CHUNK_INDEX:
+            raw.content = raw.content[:-1] + b"\xff"
+    data = written(records)
+    assert not victim.read(data, log.name)
+    damaged = tmp_path / log.name
+    damaged.write_bytes(data)
+    for topic, columns in read_columns([log]).items():
+        np.testing.assert_array_equal(read_columns([damaged])[topic].log_times, columns.log_times)
 
 
 def _written(records):

@@ -257,4 +257,5 @@ def test_a_worker_with_another_hearthlog_is_refused(cluster, tmp_path, site_of):
 
 
 def _children():
-    return [child for child in psutil.Process().children() if "serve()" in child.cmdline()[-1]]
+    name = "hearthlog.analyzer.workers"
+    return [child for child in psutil.Process().children() if child.cmdline()[-1] == name]

@@ -17,6 +17,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logfile import LogFile, time_span
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.provenance import read_provenance
+from hearthlog.schemas.topics import microphone_of
 
 _FEATURES: dict[str, Sequence[str]] = {messages.FEATURES: ("header.stamp", "frame")}
 _EVENTS: dict[str, Sequence[str]] = {
@@ -96,7 +97,7 @@ def read_contents(path: Path, segment_topic: str) -> Contents:
             ids = reading.channels_of(_FEATURES)
             found.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
         ours = [file.channels[i].topic for i in reading.channels_of(_OTHERS | _FEATURES | _EVENTS)]
-        found.microphones = sorted({topic.split("/")[1][:_LONGEST] for topic in ours})
+        found.microphones = sorted({microphone_of(topic)[:_LONGEST] for topic in ours} - {""})
         if len(reading.channels_of(_FEATURES)) > 1:
             found.first = found.last = None
     return found

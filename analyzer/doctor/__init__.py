@@ -4,12 +4,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.doctor.check import Examined, examine_file
-from hearthlog.analyzer.doctor.findings import Finding, Findings, printable
+from hearthlog.analyzer.doctor.findings import Finding, Findings
 from hearthlog.analyzer.doctor.folder import check_leftovers, check_series
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import find_logs
 
-__all__ = ["Examined", "Finding", "Findings", "examine", "examine_file", "printable"]
+__all__ = ["Examined", "Finding", "Findings", "examine", "examine_file"]
 
 
 def examine(path: Path, progress: Callable[[float], None] = lambda _: None) -> list[Findings]:

@@ -5,13 +5,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.schemas.text import printable
+
 Level = Literal["error", "warning"]
 _SHOWN = 5  # findings of one kind in one file
+_LENGTH = 600  # characters of a finding
 
 RECOVER = "`hearthlog recover` saves what is whole"
 REINDEX = "the messages are not affected; `hearthlog recover` makes a log with a new index"
@@ -51,7 +54,8 @@ class Finding(NamedTuple):
         if self.time is not None:
             parts.append(time_text(self.time))
         parts.append(f"{self.what} [{self.rule}]")
-        return printable(": ".join(parts) + (f"; {self.advice}" if self.advice else ""))
+        line = ": ".join(parts) + (f"; {self.advice}" if self.advice else "")
+        return printable(line[:_LENGTH])
 
 
 @dataclass
@@ -131,11 +135,3 @@ def time_text(stamp: int) -> str:
     except (OverflowError, ValueError, OSError):
         return f"{stamp} ns"
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def printable(text: Any) -> str:
-    """Return a text of a file so that it stays on its line, and leaves the terminal alone."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text)[:_LINE])
-
-
-_LINE = 600  # characters

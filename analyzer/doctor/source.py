@@ -5,6 +5,8 @@ import zlib
 from pathlib import Path
 from typing import Self
 
+from hearthlog.schemas.regular import open_regular
+
 _PIECE = 1 << 20  # bytes
 _READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and has no end
 
@@ -22,7 +24,7 @@ class Source:
     """
 
     def __init__(self, path: Path) -> None:
-        self._stream = path.open("rb", buffering=_PIECE)
+        self._stream = os.fdopen(open_regular(path), "rb", buffering=_PIECE)
         self.size = os.fstat(self._stream.fileno()).st_size
         self.offset = 0
         self.crc: int | None = 0

@@ -17,7 +17,7 @@ from hearthlog.analyzer.selection import Selection, select
 from hearthlog.schemas import messages
 from hearthlog.schemas.columns import Columns, read_columns
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import SUFFIX, find_logs, stem
+from hearthlog.schemas.files import SUFFIX, find_logs, is_log, stem
 
 REVIEW = "review"
 FIELDS = {"header.stamp", "duration", "label"}
@@ -150,8 +150,9 @@ def with_layers(path: Path) -> list[Path]:
     """List a log and the layers beside it."""
     if not path.is_file():
         return [path]
-    beside = (other for other in path.parent.iterdir() if other.name.endswith(SUFFIX))
-    return [path, *sorted(other for other in beside if other.name.startswith(f"{stem(path)}."))]
+    named = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
+    beside = (each for each in named if each.name.endswith(SUFFIX) and is_log(each))
+    return [path, *sorted(beside)]
 
 
 def _segment_topic(selection: Selection, wanted: str | None) -> str:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from hearthlog.analyzer.evaluation.events import Detections
 from hearthlog.analyzer.evaluation.scores import Bin, Interval, Scores
+from hearthlog.schemas.text import printable
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.search import Tried  # which imports scikit-learn
@@ -76,8 +77,7 @@ def search_table(tried: Sequence["Tried"]) -> Iterator[str]:
 
 def shown(name: str) -> str:
     """Return a name as it can be printed, shortened if it is long."""
-    printable = "".join(c if c.isprintable() else " " for c in name)
-    return printable if len(printable) <= _NAME else printable[: _NAME - 1] + "…"
+    return printable(name if len(name) <= _NAME else name[: _NAME - 1] + "…")
 
 
 def _share(value: float | None) -> str:

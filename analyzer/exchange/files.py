@@ -14,6 +14,7 @@ from hearthlog.schemas.files import new_file
 
 _SIZE_LIMIT = 16 << 20  # a hundred thousand labels, or more; what is larger is something else
 _XML_LIMIT = 64 << 20  # as many
+_OBEYED = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # by terminals; names have no others
 
 
 class _Form(NamedTuple):
@@ -118,9 +119,16 @@ def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) 
     if not marks:
         raise DataError("no marks to export: nothing was imported or marked in these logs yet")
     form = _RAVEN if path.name.endswith(raven.SUFFIX) else _FORMS[path.suffix]
-    raw = form.write(path, marks, heard).encode()
+    raw = form.write(path, [_harmless(mark) for mark in marks], heard).encode()
     if len(raw) > form.size_limit:
         limit = form.size_limit >> 20
         raise DataError(f"{path}: would be larger than {limit} MB; export fewer logs")
     with new_file(path) as temporary:
         temporary.write_bytes(raw)
+
+
+def _harmless(mark: Mark) -> Mark:
+    """Leave out of a mark what would steer a terminal."""
+    return mark._replace(
+        reviewer=mark.reviewer.translate(_OBEYED), corrects=mark.corrects.translate(_OBEYED)
+    )

@@ -7,6 +7,7 @@ from hearthlog.analyzer.selection import Selection
 from hearthlog.schemas.columns import iterate_columns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.text import printable
 from hearthlog.schemas.topics import topic as topic_of
 
 _FIELDS = {"header.stamp", "duration", "label"}
@@ -46,7 +47,7 @@ class LabelTrack:
             strict=True,
         )
         lines = [
-            f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(label.split())}\n"
+            f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
             for start, end, label in rows
             if end > 0  # or it was over before, and known only then
         ]

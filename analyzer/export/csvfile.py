@@ -5,6 +5,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
@@ -18,6 +19,8 @@ from hearthlog.schemas.fields import DURATION, Field
 from hearthlog.schemas.messages import NANOSECONDS
 
 _OPTIONS = csv.WriteOptions(quoting_style="needed")
+_CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV has tabs and the ends of lines alone
+_IN_THEIR_PLACE = "\ufffd"
 
 
 class CsvFile:
@@ -25,7 +28,7 @@ class CsvFile:
 
     Arrays are spread into columns, such as `mean.energy` where the channel has names for the
     elements, otherwise `values[0]`; arrays of messages are JSON, and bytes are in base64. Stamps
-    are UTC, durations are in seconds.
+    are UTC, durations are in seconds. Control characters of texts become U+FFFD.
     """
 
     def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
@@ -55,7 +58,7 @@ class CsvFile:
             )
         count = len(piece.columns)
         arrays = [
-            columns[field.name] if field.name in columns else pa.nulls(count, field.type)
+            _harmless(columns[field.name]) if field.name in columns else pa.nulls(count, field.type)
             for field in self._schema
         ]
         self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))
@@ -98,6 +101,13 @@ class CsvFile:
         named = dict(zip(own, elements, strict=True))
         missing = pa.nulls(len(piece.columns), elements[0].type)
         return {f"{path}.{name}": named.get(name, missing) for name in all_names}
+
+
+def _harmless(column: pa.Array) -> pa.Array:
+    """Leave out of texts what would steer a terminal."""
+    if not pa.types.is_string(column.type):
+        return column
+    return pc.replace_substring_regex(column, _CONTROLS, _IN_THEIR_PLACE)
 
 
 def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:

@@ -8,13 +8,15 @@ _LENGTH = 100  # characters of a file name
 
 
 def names_of(metadata: Mapping[str, str], path: str) -> list[str]:
-    """Return the names that a channel has for the elements of an array; none if it has not."""
+    """Return the names that a channel has for the elements of an array; none if one is unfit."""
     try:
         names = json.loads(metadata.get(f"{path}_names", ""))
     except (ValueError, RecursionError):
         return []
-    sound = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    return names if sound and len(set(names)) == len(names) else []
+    fit = isinstance(names, list) and all(
+        isinstance(name, str) and name.isprintable() for name in names
+    )
+    return names if fit and len(set(names)) == len(names) else []
 
 
 def file_stem(topic: str) -> str:

@@ -108,7 +108,7 @@ def read_about(layer: Path) -> About | None:
             _read_run(record["ended"]),
             record["lost"],
         )
-    except (KeyError, ValueError, TypeError, LogError) as error:
+    except (KeyError, ValueError, TypeError, ArithmeticError, RecursionError, LogError) as error:
         why = error if isinstance(error, LogError) else f"{layer}: is no layer of `relabel`"
         raise LogError(f"{why}; move it away, and run again") from error
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import ACTIVE_SUFFIX, SUFFIX, find_logs, is_layer, stem
+from hearthlog.schemas.files import ACTIVE_SUFFIX, find_logs, is_layer, is_log, stem
 from hearthlog.schemas.logfile import time_span
 
 _NAMED = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z.*)")
@@ -76,7 +76,7 @@ def _nodes(root: Path) -> list[list[Path]]:
     """List the logs of each node of a home, in the order of time."""
     nodes: dict[str, list[tuple[str, Path]]] = {}
     for log in (*root.glob("*"), *root.glob(_DAYS)):
-        if log.name.endswith((SUFFIX, ACTIVE_SUFFIX)) and home(log) == root and not is_layer(log):
+        if home(log) == root and is_log(log) and not is_layer(log):
             node, time = _node_and_time(log)
             nodes.setdefault(node, []).append((time, log))
     return [[log for _, log in sorted(logs)] for _, logs in sorted(nodes.items())]

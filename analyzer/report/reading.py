@@ -28,7 +28,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import SUFFIX, stem
 from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import DIAGNOSTICS
+from hearthlog.schemas.topics import DIAGNOSTICS, microphone_of
 
 LIVE = "live"
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
@@ -180,7 +180,7 @@ def _look_closely(heard: Heard, entries: Sequence[Entry], close: tuple[int, int]
         if selection.unfinished:
             _lose(heard, f"unfinished, read up to the last whole chunk: {entry.path}")
         for topic in (*gaps, *_topics_of(selection, messages.STREAM_INFO, ())):
-            microphones.add(topic.split("/")[1])
+            microphones |= {microphone_of(topic)} - {""}
         nodes |= dict.fromkeys(record["node"] for record in selection.metadata if "node" in record)
         for topic in set(gaps) & columns.keys():
             heard.gaps += gaps_of(entry.node, columns[topic])

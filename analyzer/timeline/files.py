@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.hometime import home_zone
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import find_logs, is_layer, stem
+from hearthlog.schemas.files import find_logs, is_layer, is_log, stem
 from hearthlog.schemas.logfile import LogFile, time_span
 from hearthlog.schemas.provenance import read_provenance
 
@@ -67,7 +67,8 @@ def _with_layers(path: Path) -> list[Path]:
     found = find_logs(path)
     if found != [path] or is_layer(path):
         return found
-    return [path, *sorted(path.parent.glob(f"{_escaped(stem(path))}.*.mcap"))]
+    beside = path.parent.glob(f"{_escaped(stem(path))}.*.mcap")
+    return [path, *sorted(filter(is_log, beside))]
 
 
 def _escaped(name: str) -> str:

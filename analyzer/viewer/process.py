@@ -31,8 +31,8 @@ def program() -> Path:
         If it is not there.
     """
     spec = find_spec("rerun_cli")
-    found = Path(spec.origin).with_name("rerun") if spec and spec.origin else Path("rerun")
-    if not found.exists():
+    found = Path(spec.origin).with_name("rerun") if spec and spec.origin else None
+    if found is None or not found.exists():
         raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
     return found
 

@@ -15,16 +15,12 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.calls import attempt, pack_call, read_reply
+from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogWarning
 
 LIVES = 3  # workers that a task may cost
 _TIDY_SECONDS = 3.0  # to remove what is half-written
-_SERVE = [
-    sys.executable,
-    "-P",
-    "-c",
-    "from hearthlog.analyzer.workers.processes import serve; serve()",
-]
+_SERVE = module_command("hearthlog.analyzer.workers")
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 P = ParamSpec("P")

@@ -51,8 +51,10 @@ def audio_seconds(path: Path) -> float:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
-    if not path.is_file():
+    if not path.exists():
         raise SourceError(f"{path}: no such file")
+    if not path.is_file():
+        raise SourceError(f"{path}: cannot be read as audio (Not a regular file)")
     try:
         with soundfile.SoundFile(path) as audio:
             if audio.samplerate not in _RATES:

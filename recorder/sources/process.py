@@ -5,17 +5,17 @@ import json
 import os
 import select
 import subprocess
-import sys
 import time
 
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.sources.capture import BLOCK, Format
 from hearthlog.recorder.sources.devices import Device
 from hearthlog.recorder.sources.framing import Block
 
-_CAPTURE = [sys.executable, "-m", "hearthlog.recorder.sources.capture"]
+_CAPTURE = module_command("hearthlog.recorder.sources.capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: what the recorder may be late by

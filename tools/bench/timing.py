@@ -4,16 +4,16 @@ import itertools
 import os
 import resource
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogError
 
 _TURN_SECONDS = 0.5
-HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
+HEARTHLOG = module_command("hearthlog.tools.cli.main")
 
 
 class BenchError(HearthlogError):

@@ -1,6 +1,5 @@
 """`hearthlog cat`: the messages of logs as text."""
 
-import os
 import sys
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
@@ -42,15 +41,10 @@ def cat(
     if output_format is Format.csv and len(selection.channels) > 1:
         names = ", ".join(sorted(selection.channels))
         wrong_use(f"csv is for one topic: choose one with --topics ({names})")
-    try:
-        if output_format is Format.csv:
-            _print_table(selection)
-        else:
-            _print_lines(selection, output_format)
-        sys.stdout.flush()
-    except BrokenPipeError:  # `| head` has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return
+    if output_format is Format.csv:
+        _print_table(selection)
+    else:
+        _print_lines(selection, output_format)
     report_unfinished(selection)
 
 

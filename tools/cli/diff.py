@@ -11,6 +11,7 @@ import typer
 
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.selection import End, Start, log_location, wrong_use
+from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def _report_losses(sources: "Sources", topics: list[str]) -> None:
         names = ", ".join(map(str, unfinished))
         lines.append(f"unfinished, read up to the last whole chunk: {names}")
     for line in lines:
-        typer.echo(f"hearthlog: {line}", err=True)
+        tell(line)
     if lines:
         raise typer.Exit(3)
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.text import printable
+
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
 
@@ -36,8 +38,6 @@ def doctor(
 
 
 def _print(files: "list[Findings]") -> None:
-    from hearthlog.analyzer.doctor import printable
-
     errors, warnings = _count(files, "error"), _count(files, "warning")
     for findings in files:
         for finding in findings.shown:

@@ -10,6 +10,7 @@ import typer
 from hearthlog.tools.cli.method import chosen_method
 from hearthlog.tools.cli.progress import steps_done
 from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.dataset import Dataset
@@ -296,7 +297,7 @@ def _evaluate_log(
             print(f"\n{found.ambiguous_seconds:.1f} s have two labels in the reference", end="")
             print(": left out of the scores of frames")
     for line in _log_warnings(labelled.unfinished, found.unknown_labels):
-        typer.echo(f"hearthlog: {line}", err=True)
+        tell(line)
     if labelled.unfinished or found.unknown_labels:
         raise typer.Exit(3)
 

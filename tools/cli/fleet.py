@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.selection import wrong_use
-from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
+from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.catalog import Catalog
@@ -32,7 +33,7 @@ def make_catalog(folder: Path, *, as_json: bool) -> None:
     catalog = _written(folder)
     damaged = catalog.of_state(DAMAGED)
     for row in damaged:
-        print(printable(f"hearthlog: {folder / row.path}: {row.error}"), file=sys.stderr)
+        tell(f"{folder / row.path}: {row.error}")
     unfinished = [row.path for row in catalog.of_state(UNFINISHED)]
     found, labels = homes(catalog), heard(catalog)
     if as_json:

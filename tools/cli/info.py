@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.selection import log_location
-from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, printable
+from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.summary import Summary
@@ -53,7 +54,7 @@ def info(
 
     summary = summarise(track(find_logs(path), "reading logs"))
     for error in summary.damaged.values():
-        print(f"hearthlog: {error}", file=sys.stderr)
+        tell(error)
     if not summary.files:
         raise typer.Exit(1)
     if as_json:

@@ -3,7 +3,7 @@
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -27,13 +27,14 @@ from hearthlog.tools.cli.export import export
 from hearthlog.tools.cli.info import info
 from hearthlog.tools.cli.merge import merge
 from hearthlog.tools.cli.models import models
+from hearthlog.tools.cli.output import OutputClosedError, checked_output
 from hearthlog.tools.cli.record import record
 from hearthlog.tools.cli.recover import recover
 from hearthlog.tools.cli.relabel import relabel
 from hearthlog.tools.cli.replay import replay
 from hearthlog.tools.cli.report import report
 from hearthlog.tools.cli.review import review
-from hearthlog.tools.cli.text import printable
+from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.cli.watch import watch
 
@@ -96,44 +97,56 @@ _debug = {"on": False}
 
 
 def main() -> None:
-    """Run the command line; an error is one line, and exit status 1."""
+    """Run the command line; with a warning of ours, what is done is done with exit status 3."""
+    with checked_output(), _warnings_shown() as warned:
+        status = _status_of(app)
+        status = _status_of(sys.stdout.flush) or status
+    sys.exit(status or (3 if warned else 0))
+
+
+def _status_of(step: Callable[[], object]) -> str | int | None:
+    """Return the exit status of a step; an error is one line, and exit status 1."""
     try:
-        with _warnings_shown():
-            app()
-    except (HearthlogError, ModuleNotFoundError) as error:
+        step()
+    except SystemExit as end:
+        return end.code
+    except OutputClosedError:
+        return 0  # `| head` has seen enough
+    except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        message = str(error)
-        if isinstance(error, ModuleNotFoundError):
-            from hearthlog.analyzer.extras import remedy
+        tell(_message(error))
+        return 1
+    return 0
 
-            message = f"{error.name} is not installed; {remedy(error.name or '')}"
-        print(f"hearthlog: {message}", file=sys.stderr)
-        sys.exit(1)
+
+def _message(error: Exception) -> str:
+    if isinstance(error, ModuleNotFoundError):
+        from hearthlog.analyzer.extras import remedy
+
+        return f"{error.name} is not installed; {remedy(error.name or '')}"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 @contextmanager
-def _warnings_shown() -> Iterator[None]:
-    """Print each of our warnings once, in one line; with one, what is done is done with 3."""
-    shown: set[str] = set()
+def _warnings_shown() -> Iterator[set[str]]:
+    """Print each of our warnings once, in one line, and collect them."""
+    warned: set[str] = set()
     others = warnings.showwarning
 
     def show(message: Any, *about: Any, **more: Any) -> None:
         if not isinstance(message, HearthlogWarning):
             others(message, *about, **more)
-        elif str(message) not in shown:
-            shown.add(str(message))
-            print(f"hearthlog: {printable(f'{message.where}: {message}')}", file=sys.stderr)
+        elif str(message) not in warned:
+            warned.add(str(message))
+            tell(f"{message.where}: {message}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", HearthlogWarning)
         warnings.showwarning = show
-        try:
-            yield
-        except SystemExit as end:
-            if shown and not end.code:
-                sys.exit(3)
-            raise
+        yield warned
 
 
 if __name__ == "__main__":

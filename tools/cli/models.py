@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.text import printable
+
 if TYPE_CHECKING:
     from hearthlog.analyzer.compare import Comparison
     from hearthlog.analyzer.dataset import Recording
@@ -68,7 +70,7 @@ def show(
         about = {"name": model.name, "sha256": model.sha256}
         print(json.dumps(about | model.description.model_dump(), indent=2))
     else:
-        print(model_card(model), end="")
+        print(*map(printable, model_card(model).splitlines()), sep="\n")
 
 
 @models.command()

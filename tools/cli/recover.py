@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.tools.cli.text import tell
+
 if TYPE_CHECKING:
     from hearthlog.recorder.recovery import Recovery
 
@@ -43,7 +45,7 @@ def recover(
         except LogError as error:
             if len(logs) == 1:
                 raise
-            typer.echo(f"hearthlog: {error}", err=True)
+            tell(str(error))
             failed = True
             continue
         lost |= not recovery.lossless
@@ -74,9 +76,9 @@ def _say(log: Path, recovery: "Recovery") -> None:
     expected = [topic.expected for topic in recovery.topics.values() if topic.expected is not None]
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
-    typer.echo(f"hearthlog: {log}: {recovery.messages}{of} messages saved{end}", err=True)
+    tell(f"{log}: {recovery.messages}{of} messages saved{end}")
     for damage in recovery.damages:
-        typer.echo(f"hearthlog: {log}: {damage}", err=True)
+        tell(f"{log}: {damage}")
 
 
 def _as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:

@@ -2,13 +2,13 @@
 
 import json
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hearthlog.tools.cli.selection import Logs, log_location
+from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.relabel.run import Relabelled
@@ -64,10 +64,10 @@ def _print(found: "Relabelled", model: str) -> None:
     if found.active:
         print(f"{_number(len(found.active), 'log')} still being written")
     for what, logs in (("not relabelled", found.failed), ("partly relabelled", found.lost)):
-        lines = [f"hearthlog: {what}: {_about(log, why)}" for log, why in sorted(logs.items())]
-        print(*lines[:_SHOWN], sep="\n", end="\n" if lines else "", file=sys.stderr)
-        if len(lines) > _SHOWN:
-            print(f"hearthlog: {what}: {len(lines) - _SHOWN} more; see --json", file=sys.stderr)
+        for log, why in sorted(logs.items())[:_SHOWN]:
+            tell(f"{what}: {_about(log, why)}")
+        if len(logs) > _SHOWN:
+            tell(f"{what}: {len(logs) - _SHOWN} more; see --json")
 
 
 def _about(log: Path, why: str) -> str:

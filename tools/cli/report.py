@@ -8,6 +8,7 @@ import typer
 
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.selection import Logs, wrong_use
+from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.report.shelf import Shelf
@@ -64,7 +65,7 @@ def report(
     print(made.page)
     print(made.picture)
     for line in made.losses:
-        typer.echo(f"hearthlog: {line}", err=True)
+        tell(line)
     if made.losses:
         raise typer.Exit(3)
 

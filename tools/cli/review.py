@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.browser import show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.reviewer import reviewer_name
 from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
@@ -85,7 +87,7 @@ def review(
             chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
             _show(viewer, timeline, logs, chosen)
     for loss in timeline.losses:
-        typer.echo(f"hearthlog: {loss}", err=True)
+        tell(loss)
     if timeline.losses:
         raise typer.Exit(3)
 
@@ -167,7 +169,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     items, marking = _work(timeline, logs, choice, microphone)
 
     def say(text: str) -> None:
-        print(text, flush=True)
+        print(printable(text), flush=True)
         viewer.say(text)
 
     def look_closely(start: int, end: int) -> None:
@@ -198,7 +200,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     grid = timeline.grid
     if not items and grid.end - grid.start <= _ALL_FRAMES:
         look_closely(grid.start, grid.end)
-    print(", ".join(f"{key} {text}" for key, text in session.keys), flush=True)
+    print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
         session.run(keys)
 
@@ -237,7 +239,8 @@ def _microphone(timeline: "Timeline", wanted: str | None) -> str:
     if wanted is not None and wanted not in timeline.microphones:
         wrong_use(f"--microphone {wanted}: there is {known}")
     if wanted is None and len(timeline.microphones) > 1:
-        print(f"marks are of the first microphone of {known}; --microphone chooses another one")
+        line = f"marks are of the first microphone of {known}; --microphone chooses another one"
+        print(printable(line))
     return wanted or next(iter(timeline.microphones))
 
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from hearthlog.tools.cli.text import tell
+
 if TYPE_CHECKING:
     from hearthlog.analyzer.selection import Selection
 
@@ -38,18 +40,15 @@ End = Annotated[str | None, typer.Option(help="Up to this log time, which is not
 
 def wrong_use(message: str) -> NoReturn:
     """End with one line, and the exit status of wrong use."""
-    typer.echo(f"hearthlog: {message}", err=True)
+    tell(message)
     raise typer.Exit(2)
 
 
 def report_unfinished(selection: "Selection") -> None:
     """End with exit status 3 if a log was not completed, and say which."""
     if selection.unfinished:
-        typer.echo(
-            f"hearthlog: unfinished, read up to the last whole chunk: "
-            f"{', '.join(map(str, selection.unfinished))}",
-            err=True,
-        )
+        names = ", ".join(map(str, selection.unfinished))
+        tell(f"unfinished, read up to the last whole chunk: {names}")
         raise typer.Exit(3)
 
 

@@ -1,14 +1,19 @@
 """How numbers, times and lists are printed."""
 
+import sys
 from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hearthlog.schemas.text import printable
 
 PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
 _SHOWN = 10  # of a list
 
 
-def printable(text: str) -> str:
-    """Leave out what would steer the terminal: it may come from a foreign file."""
-    return "".join(c if c.isprintable() else " " for c in text)
+def tell(text: str) -> None:
+    """Write a line that is no result to standard error."""
+    print(f"hearthlog: {printable(text)}", file=sys.stderr)
 
 
 def number(count: int, what: str) -> str:
@@ -18,8 +23,6 @@ def number(count: int, what: str) -> str:
 
 def moment(stamp: int | None) -> str | None:
     """Write a time (ns of UTC) down to the millisecond."""
-    import numpy as np
-
     return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
 
 
