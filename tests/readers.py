@@ -189,7 +189,7 @@ def by_marks(run: Run) -> Any:
 def by_enrolment(run: Run) -> Any:
     span = ["--start", "2026-03-01T06:59:38", "--end", "2026-03-01T06:59:41"]
     made = run("enrol", "coughing", "--home", "home", "--log", "logs", *span)
-    by_topic = read_columns(find_logs(Path("home")))
+    by_topic = read_columns(find_logs(Path("home", "enrolled")))
     return made.stdout, {topic: plain(columns.fields) for topic, columns in by_topic.items()}
 
 

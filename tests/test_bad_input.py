@@ -213,10 +213,18 @@ def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, 
     assert not (tmp_path / "logs").exists()
 
 
-@pytest.mark.parametrize("path", ["/dev/zero", "/dev/tty", "/", "none.toml"])
-def test_a_configuration_that_is_no_regular_file(refused, sound, tmp_path, path):
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [
+        ("/dev/zero", "cannot be read (Not a regular file)"),
+        ("/dev/tty", "cannot be read (Not a regular file)"),
+        ("/", "cannot be read (Is a directory)"),
+        ("none.toml", "no such configuration"),
+    ],
+)
+def test_a_configuration_that_is_no_regular_file(refused, sound, tmp_path, path, reason):
     message = refused("record", sound, "--config", path, "-o", tmp_path / "logs")
-    assert message == f"{path}: no such configuration"
+    assert message == f"{path}: {reason}"
 
 
 def test_a_configuration_may_have_a_line_of_dots_in_a_comment(hearthlog, sound, tmp_path):

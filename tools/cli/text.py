@@ -3,8 +3,6 @@
 import sys
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from hearthlog.schemas.text import printable
 
 PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
