@@ -13,7 +13,8 @@ from rewriting import Log
 from spliced import run
 
 from hearthlog.analyzer.export.names import names_of
-from hearthlog.models.modelfile import Collection, load_model, save_model
+from hearthlog.models.description import Collection
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource

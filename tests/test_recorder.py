@@ -23,6 +23,7 @@ from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages import nanoseconds
+from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.reader import LogReader
 
 START = int(datetime(2026, 3, 1, 7, tzinfo=UTC).timestamp()) * 1_000_000_000
@@ -109,6 +110,7 @@ def test_files_begin_at_the_full_hour_and_each_says_what_it_is(day, model_file, 
         reader = LogReader(log)
         assert next(reader.messages()).topic == "/mic/info"
         assert reader.metadata["hearthlog"]["model_sha256"] == load_model(model_file).sha256
+        assert provenance("home").items() <= reader.metadata["hearthlog"].items()
         assert set(reader.attachments) == {"configuration.json", "model.json", "model_card.md"}
 
 

@@ -5,12 +5,11 @@ from typing import BinaryIO
 from hearthlog.analyzer.pieces import Piece
 from hearthlog.analyzer.selection import Selection
 from hearthlog.schemas.columns import iterate_columns
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.text import printable
 from hearthlog.schemas.topics import topic as topic_of
 
-_FIELDS = {"header.stamp", "duration", "label"}
+FIELDS = {"header.stamp", "duration", "label"}
 
 
 class LabelTrack:
@@ -25,17 +24,8 @@ class LabelTrack:
         self._zero = _first_frame(topic, selection)
 
     def write(self, piece: Piece) -> None:
-        """Append segments.
-
-        Raises
-        ------
-        LogError
-            If the messages are none.
-        """
+        """Append segments; raise LogError if the messages are none."""
         columns = piece.columns
-        missing = _FIELDS - columns.fields.keys()
-        if missing:
-            raise LogError(f"{columns.topic}: {columns.type} has no field {min(missing)}")
         starts = columns["header.stamp"]
         if self._zero is None:
             self._zero = int(starts.min())

@@ -9,6 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
+from hearthlog.analyzer.export import audacity, wav
 from hearthlog.analyzer.export.audacity import LabelTrack
 from hearthlog.analyzer.export.csvfile import CsvFile
 from hearthlog.analyzer.export.names import file_stem, unused
@@ -17,6 +18,7 @@ from hearthlog.analyzer.export.parquet import ParquetFile
 from hearthlog.analyzer.export.rosbag1 import save_rosbag1
 from hearthlog.analyzer.export.rosbag2 import save_rosbag2
 from hearthlog.analyzer.export.wav import WavFiles
+from hearthlog.analyzer.known import is_of_type
 from hearthlog.analyzer.pieces import Piece, pieces
 from hearthlog.analyzer.selection import Progress, Selection
 from hearthlog.schemas import messages
@@ -38,7 +40,10 @@ class Format(StrEnum):
 
 
 ONE_TOPIC = {Format.parquet, Format.csv, Format.npz, Format.txt, Format.wav}
-_TYPES = {Format.txt: messages.SEGMENT, Format.wav: messages.RAW_AUDIO}
+_TYPES = {
+    Format.txt: (messages.SEGMENT, audacity.FIELDS),
+    Format.wav: (messages.RAW_AUDIO, wav.FIELDS),
+}
 
 
 class Sink(Protocol):
@@ -72,10 +77,10 @@ def fitting(selection: Selection, form: Format) -> Selection:
     left = {
         topic
         for topic, same in selection.channels.items()
-        if any(schema is not None and schema.name == wanted for _, schema in same)
+        if any(is_of_type(*described, *wanted) for described in same)
     }
     if selection.logs and not left:
-        raise LogError(f"no topic of type {wanted}; there are {', '.join(selection.channels)}")
+        raise LogError(f"no topic of type {wanted[0]}; there are {', '.join(selection.channels)}")
     return selection.only(left)
 
 

@@ -10,7 +10,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import NANOSECONDS
 
 FORMAT = "pcm-s16"
-_FIELDS = {"timestamp", "data", "format", "sample_rate", "number_of_channels"}
+FIELDS = {"timestamp", "data", "format", "sample_rate", "number_of_channels"}
 _SAMPLE_BYTES = 2
 _HOLE = 5_000_000  # ns: stamps are as good as 1 ms, and what is lost is a frame at least
 _RATE_LIMIT = 1_000_000  # Hz
@@ -82,9 +82,6 @@ class WavFiles:
 
 def _clips(piece: Piece) -> Iterator[_Clip]:
     columns = piece.columns
-    missing = _FIELDS - columns.fields.keys()
-    if missing:
-        raise LogError(f"{columns.topic}: {columns.type} has no field {min(missing)}")
     fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
     for start, data, form, rate, channels in zip(
         columns["timestamp"].tolist(), columns["data"], *fields, strict=True

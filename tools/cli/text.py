@@ -21,6 +21,8 @@ def number(count: int, what: str) -> str:
 
 def moment(stamp: int | None) -> str | None:
     """Write a time (ns of UTC) down to the millisecond."""
+    import numpy as np
+
     return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
 
 
