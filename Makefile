@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench clean
+.PHONY: demo test test-wheel test-lowest test-3.13 check bench dist clean
 
 # Sets up, simulates a home, learns, records, labels, and writes demo/day.rrd to look at.
 demo: $(VENV)/.analyzer
@@ -11,6 +11,31 @@ demo: $(VENV)/.analyzer
 
 test: $(VENV)/.dev
 	$(BIN)/pytest -n 2
+
+# Every verb of the wheel, in an environment of its own: without Rerun, and with it.
+test-wheel: dist
+	$(PYTHON) -m venv --clear build/wheel
+	build/wheel/bin/pip install --quiet "$$(ls build/dist/*.whl)[headless]" \
+		pytest pytest-timeout pytest-xdist
+	build/wheel/bin/pytest -n 2 tests/test_verbs.py
+	build/wheel/bin/pip install --quiet "$$(ls build/dist/*.whl)[analyzer]"
+	build/wheel/bin/pytest -n 2 tests/test_verbs.py
+
+# The fast part of the tests, with the oldest libraries that pyproject.toml allows, and on the
+# newest Python that all of them support.
+test-lowest: dist
+	python=$$(.ci/python 3.11) && $$python -m venv --clear build/lowest
+	build/lowest/bin/pip install --quiet uv
+	build/lowest/bin/uv pip compile --quiet --python build/lowest/bin/python pyproject.toml \
+		--extra analyzer --extra cluster --resolution lowest-direct -o build/lowest/versions.txt
+	build/lowest/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]" \
+		--constraint build/lowest/versions.txt
+	build/lowest/bin/pytest -n 2 -m fast
+
+test-3.13: dist
+	python=$$(.ci/python 3.13) && $$python -m venv --clear build/3.13
+	build/3.13/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]"
+	build/3.13/bin/pytest -n 2 -m fast
 
 check: $(VENV)/.dev build/checked/hearthlog
 	$(BIN)/ruff check
@@ -26,6 +51,11 @@ build/checked/hearthlog: Makefile
 	ln -sfn $(CURDIR)/tools/package/__init__.py $(CURDIR)/tools/package/py.typed $@
 	touch $@
 
+# The sdist, and the wheel that is built from it.
+dist: $(VENV)/.dev
+	rm -rf build/dist
+	$(BIN)/pyproject-build --quiet --outdir build/dist
+
 bench: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.bench
 
@@ -40,4 +70,4 @@ $(VENV)/.dev: pyproject.toml
 	touch $@ $(VENV)/.analyzer
 
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) build demo

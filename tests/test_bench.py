@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench import features, reading, timing, writing
 from hearthlog.tools.bench.labmic import make_microphone

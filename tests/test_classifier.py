@@ -18,6 +18,8 @@ from hearthlog.models.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.svm_rbf import SVM_RBF
 
+pytestmark = pytest.mark.fast
+
 ROWS = 600
 
 

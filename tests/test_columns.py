@@ -32,6 +32,8 @@ from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
+pytestmark = pytest.mark.fast
+
 SECOND = NANOSECONDS
 
 

@@ -15,6 +15,8 @@ import pytest
 from hearthlog.schemas.columns import read_columns
 from hearthlog.schemas.files import find_logs
 
+pytestmark = pytest.mark.fast
+
 EXAMPLE = Path(__file__).parents[1] / "examples" / "extension"
 
 

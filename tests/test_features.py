@@ -12,6 +12,8 @@ from hearthlog.models.features.auros21.extractor import FeatureExtractor, mel_ba
 from hearthlog.models.features.auros21.names import FEATURE_NAMES, MFCC_COUNT
 from hearthlog.schemas.frames import FRAME_SAMPLES
 
+pytestmark = pytest.mark.fast
+
 RATE = 16_000
 NOISE = np.random.default_rng(7).standard_normal((600, FRAME_SAMPLES)).astype(np.float32) * 0.1
 

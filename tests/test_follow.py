@@ -18,6 +18,8 @@ from hearthlog.schemas.follow import follow
 from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
+pytestmark = pytest.mark.fast
+
 TOPIC = "/mic/features"
 
 

@@ -47,6 +47,8 @@ from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.files import find_logs, is_layer
 from hearthlog.schemas.versions import SCHEMA_VERSION
 
+pytestmark = pytest.mark.fast
+
 GOLDEN = sorted((Path(__file__).parent / "golden").iterdir())
 
 

@@ -11,6 +11,8 @@ from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.statistics import RollingStatistics
 
+pytestmark = pytest.mark.fast
+
 KINDS = ["statistics", "bands"]
 
 

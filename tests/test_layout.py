@@ -14,6 +14,8 @@ from hearthlog.schemas.layout import message_type
 from hearthlog.schemas.messages import NANOSECONDS, definition, typestore
 from hearthlog.schemas.rows import decode_rows
 
+pytestmark = pytest.mark.fast
+
 TYPES = [
     "diagnostic_msgs/msg/DiagnosticArray",
     "geometry_msgs/msg/PoseWithCovarianceStamped",

@@ -13,6 +13,8 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
 from hearthlog.schemas.reader import LogReader
 
+pytestmark = pytest.mark.fast
+
 HOUR = 3600 * NANOSECONDS
 START = 490_000 * HOUR
 VALUES = np.random.default_rng(0).random((2000, 21)).astype(np.float32)

@@ -6,6 +6,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.manifest import read_manifest
 from hearthlog.analyzer.scenario import BUILTIN, LABELS, load_scenario
 
+pytestmark = pytest.mark.fast
+
 HEADER = "path,label,source_group,source,licence\n"
 
 

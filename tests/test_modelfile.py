@@ -16,6 +16,8 @@ from hearthlog.models.card import model_card
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model, save_model
 
+pytestmark = pytest.mark.fast
+
 ARRAYS = (
     "scaler_mean",
     "scaler_scale",

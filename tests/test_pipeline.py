@@ -21,6 +21,8 @@ from hearthlog.schemas.messages import (
     nanoseconds,
 )
 
+pytestmark = pytest.mark.fast
+
 START = 1_772_348_370_123_456_789
 LOST = 40
 

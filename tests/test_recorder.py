@@ -26,6 +26,8 @@ from hearthlog.schemas.messages import nanoseconds
 from hearthlog.schemas.provenance import provenance
 from hearthlog.schemas.reader import LogReader
 
+pytestmark = pytest.mark.fast
+
 START = int(datetime(2026, 3, 1, 7, tzinfo=UTC).timestamp()) * 1_000_000_000
 
 

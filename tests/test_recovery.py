@@ -21,6 +21,8 @@ from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import topics_of
 from hearthlog.schemas.writer import LogWriter
 
+pytestmark = pytest.mark.fast
+
 CHUNK = 0x06
 
 

@@ -9,6 +9,8 @@ from hearthlog.schemas import messages
 from hearthlog.schemas.messages import encode, header, message
 from hearthlog.schemas.rows import encode_rows
 
+pytestmark = pytest.mark.fast
+
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
 
 

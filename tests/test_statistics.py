@@ -1,12 +1,15 @@
 """Rolling statistics are those of the window itself, after any number of frames."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
 from hearthlog.recorder.statistics import RollingStatistics
+
+pytestmark = pytest.mark.fast
 
 
 def directly(features):

@@ -37,6 +37,8 @@ from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import DIAGNOSTICS, Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
+pytestmark = pytest.mark.fast
+
 SECOND = NANOSECONDS
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 400}

@@ -11,6 +11,8 @@ from hearthlog.schemas.messages import encode, message, time_message, typestore
 from hearthlog.schemas.topics import Topic, check_microphone_name, topics_of
 from hearthlog.schemas.writer import LogWriter
 
+pytestmark = pytest.mark.fast
+
 # The fields of `ros/src/foxglove_msgs/ros2/RawAudio.msg` in Foxglove's SDK.
 RAW_AUDIO = """
 builtin_interfaces/Time timestamp

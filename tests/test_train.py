@@ -22,6 +22,8 @@ from hearthlog.recorder.errors import SourceError
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.home.simulate import write_training_set
 
+pytestmark = pytest.mark.fast
+
 RATE = 16_000
 TOML = '[classes]\nsilence = ["silence"]\nmusic = ["music"]\nspeech = ["speech"]\n'
 

@@ -21,6 +21,8 @@ from hearthlog.schemas.series import iterate_messages
 from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
+pytestmark = pytest.mark.fast
+
 LABELS = ["speech", "silence", "telephone_bell_ringing", ""]
 TOPICS = [
     Topic("/mic/features", messages.FEATURES, array_names={"values": ["a", "b"]}),

@@ -13,8 +13,8 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.hmm import viterbi
 from hearthlog.analyzer.train import train_model
+from hearthlog.analyzer.viterbi import viterbi
 from hearthlog.models.classifier import Classifier
 from hearthlog.models.model import Model
 from hearthlog.models.modelfile import save_model
