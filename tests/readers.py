@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 from growing import plain
-from rosbags.highlevel import AnyReader
+from rosbags import rosbag1, rosbag2
 from spliced import Result
 
 from hearthlog.analyzer.marks import read_marks
@@ -106,11 +106,11 @@ def by_text_and_sound(run: Run) -> Any:
 def by_bags(run: Run) -> Any:
     run("export", "logs", "-o", "bag", "--format", "rosbag2")
     run("export", "logs", "-o", "day.bag", "--format", "bag")
-    counts = []
-    for bag in ("bag", "day.bag"):
-        with AnyReader([Path(bag)]) as reader:
-            counts.append({topic: about.msgcount for topic, about in reader.topics.items()})
-    return counts
+    with rosbag2.Reader("bag") as bag, rosbag1.Reader("day.bag") as old:
+        return [
+            {topic: about.msgcount for topic, about in reader.topics.items()}
+            for reader in (bag, old)
+        ]
 
 
 def by_doctor(run: Run) -> Any:
