@@ -218,7 +218,7 @@ def _point(folder: Path, alias: str, name: str) -> None:
 def _earlier(folder: Path) -> list[str]:
     """Read the earlier champions, without the one that still is."""
     path = folder / _HISTORY
-    names = path.read_text(errors="replace").splitlines() if path.exists() else []
+    names = path.read_text(errors="replace").splitlines() if path.is_file() else []
     champion = target(folder, CHAMPION)
     while names and names[-1] == champion:
         names.pop()

@@ -91,6 +91,20 @@ def test_a_log_that_was_put_together_again_is_the_same(recorded, log, tmp_path):
     assert found(tmp_path / NAME) == {("warning", GAP)}
 
 
+@pytest.mark.parametrize("time", [0, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+def test_a_time_that_a_chunk_does_not_speak_of_is_an_error_whatever_it_is(log, tmp_path, time):
+    moved = struct.pack("<Q", log.messages(FEATURES)[30].log_time)
+
+    def edit(records):
+        for raw in (raw for raw in records if raw.opcode == Opcode.CHUNK):
+            chunk = parsed(raw, Chunk)
+            content = zstandard.decompress(chunk.data).replace(moved, struct.pack("<Q", time))
+            chunk.data, chunk.uncompressed_crc = zstandard.compress(content), zlib.crc32(content)
+            raw.content = as_raw(chunk).content
+
+    assert {"chunk-times", "log-time"} <= errors(log.write(tmp_path / NAME, edit))
+
+
 # What is wrong with the records of the data section. Everything that refers to them is right.
 
 FEATURES, LABEL, STATISTICS = "/mic/features", "/mic/label", "/mic/statistics"

@@ -284,6 +284,19 @@ def test_a_size_in_the_index_that_is_too_large_for_a_number(log, victim, tmp_pat
         np.testing.assert_array_equal(read_columns([damaged])[topic].log_times, columns.log_times)
 
 
+@pytest.mark.parametrize("length", [(1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+def test_a_message_that_claims_to_be_longer_than_a_number_can_say(log, victim, length):
+    def mutate(content):
+        start = 0
+        while content[start] != Opcode.MESSAGE:
+            start += HEAD.size + HEAD.unpack_from(content, start)[1]
+        struct.pack_into("<Q", content, start + 1, length)
+
+    records = split(log.read_bytes())
+    _in_chunk(records, 1, mutate, "zstd")
+    assert not victim.read(joined(records), log.name)
+
+
 def _written(records):
     """Put records together; the footer keeps its checksum only where it can be made anew."""
     try:

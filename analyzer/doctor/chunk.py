@@ -200,11 +200,11 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
     """
     if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
         heads = heads_at(records, hints)
-        ends = hints + HEAD.size + heads["length"]
-        firsts = np.concatenate([[0], ends])
+        lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
+        firsts = np.concatenate([[0], hints + HEAD.size + lengths])
         lasts = np.concatenate([hints, [len(records)]])
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
-            (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= _FIXED)
+            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= _FIXED)
         ).all():
             others: list[tuple[int, int, int]] = []
             for place in np.flatnonzero(firsts < lasts).tolist():

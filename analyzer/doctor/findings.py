@@ -112,7 +112,8 @@ class Findings:
         advice = DISTRUST if level == "error" else ""
         for row in places[:_SHOWN].tolist():
             time = int(times[row])
-            self._add(Finding(self.path, level, rule, what(row), advice, None, time))
+            with np.errstate(over="ignore"):  # of numbers that are any
+                self._add(Finding(self.path, level, rule, what(row), advice, None, time))
         if len(places) > _SHOWN:
             self.counts[level, rule] += len(places) - _SHOWN
 
