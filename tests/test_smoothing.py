@@ -14,14 +14,13 @@ from hearthlog.analyzer.hmm import (
     FRAME_SECONDS,
     LAG_SECONDS,
     default_transitions,
-    smoothed,
     transitions_from_durations,
     transitions_from_sequences,
-    viterbi,
 )
 from hearthlog.analyzer.replay.player import Wanted
 from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.viterbi import smoothed, viterbi
 from hearthlog.models.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.inputs import InputStream

@@ -13,8 +13,8 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.hmm import viterbi
 from hearthlog.analyzer.train import train_model
+from hearthlog.analyzer.viterbi import viterbi
 from hearthlog.models.inputs import InputStream
 from hearthlog.models.modelfile import Model, save_model
 from hearthlog.schemas.files import find_logs
