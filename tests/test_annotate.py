@@ -35,8 +35,6 @@ from hearthlog.schemas.logfile import LogFile
 from hearthlog.schemas.messages import NANOSECONDS, SEGMENT, duration_message, header, message
 from hearthlog.schemas.reader import LogReader
 
-pytestmark = pytest.mark.fast
-
 SECOND = NANOSECONDS
 NAMES = [*(f"again{suffix}" for suffix in SUFFIXES), "again.selections.txt"]
 LABELS = st.sampled_from(["coughing", "speech", "unknown"])

@@ -14,8 +14,6 @@ from spliced import small_disk
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.reader import LogReader
 
-pytestmark = pytest.mark.fast
-
 
 @pytest.fixture
 def refused(hearthlog):

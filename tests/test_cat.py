@@ -37,8 +37,6 @@ from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 from hearthlog.tools.cli.times import parse_time
 
-pytestmark = pytest.mark.fast
-
 
 @pytest.fixture
 def hearthlog(capfd):

@@ -22,8 +22,6 @@ from hearthlog.models.classes import (
 from hearthlog.models.description import CLASS_NAME
 from hearthlog.models.modelfile import load_model
 
-pytestmark = pytest.mark.fast
-
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"
 AUDIOSET = {

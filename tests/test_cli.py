@@ -15,8 +15,6 @@ from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
-pytestmark = pytest.mark.fast
-
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
 

@@ -10,8 +10,6 @@ from hearthlog.recorder.sources.framing import Block, Framer
 from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
-pytestmark = pytest.mark.fast
-
 RATE = 16_000
 BLOCK = 8_000
 BOOT = 5_000.0  # CLOCK_MONOTONIC when the capture starts

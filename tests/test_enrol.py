@@ -25,8 +25,6 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.messages import NANOSECONDS
 from hearthlog.schemas.topics import topic
 
-pytestmark = pytest.mark.fast
-
 RATE = 16_000
 FEATURES = topic("mic", "features")
 

@@ -24,8 +24,6 @@ from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.messages import NANOSECONDS, header, message, nanoseconds, time_message
 from hearthlog.schemas.reader import LogReader
 
-pytestmark = pytest.mark.fast
-
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000
 

@@ -31,8 +31,6 @@ from hearthlog.schemas.reader import LogMessage, LogReader
 from hearthlog.schemas.rows import decode_rows, encode_rows
 from hearthlog.schemas.versions import APPENDED, SCHEMA_VERSION
 
-pytestmark = pytest.mark.fast
-
 GOLDEN = Path(__file__).parent / "golden"
 OURS = messages._DEFINED_HERE[:-1]  # the last one is of Foxglove
 SEGMENTS = "/hall/segment"

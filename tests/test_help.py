@@ -14,8 +14,6 @@ from hearthlog import __version__
 from hearthlog.recorder.config import Settings
 from hearthlog.tools.cli.main import app
 
-pytestmark = pytest.mark.fast
-
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
 _HEAVY = {"numpy", "rosbags", "mcap", "soundfile", "sounddevice"}

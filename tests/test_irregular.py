@@ -12,8 +12,6 @@ from spliced import record_logs, run
 
 from hearthlog.schemas.follow import follow_messages
 
-pytestmark = pytest.mark.fast
-
 KINDS = ("pipe", "socket", "device", "folder")
 AMONG = [
     "info LOGS",

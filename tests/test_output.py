@@ -8,8 +8,6 @@ import pytest
 from conftest import HEARTHLOG
 from spliced import record_logs
 
-pytestmark = pytest.mark.fast
-
 VERBS = {
     "help": "--help",
     "info": "info LOGS",

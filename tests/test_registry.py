@@ -15,8 +15,6 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import list_models, load, promote, rollback, target
 
-pytestmark = pytest.mark.fast
-
 
 @pytest.fixture
 def folder(tmp_path, model_file):

@@ -20,8 +20,6 @@ from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import Quality, Topic
 from hearthlog.schemas.writer import Attachment, LogWriter, Rows
 
-pytestmark = pytest.mark.fast
-
 INFO = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=1, transient_local=True))
 FEATURES = Topic("/mic/features", messages.FEATURES, array_names={"values": ["a", "b"]})
 

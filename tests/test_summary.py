@@ -37,8 +37,6 @@ from hearthlog.schemas.reader import LogReader
 from hearthlog.schemas.topics import DIAGNOSTICS, Topic
 from hearthlog.schemas.writer import LogWriter, Rows
 
-pytestmark = pytest.mark.fast
-
 SECOND = NANOSECONDS
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 400}
@@ -173,7 +171,7 @@ def test_what_a_file_is_and_what_it_carries_is_named(logs):
     reader = LogReader(logs[0])
     assert summary.metadata == reader.metadata.keys()
     assert summary.attachments == reader.attachments.keys()
-    assert len(summary.attachments) == 2
+    assert len(summary.attachments) == 3
 
 
 def test_an_unfinished_log_counts_as_far_as_it_goes(logs, tmp_path):

@@ -7,8 +7,6 @@ from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.reader import LogReader
 
-pytestmark = pytest.mark.fast
-
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
