@@ -1,5 +1,6 @@
 """Texts in a file of others neither steer a terminal nor end in a traceback."""
 
+import json
 import unicodedata
 from dataclasses import replace
 from functools import partial
@@ -120,7 +121,7 @@ def test_names_that_cannot_be_printed_are_none(name):
     assert names_of({"values_names": f'["energy", {name}]'}, "values") == []
 
 
-@pytest.mark.parametrize("names", ['["\\ud800", "b"]', DEEP, "{}", ""])
+@pytest.mark.parametrize("names", ["\ud800", "\x1b", DEEP, "{}", ""])
 @pytest.mark.parametrize(
     "words",
     [
@@ -135,6 +136,9 @@ def test_names_that_cannot_be_printed_are_none(name):
 def test_a_channel_with_unfit_names_ends_nothing_in_a_traceback(
     hearthlog, log, tmp_path, names, words
 ):
+    if len(names) == 1:  # one of as many as there are
+        others = json.loads(Log(log).named("/mic/label").metadata["probabilities_names"])
+        names = json.dumps([names, *others[1:]])
     path = with_metadata(log, tmp_path, "/mic/label", probabilities_names=names)
     places = {"LOG": path}
     given = [places.get(word, word.replace("OUT", f"{tmp_path}/out")) for word in words.split()]

@@ -36,19 +36,16 @@ def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
     where = f"{path}: {columns.topic}"
     try:
         names: Any = json.loads(columns.metadata.get(f"{field_}_names", ""))
-    except (ValueError, RecursionError):
+        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
+    except (ValueError, TypeError, RecursionError):
         names = None
-    if not isinstance(names, list) or not names or not all(map(_is_name, names)):
+    if not isinstance(names, list) or not names:
         raise LogError(f"{where}: the channel does not name its values")
     if len(names) > _MOST_NAMES or len(set(names)) < len(names):
         raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
     if columns[field_].shape[1:] != (len(names),):
         raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
     return tuple(names)
-
-
-def _is_name(name: object) -> bool:
-    return isinstance(name, str) and name.isprintable()
 
 
 def decibel(energy: Any) -> Any:
