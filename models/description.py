@@ -1,10 +1,10 @@
 """What a model file says of its model besides arrays, checked when it is read."""
 
+import json
 import re
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from pydantic_core import from_json
 
 from hearthlog.models.errors import ModelError
 from hearthlog.schemas.text import printable
@@ -154,13 +154,13 @@ def read_description(text: str) -> Description:
         If it is of a newer format, or says what cannot be.
     """
     try:
-        content = from_json(text)
+        content = json.loads(text)
         if isinstance(content, dict):
             content = _in_this_format(content)
         return Description.model_validate(content)
     except ValidationError as error:
         raise ModelError(first_problem(error)) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ModelError(f"its description is no JSON ({one_line(error)})") from error
 
 

@@ -35,7 +35,7 @@ from hearthlog.analyzer.review.session import Item, Session
 from hearthlog.analyzer.review.sound import sound_of
 from hearthlog.analyzer.timeline.contents import Clip
 from hearthlog.analyzer.timeline.reading import read_timeline
-from hearthlog.recorder.config import Settings
+from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.schemas.files import find_logs, is_layer
@@ -615,7 +615,7 @@ def test_a_file_that_exists_is_left_alone(recorded_home, capfd, tmp_path):
 
 
 def test_a_queue_of_logs_without_labels_is_refused(tmp_path, capfd, day):
-    record(Settings(output=tmp_path / "logs"), FileSource([day], START), Flag())
+    record(Settings(output=tmp_path / "logs"), Microphone(), FileSource([day], START), Flag())
     done = run(capfd, "review", tmp_path / "logs", "--web", "--queue", "novel")
     assert done.returncode == 1
     assert "no labelling 'live'" in done.stderr or "no segments" in done.stderr

@@ -32,7 +32,7 @@ from hearthlog.analyzer.timeline.reading import SHARES, read_timeline
 from hearthlog.analyzer.train import train_model
 from hearthlog.analyzer.viewer.file import save_timeline
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.config import Settings
+from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.replayed import FileSource
 from hearthlog.schemas import messages
@@ -250,7 +250,7 @@ def test_a_log_named_by_itself_comes_with_its_layers_and_no_others(folder):
 
 
 def test_a_log_without_a_model_shows_its_features(tmp_path, day):
-    logs = record(Settings(output=tmp_path), FileSource([day], START), Flag()).logs
+    logs = record(Settings(output=tmp_path), Microphone(), FileSource([day], START), Flag()).logs
     microphone = read_timeline(logs).microphones["mic"]
     assert microphone.labellings == []
     assert np.isfinite(microphone.level).all()

@@ -5,12 +5,9 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import Any
 
 from hearthlog.schemas.errors import HearthlogError
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
 
 
 class OutputClosedError(Exception):
@@ -41,7 +38,7 @@ def checked_output() -> Iterator[None]:
 class _Output(io.FileIO):
     """A file whose errors are ours."""
 
-    def write(self, data: "ReadableBuffer", /) -> int:
+    def write(self, data: Any, /) -> int:
         try:
             return super().write(data)
         except BrokenPipeError as error:
