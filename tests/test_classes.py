@@ -53,6 +53,14 @@ def test_every_label_has_a_colour_of_its_own_a_duration_and_words(label):
     assert CLASS_NAME.fullmatch(label)
 
 
+def test_how_long_a_sound_is_expected_to_go_on_stays_as_models_have_learned_it():
+    seconds = {"coughing": 0.5, "yelling": 2, "laughing": 2, "objects_activity": 2}
+    seconds |= dict.fromkeys(("speech", "phone_ring", "crying", "bathroom_other", "unknown"), 5)
+    seconds |= {"other": 10, "tap_water": 10, "flushing_water": 15}
+    seconds |= {"silence": 60, "music": 60, "shower": 300, "other_negative": 5}
+    assert {row.name: row.seconds for row in CLASSES} == seconds
+
+
 def test_no_name_is_of_two_classes():
     names = [name for row in CLASSES for name in (row.name, *row.aliases)]
     assert sorted(names) == sorted(set(names))
