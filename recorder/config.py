@@ -14,13 +14,13 @@ from pydantic_settings import (
 )
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
-from hearthlog.recorder.clips import Keep
+from hearthlog.recorder.clips.clip_choice import Keep
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.zone import check_time_zone, machine_zone
+from hearthlog.recorder.timezone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import check_node_name
-from hearthlog.schemas.smallfile import read_toml
-from hearthlog.schemas.topics import check_microphone_name
+from hearthlog.schemas.logs.files import check_node_name
+from hearthlog.schemas.messages.topics import check_microphone_name
+from hearthlog.schemas.storage.small_file import read_toml
 
 _PREFIX = "HEARTHLOG_"
 

@@ -10,10 +10,11 @@ from typing import Any
 
 from hearthlog.recorder.pipeline import Record, opening
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import active_path, log_path
-from hearthlog.schemas.messages import NANOSECONDS, header
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import Attachment, LogWriter
+from hearthlog.schemas.logs.files import active_path, log_path
+from hearthlog.schemas.logs.writer import Attachment, LogWriter
+from hearthlog.schemas.messages.message_types import header
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 # What may lie between a sound and its being written: a block of frames, and the capture's delay.
 _DELAY_SECONDS = 0.9

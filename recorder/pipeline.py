@@ -7,27 +7,33 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.model import Model
-from hearthlog.models.segments import Segment, Segmenter
-from hearthlog.recorder import lines
-from hearthlog.recorder.clips import Labelled
+from hearthlog.models.labels.segments import Segment, Segmenter
+from hearthlog.recorder import rosout
+from hearthlog.recorder.clips.clip_choice import Labelled
+from hearthlog.recorder.events import Event, Frames, Gap, Health
 from hearthlog.recorder.statistics import RollingStatistics
-from hearthlog.recorder.stream import Event, Frames, Gap, Health
-from hearthlog.schemas import messages
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.schemas.messages import duration_message, encode, header, message, nanoseconds
-from hearthlog.schemas.rows import Column, encode_rows
-from hearthlog.schemas.topics import DIAGNOSTICS, ROSOUT, topic
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
+from hearthlog.schemas.messages.message_types import (
+    duration_message,
+    encode,
+    header,
+    message,
+    nanoseconds,
+)
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
 _ROW_TYPES = {
-    "features": messages.FEATURES,
-    "statistics": messages.STATISTICS,
-    "label": messages.LABEL,
+    "features": message_types.FEATURES,
+    "statistics": message_types.STATISTICS,
+    "label": message_types.LABEL,
 }
 
 
@@ -42,7 +48,7 @@ class Record(NamedTuple):
 def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
     """Make the `AudioStreamInfo` of a microphone; its stamp is still zero."""
     return message(
-        messages.STREAM_INFO,
+        message_types.STREAM_INFO,
         header=header(0, microphone),
         device=device,
         sample_rate=SAMPLE_RATE,
@@ -61,7 +67,7 @@ def opening(info: Any) -> list[Record]:
     stamp = nanoseconds(info.header.stamp)
     return [
         Record(stamp, topic(info.header.frame_id, "info"), encode(info)),
-        Record(stamp, ROSOUT, lines.of_info(info)),
+        Record(stamp, ROSOUT, rosout.of_info(info)),
     ]
 
 
@@ -184,7 +190,7 @@ class Pipeline:
         """Say something about the model or the clips; the level is one of `diagnostic_msgs`."""
         return [
             self._diagnostics(stamp, level, f"hearthlog: {self.microphone} {what}", text, {}),
-            Record(stamp, ROSOUT, lines.of_report(self.microphone, stamp, level, text)),
+            Record(stamp, ROSOUT, rosout.of_report(self.microphone, stamp, level, text)),
         ]
 
     def _use(self, classifier: Classifier | None) -> None:
@@ -200,7 +206,7 @@ class Pipeline:
         closed = self._close(self._end)
         data = encode(
             message(
-                messages.GAP,
+                message_types.GAP,
                 header=header(gap.start, self.microphone),
                 duration=duration_message(gap.end - gap.start),
                 reason=gap.reason,
@@ -210,7 +216,7 @@ class Pipeline:
         return [
             *closed,
             Record(gap.end, topic(self.microphone, "gap"), data),
-            Record(gap.end, ROSOUT, lines.of_gap(self.microphone, gap)),
+            Record(gap.end, ROSOUT, rosout.of_gap(self.microphone, gap)),
         ]
 
     def _labels(self, inputs: Float32, frames: Int64, stamps: Int64) -> list[Record]:
@@ -259,7 +265,7 @@ class Pipeline:
         label = self._classifier.classes[segment.label]
         data = encode(
             message(
-                messages.SEGMENT,
+                message_types.SEGMENT,
                 header=header(segment.start, self.microphone),
                 duration=duration_message(segment.end - segment.start),
                 label=label,
@@ -268,7 +274,7 @@ class Pipeline:
         )
         return [
             Record(segment.known, topic(self.microphone, "segment"), data),
-            Record(segment.known, ROSOUT, lines.of_segment(self.microphone, segment, label)),
+            Record(segment.known, ROSOUT, rosout.of_segment(self.microphone, segment, label)),
         ]
 
     def _push_health(self, health: Health) -> list[Record]:
@@ -278,7 +284,7 @@ class Pipeline:
         ]
         if health.level != self._level:
             self._level = health.level
-            line = lines.of_health(self.microphone, health)
+            line = rosout.of_health(self.microphone, health)
             records.append(Record(health.stamp, ROSOUT, line))
         return records
 
@@ -297,7 +303,9 @@ class Pipeline:
             ],
         )
         data = encode(
-            message(messages.DIAGNOSTICS, header=header(stamp, self.microphone), status=[status])
+            message(
+                message_types.DIAGNOSTICS, header=header(stamp, self.microphone), status=[status]
+            )
         )
         return Record(stamp, DIAGNOSTICS, data)
 

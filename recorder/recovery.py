@@ -11,25 +11,18 @@ from typing import BinaryIO
 import numpy as np
 from mcap.records import Message
 
-from hearthlog.schemas import messages, rosbag2
-from hearthlog.schemas.chunks import read_chunks
-from hearthlog.schemas.chunkwriter import ChunkWriter
-from hearthlog.schemas.damage import Damage
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import (
-    ACTIVE_SUFFIX,
-    SUFFIX,
-    check_new,
-    is_layer,
-    is_log,
-    stem,
-    sync_folder,
-)
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.intact import FoundAttachment, FoundChunk
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.regular import open_regular
-from hearthlog.schemas.salvage import Definition, Piece, Salvage
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.files import SUFFIX, check_new, is_layer, is_log, stem, sync_folder
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.salvage.damage import Damage
+from hearthlog.schemas.salvage.record_verifier import FoundAttachment, FoundChunk
+from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
+from hearthlog.schemas.storage.regular_file import open_regular
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
 _ENCODING = "cdr"
@@ -412,7 +405,7 @@ def _recover(active: Path) -> list[Recovered]:
     ends = [
         t.end + FRAME_NANOSECONDS
         for t in recovery.topics.values()
-        if t.type == messages.FEATURES and t.messages
+        if t.type == message_types.FEATURES and t.messages
     ]
     more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
     kept = "; the original is kept as *.damaged"

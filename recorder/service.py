@@ -9,25 +9,25 @@ from queue import SimpleQueue
 from threading import Event as Flag
 from typing import Any, Protocol
 
-from hearthlog.models.card import model_attachments
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
-from hearthlog.models.model import Model
+from hearthlog.models.modelfile.card import model_attachments
+from hearthlog.recorder.clips.clip_recorder import ClipKeeper, time_of
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.keeper import ClipKeeper, time_of
+from hearthlog.recorder.events import Event, Frames, Gap
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.modelwatch import ModelWatch
+from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline, Record, stream_info
 from hearthlog.recorder.recovery import Recovered, recover_active
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.microphone import MicrophoneSource
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Event, Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.provenance import provenance
-from hearthlog.schemas.topics import topics_of
-from hearthlog.schemas.writer import Attachment
+from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.writer import Attachment
+from hearthlog.schemas.messages.topics import topics_of
 
 
 class Source(Protocol):

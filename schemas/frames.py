@@ -4,7 +4,7 @@ What is computed from a frame is a feature set's own concern; how long it is, an
 samples, is not, for everything that reads logs counts time in frames.
 """
 
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
 
 SAMPLE_RATE = 16_000  # Hz, one channel
 FRAME_SAMPLES = 800

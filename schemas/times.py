@@ -3,8 +3,7 @@
 import re
 from datetime import UTC, datetime, timedelta
 
-from hearthlog.schemas.messages import NANOSECONDS
-
+NANOSECONDS = 1_000_000_000  # of a second
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.scenario import Scenario
-from hearthlog.models.model import Model
+from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.models.classifiers.model import Model
 
 SOURCES = 6
 

@@ -14,14 +14,14 @@ from realday import write_real_day
 from spliced import record_logs
 from stores import bucket, in_memory, s3_account
 
-from hearthlog.analyzer.dataset import build_dataset
-from hearthlog.analyzer.hmm import LAG_SECONDS, default_transitions
-from hearthlog.analyzer.manifest import read_manifest
-from hearthlog.analyzer.scenario import load_scenario
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.description import Smoothing
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.sources.files import read_audio
+from hearthlog.analyzer.training.dataset import build_dataset
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.transitions import LAG_SECONDS, default_transitions
+from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 

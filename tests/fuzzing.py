@@ -46,7 +46,7 @@ class Victim:
 
 def _serve(pipe, folder: Path) -> None:
     from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
-    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
 
     assert examine
     assert LogReader
@@ -70,27 +70,27 @@ def _try(reader, path: Path, folder: Path) -> str:
 
 
 def message_by_message(path: Path, _folder: Path) -> None:
-    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
 
     for item in LogReader(path).messages():
         item.decode()
 
 
 def as_columns(path: Path, _folder: Path) -> None:
-    from hearthlog.schemas.columns import read_columns  # noqa: PLC0415
+    from hearthlog.schemas.logs.columns import read_columns  # noqa: PLC0415
 
     read_columns([path])
 
 
 def as_columns_between(path: Path, _folder: Path) -> None:
-    from hearthlog.schemas.columns import read_columns  # noqa: PLC0415
+    from hearthlog.schemas.logs.columns import read_columns  # noqa: PLC0415
 
     middle = 1_772_348_410_000_000_000
     read_columns([path], ["/mic/features", "/mic/gap"], middle, middle + 5_000_000_000)
 
 
 def summarised(path: Path, _folder: Path) -> None:
-    from hearthlog.analyzer.summary import summarise  # noqa: PLC0415
+    from hearthlog.analyzer.logs.summary import summarise  # noqa: PLC0415
 
     summarise([path])
 
@@ -107,7 +107,7 @@ def recovered(path: Path, folder: Path) -> None:
     from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
     from hearthlog.recorder.recovery import recover_log  # noqa: PLC0415
     from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
-    from hearthlog.schemas.reader import LogReader  # noqa: PLC0415
+    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
 
     copy = folder / "recovered.mcap"
     recover_log(path, copy, copy.name)

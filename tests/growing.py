@@ -13,14 +13,15 @@ import pytest
 from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
-from hearthlog.analyzer import known
+from hearthlog.analyzer.logs import typed_columns as known
 from hearthlog.analyzer.relabel.layer import digest
-from hearthlog.schemas import fields as schema_fields
-from hearthlog.schemas import layout, messages
-from hearthlog.schemas.files import SUFFIX, is_layer
-from hearthlog.schemas.provenance import METADATA
-from hearthlog.schemas.reader import LogMessage
-from hearthlog.schemas.versions import APPENDED, SCHEMA_VERSION, Appended
+from hearthlog.schemas.logs.files import SUFFIX, is_layer
+from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.logs.reader import LogMessage
+from hearthlog.schemas.messages import cdr_layout as layout
+from hearthlog.schemas.messages import fields as schema_fields
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION, Appended
 
 NEXT = SCHEMA_VERSION + 1
 
@@ -40,13 +41,15 @@ class Growth(NamedTuple):
 
 _SPAN = {"header": {"stamp": 0.0, "frame_id": ""}, "duration": 0.0, "reason": "", "frames_lost": 0}
 GROWN = {
-    messages.FEATURES: Growth("uint8 quality", 255, 255, 3),
-    messages.STATISTICS: Growth("string formula", "of the paper", "of the paper", "in two passes"),
-    messages.LABEL: Growth("float32[] embedding", None, [], np.arange(3, dtype=np.float32)),
-    messages.SEGMENT: Growth("float32 loudness", float("nan"), None, -12.5),
-    messages.MARK: Growth("string[] tags", None, [], ["sure", "from the next room"]),
-    messages.GAP: Growth("builtin_interfaces/Time noticed", None, 0.0, None),
-    messages.STREAM_INFO: Growth(
+    message_types.FEATURES: Growth("uint8 quality", 255, 255, 3),
+    message_types.STATISTICS: Growth(
+        "string formula", "of the paper", "of the paper", "in two passes"
+    ),
+    message_types.LABEL: Growth("float32[] embedding", None, [], np.arange(3, dtype=np.float32)),
+    message_types.SEGMENT: Growth("float32 loudness", float("nan"), None, -12.5),
+    message_types.MARK: Growth("string[] tags", None, [], ["sure", "from the next room"]),
+    message_types.GAP: Growth("builtin_interfaces/Time noticed", None, 0.0, None),
+    message_types.STREAM_INFO: Growth(
         "hearthlog_msgs/AudioGap last_gap", None, {**_SPAN, "noticed": 0.0}, None
     ),
 }
@@ -54,16 +57,16 @@ GROWN = {
 
 def value_of(typename: str) -> Any:
     """Return what a later version writes to the field that it appended."""
-    if typename == messages.GAP:
-        return messages.time_message(1_772_348_390_000_000_001)
-    if typename == messages.STREAM_INFO:
-        return messages.message(
-            messages.GAP,
-            header=messages.header(1_772_348_380_000_000_001, "hall"),
-            duration=messages.duration_message(2_000_000_000),
+    if typename == message_types.GAP:
+        return message_types.time_message(1_772_348_390_000_000_001)
+    if typename == message_types.STREAM_INFO:
+        return message_types.message(
+            message_types.GAP,
+            header=message_types.header(1_772_348_380_000_000_001, "hall"),
+            duration=message_types.duration_message(2_000_000_000),
             reason="overrun",
             frames_lost=40,
-            noticed=value_of(messages.GAP),
+            noticed=value_of(message_types.GAP),
         )
     return GROWN[typename].value
 
@@ -71,13 +74,13 @@ def value_of(typename: str) -> Any:
 @contextmanager
 def grown_definitions(folder: Path) -> Iterator[None]:
     """Let every type of ours have a field more, as in a later version of hearthlog."""
-    shutil.copytree(Path(messages.__file__).with_name("msg"), folder / "msg")
+    shutil.copytree(Path(message_types.__file__).with_name("msg"), folder / "msg")
     for typename, growth in GROWN.items():
         with (folder / "msg" / f"{typename.rpartition('/')[2]}.msg").open("a") as text:
             text.write(f"{growth.line}\n")
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(messages, "files", lambda _: folder)
+            patch.setattr(message_types, "files", lambda _: folder)
             for typename, growth in GROWN.items():
                 appended = {growth.name: Appended(NEXT, growth.default)}
                 patch.setitem(APPENDED, typename, APPENDED.get(typename, {}) | appended)
@@ -90,9 +93,9 @@ def grown_definitions(folder: Path) -> Iterator[None]:
 def _forget() -> None:
     """Let nothing be remembered of other definitions."""
     for remembered in (
-        messages.typestore,
-        messages.definition,
-        messages.type_hash,
+        message_types.typestore,
+        message_types.definition,
+        message_types.type_hash,
         layout.message_type,
         schema_fields.fields_of,
         known._lacking,
@@ -124,10 +127,10 @@ def _write(path: Path, target: Path) -> None:
                 record.data = _with_value(record.data, schema)
     for record in log.records():
         if isinstance(record, Schema) and record.name in GROWN:
-            record.data = messages.definition(record.name).encode()
+            record.data = message_types.definition(record.name).encode()
         elif isinstance(record, Channel):
             name = old[record.schema_id].name
-            record.metadata["topic_type_hash"] = messages.type_hash(name)
+            record.metadata["topic_type_hash"] = message_types.type_hash(name)
         elif isinstance(record, Metadata) and record.name == METADATA:
             record.metadata["schema_version"] = str(NEXT)
             if "input_sha256" in record.metadata:
@@ -140,7 +143,7 @@ def _with_value(data: bytes, schema: Schema) -> bytes:
     """Encode a message of an older definition anew, with a value of what was appended to it."""
     content = LogMessage("", schema.name, 0, data, schema).decode()
     setattr(content, GROWN[schema.name].name, value_of(schema.name))
-    return messages.encode(content)
+    return message_types.encode(content)
 
 
 def plain(value: Any) -> Any:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
-from hearthlog.schemas import messages
-from hearthlog.schemas.content import Attachment, Rows
-from hearthlog.schemas.files import log_path
-from hearthlog.schemas.messages import NANOSECONDS, duration_message, encode, header, message
-from hearthlog.schemas.topics import DIAGNOSTICS, topics_of
-from hearthlog.schemas.writer import LogWriter
+from hearthlog.schemas.logs.files import log_path
+from hearthlog.schemas.logs.log_stream import Attachment, Rows
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, topics_of
+from hearthlog.schemas.times import NANOSECONDS
 
 GENERAL = [
     "silence",
@@ -180,7 +181,7 @@ def _write_hour(  # noqa: PLR0913, PLR0917
         stamp = begin + round(start * NANOSECONDS)
         length = round(seconds * NANOSECONDS)
         gap = message(
-            messages.GAP,
+            message_types.GAP,
             header=header(stamp, microphone),
             duration=duration_message(length),
             reason=reason,
@@ -197,7 +198,7 @@ def _write_hour(  # noqa: PLR0913, PLR0917
             hardware_id=microphone,
             values=[],
         )
-        said = message(messages.DIAGNOSTICS, header=header(stamp, microphone), status=[status])
+        said = message(message_types.DIAGNOSTICS, header=header(stamp, microphone), status=[status])
         written.append((stamp, DIAGNOSTICS, encode(said)))
     for time, topic, data in sorted(written):
         writer.write(topic, time, data)

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.models.description import Smoothing
+from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.model import Model
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:

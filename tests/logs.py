@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import nanoseconds
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages.message_types import nanoseconds
 
 
 def read(path: Path, kind: str) -> list:

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from threading import Event as Flag
 
+from hearthlog.recorder.events import Event, Frames, Gap
 from hearthlog.recorder.service import Source
-from hearthlog.recorder.stream import Event, Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 

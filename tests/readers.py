@@ -18,16 +18,16 @@ from growing import plain
 from rosbags import rosbag1, rosbag2
 from spliced import Result
 
-from hearthlog.analyzer.marks import read_marks
-from hearthlog.analyzer.timeline.live import Live
-from hearthlog.analyzer.timeline.reading import read_timeline
-from hearthlog.models.modelfile import load_model
-from hearthlog.schemas import messages
-from hearthlog.schemas.columns import iterate_columns, read_columns
-from hearthlog.schemas.files import find_logs, is_layer
-from hearthlog.schemas.follow import follow
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.series import iterate_messages
+from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.analyzer.review.timeline.live import Live
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.logs.columns import iterate_columns, read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.follow import follow
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages import message_types
 
 Run = Callable[..., Result]
 _NO_SOUND = ["--topics", "/hall/[!a]*", "--topics", "/[dr]*"]
@@ -71,7 +71,7 @@ def by_follow(_: Run) -> Any:
         for batch in follow(Path(folder), start=0, stop=stop):
             for columns in batch:
                 frames[f"{folder} {columns.topic}"] += len(columns)
-                if columns.type == messages.LABEL:
+                if columns.type == message_types.LABEL:
                     labels += columns["label"].tolist()
             stop.set()
     return frames, labels

@@ -9,16 +9,16 @@ import numpy as np
 import soundfile
 from lossy import LossySource
 
-from hearthlog.analyzer.dataset import build_dataset
-from hearthlog.analyzer.manifest import Clip, read_manifest
-from hearthlog.analyzer.scenario import Scenario
-from hearthlog.analyzer.svm_method import PAPER
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.modelfile import save_model
+from hearthlog.analyzer.training.dataset import build_dataset
+from hearthlog.analyzer.training.manifest import Clip, read_manifest
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.svm_method import PAPER
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 ZONE = "Europe/Vienna"

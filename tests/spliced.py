@@ -15,11 +15,11 @@ from mcap.reader import make_reader
 
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import rosbag2
-from hearthlog.schemas.chunkwriter import ChunkWriter
-from hearthlog.schemas.messages import definition, encode, type_hash
-from hearthlog.schemas.topics import Quality
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.messages.message_types import definition, encode, type_hash
+from hearthlog.schemas.messages.topics import Quality
 from hearthlog.tools.cli.main import main
 
 START = 1_772_348_370_123_456_789

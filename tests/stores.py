@@ -5,7 +5,7 @@ from uuid import uuid4
 
 import pytest
 
-from hearthlog.analyzer.storage import location
+from hearthlog.analyzer.logs.locations import location
 
 
 @pytest.fixture(scope="session")

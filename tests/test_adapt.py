@@ -8,26 +8,26 @@ import pytest
 import soundfile
 from blobs import blobs, ignore_progress
 
-from hearthlog.analyzer.adaptation import CORRECTED, adaptation_curve
-from hearthlog.analyzer.dataset import Recording, cut_recordings
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.folds import KINDS, evaluate_method
-from hearthlog.analyzer.home import home_recordings, home_sequences
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.method import inverse_temperature, prepare, softmax
-from hearthlog.analyzer.scenario import BUILTIN, Scenario
-from hearthlog.analyzer.svm_method import BANDS
-from hearthlog.analyzer.train import adapt_model, train_model
-from hearthlog.models.card import model_card
-from hearthlog.models.classifier import Classifier
+from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation_curve
+from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.training.dataset import Recording, cut_recordings
+from hearthlog.analyzer.training.home_data import home_recordings, home_sequences
+from hearthlog.analyzer.training.method import inverse_temperature, prepare, softmax
+from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
+from hearthlog.analyzer.training.svm_method import BANDS
+from hearthlog.analyzer.training.train import adapt_model, train_model
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.auros21.inputs import bands_of
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.models.svm_rbf import HOME_VOTE, home_votes
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
 
 RATE = 16_000
 

@@ -18,22 +18,15 @@ from hypothesis import strategies as st
 from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.exchange import SUFFIXES
-from hearthlog.analyzer.heard import find_heard
-from hearthlog.analyzer.marks import (
-    LATEST,
-    ROUNDING,
-    Mark,
-    Span,
-    read_marks,
-    review_path,
-    write_marks,
-)
+from hearthlog.analyzer.logs.coverage import ROUNDING, find_heard
+from hearthlog.analyzer.marks.formats import SUFFIXES
+from hearthlog.analyzer.marks.marks import LATEST, Mark, Span, read_marks, review_path, write_marks
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import NANOSECONDS, SEGMENT, duration_message, header, message
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.message_types import SEGMENT, duration_message, header, message
+from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 NAMES = [*(f"again{suffix}" for suffix in SUFFIXES), "again.selections.txt"]
@@ -263,7 +256,7 @@ def test_a_layer_from_before_marks_said_who_made_them_is_read(log, zero):
 def test_of_two_processes_that_mark_at_once_nothing_is_lost(log, zero):
     code = (
         "import sys; from pathlib import Path\n"
-        "from hearthlog.analyzer.marks import Mark, write_marks\n"
+        "from hearthlog.analyzer.marks.marks import Mark, write_marks\n"
         "log, first = Path(sys.argv[1]), int(sys.argv[2])\n"
         "for start in range(first, first + 12 * 10**8, 10**8):\n"
         "    write_marks(log, [Mark('mic', start, start + 10**7, 'cry')])"

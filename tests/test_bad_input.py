@@ -11,8 +11,8 @@ import soundfile
 from logs import features
 from spliced import small_disk
 
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.schemas.reader import LogReader
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.logs.reader import LogReader
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from logs import features, read
 
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.schemas.messages import nanoseconds
+from hearthlog.schemas.messages.message_types import nanoseconds
 
 RATE = 16_000
 FRAME = 50_000_000

@@ -17,13 +17,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spliced import run, write_log
 
-from hearthlog.analyzer.lines import in_order, json_lines, quoted, text_lines
-from hearthlog.analyzer.pieces import pieces
-from hearthlog.schemas.chunkwriter import ChunkWriter
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import (
+from hearthlog.analyzer.export.text import in_order, json_lines, quoted, text_lines
+from hearthlog.analyzer.logs.pieces import pieces
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.messages.message_types import (
     FEATURES,
-    NANOSECONDS,
     decode,
     duration_message,
     header,
@@ -31,10 +33,8 @@ from hearthlog.schemas.messages import (
     nanoseconds,
     time_message,
 )
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.series import iterate_messages
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.times import parse_time
 
 

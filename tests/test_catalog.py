@@ -18,7 +18,8 @@ from mcap.opcode import Opcode
 from spliced import record_logs, run
 from stores import put
 
-from hearthlog.analyzer.catalog import (
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.catalog import (
     DAMAGED,
     FINISHED,
     LOG,
@@ -29,21 +30,21 @@ from hearthlog.analyzer.catalog import (
     read_catalog,
     write_catalog,
 )
-from hearthlog.analyzer.catalog.file import SCHEMA, sealed
-from hearthlog.analyzer.catalog.fleet import heard, homes
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.selection import select
+from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed
+from hearthlog.analyzer.logs.catalog.fleet import heard, homes
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import messages
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import CATALOG, active_path, find_logs
-from hearthlog.schemas.logfile import FOOTER_SIZE, time_span
-from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.mcap.logfile import FOOTER_SIZE, time_span
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 START = 1_772_352_000_000_000_000  # a full hour
@@ -95,7 +96,7 @@ def relabelled(log: Path, segments: list[tuple[int, str]]) -> Path:
         "input_sha256": "cd" * 32,
         "feature_set": "auros21",
     }
-    writer = LogWriter(path, [Topic(topic, messages.SEGMENT)], about)
+    writer = LogWriter(path, [Topic(topic, message_types.SEGMENT)], about)
     writer.write_columns([Rows(topic, start + np.cumsum(lengths), fields)])
     return writer.finish()
 

@@ -9,9 +9,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.colours import colour
-from hearthlog.analyzer.hmm import default_transitions, expected_durations
-from hearthlog.analyzer.report.words import in_words, several_in_words
-from hearthlog.analyzer.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.report.class_words import in_words, several_in_words
+from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.training.transitions import default_transitions, expected_durations
 from hearthlog.models.classes import (
     CLASSES,
     class_name,
@@ -19,8 +19,8 @@ from hearthlog.models.classes import (
     meant_by,
     translation,
 )
-from hearthlog.models.description import CLASS_NAME
-from hearthlog.models.modelfile import load_model
+from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.modelfile.modelfile import load_model
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"

@@ -11,12 +11,12 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
-from hearthlog.analyzer.method import softmax
-from hearthlog.analyzer.svm_method import PAPER, LearnedSvm
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.classifier import Classifier
+from hearthlog.analyzer.training.method import softmax
+from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.svm_rbf import SVM_RBF
 
 pytestmark = pytest.mark.fast
 

@@ -10,10 +10,10 @@ import pytest
 from conftest import HEARTHLOG
 from mcap.writer import Writer as McapWriter
 
-from hearthlog.schemas import messages
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
@@ -78,7 +78,7 @@ def gaps(path, count, reason="overrun"):
         "reason": reason,
         "frames_lost": np.full(count, 5, np.uint64),
     }
-    writer = LogWriter(path, [Topic("/hall/gap", messages.GAP)], {})
+    writer = LogWriter(path, [Topic("/hall/gap", message_types.GAP)], {})
     writer.write_columns([Rows("/hall/gap", times, fields)])
     return writer.finish()
 
@@ -138,7 +138,7 @@ def test_info_of_nothing_but_damaged_logs_fails(hearthlog, tmp_path):
 
 
 def test_info_of_a_log_without_messages(hearthlog, tmp_path):
-    log = LogWriter(tmp_path / "a.mcap", [Topic("/hall/gap", messages.GAP)], {}).finish()
+    log = LogWriter(tmp_path / "a.mcap", [Topic("/hall/gap", message_types.GAP)], {}).finish()
     result = hearthlog("info", log)
     assert result.returncode == 0
     assert "no messages" in result.stdout.splitlines()

@@ -22,27 +22,27 @@ from logs import read
 from lossy import LossySource
 from spliced import raw_messages, small_disk
 
-from hearthlog.analyzer.dataset import build_dataset
-from hearthlog.analyzer.manifest import read_manifest
-from hearthlog.analyzer.scenario import load_scenario
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.description import Description
+from hearthlog.analyzer.training.dataset import build_dataset
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.cliplog import ClipLog
-from hearthlog.recorder.clips import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
+from hearthlog.recorder.clips.clip_layer import ClipLog
+from hearthlog.recorder.clips.clip_retention import Retention
 from hearthlog.recorder.config import Microphone, Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.retention import Retention
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.service import record, record_files
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Frames, Gap
-from hearthlog.schemas.files import audio_path, find_logs, is_layer
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.messages import nanoseconds
-from hearthlog.schemas.provenance import provenance
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer
+from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages.message_types import nanoseconds
 
 SECOND = 1_000_000_000
 HOUR, DAY = 3600 * SECOND, 86_400 * SECOND

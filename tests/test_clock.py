@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.recorder.clock import SampleClock
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.framing import Block, Framer
-from hearthlog.recorder.stream import Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 RATE = 16_000

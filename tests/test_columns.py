@@ -19,18 +19,19 @@ from rosbags.rosbag2 import Writer as BagWriter
 
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.service import record_files
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import messages
-from hearthlog.schemas.chunks import read_chunks
-from hearthlog.schemas.chunkwriter import ChunkWriter, StoredChunk
-from hearthlog.schemas.columns import iterate_columns, read_columns
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import active_path
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import NANOSECONDS, definition, encode, header, message, typestore
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.columns import iterate_columns, read_columns
+from hearthlog.schemas.logs.files import active_path
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter, StoredChunk
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
@@ -64,7 +65,7 @@ def flat(item):
         for name in part.__dataclass_fields__:
             value = getattr(part, name)
             if type(value).__name__.endswith(("msg__Time", "msg__Duration")):
-                found[prefix + name] = messages.nanoseconds(value)
+                found[prefix + name] = message_types.nanoseconds(value)
             elif hasattr(value, "__dataclass_fields__"):
                 add(f"{prefix}{name}.", value)
             elif name != "__msgtype__" and not name.isupper():
@@ -201,7 +202,7 @@ def test_a_log_that_is_being_written_is_read_up_to_its_last_flush(tmp_path):
     names = ["a", "b"]
     writer = LogWriter(
         tmp_path / "home_20260301T070000Z.mcap",
-        [Topic("/mic/features", messages.FEATURES, array_names={"values": names})],
+        [Topic("/mic/features", message_types.FEATURES, array_names={"values": names})],
         {},
     )
     path = writer.active_path
@@ -210,7 +211,7 @@ def test_a_log_that_is_being_written_is_read_up_to_its_last_flush(tmp_path):
         for row in range(5):
             stamp = (block * 5 + row) * SECOND
             frame = message(
-                messages.FEATURES,
+                message_types.FEATURES,
                 header=header(stamp, "mic"),
                 frame=block * 5 + row,
                 values=np.ones(2, np.float32),
@@ -242,7 +243,7 @@ def test_files_that_overlap_and_layers_come_as_one_series_in_the_order_of_time(t
 
 def written(path, topic, times, *, label="speech", width=3):
     """Write labels at these times, whose frame numbers are the times."""
-    writer = LogWriter(path, [Topic(topic, messages.LABEL)], {})
+    writer = LogWriter(path, [Topic(topic, message_types.LABEL)], {})
     writer.write_columns([Rows(topic, times, label_fields(times, label, width))])
     return writer.finish()
 
@@ -356,7 +357,7 @@ def test_a_summary_that_is_damaged_is_done_without(log, tmp_path):
 
 def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
     path = tmp_path / "long.mcap"
-    writer = LogWriter(path, [Topic("/mic/statistics", messages.STATISTICS)], {})
+    writer = LogWriter(path, [Topic("/mic/statistics", message_types.STATISTICS)], {})
     for block in range(20):
         times = np.arange(50_000) + block * 50_000
         fields = {
@@ -370,7 +371,7 @@ def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
     writer.finish()
     code = f"""
 from pathlib import Path
-from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.logs.columns import iterate_columns
 def peak():
     status = open("/proc/self/status").read()
     return int(status.partition("VmHWM:")[2].split()[0])
@@ -389,7 +390,7 @@ print(rows, (peak() - before) // 1024)
 
 @pytest.mark.parametrize("active", [False, True])
 def test_an_empty_log_has_no_columns(tmp_path, active):
-    writer = LogWriter(tmp_path / "home.mcap", [Topic("/mic/gap", messages.GAP)], {})
+    writer = LogWriter(tmp_path / "home.mcap", [Topic("/mic/gap", message_types.GAP)], {})
     if not active:
         assert read_columns([writer.finish()]) == {}
     else:
@@ -398,9 +399,9 @@ def test_an_empty_log_has_no_columns(tmp_path, active):
 
 
 def test_definitions_of_the_file_come_before_those_that_are_known(tmp_path):
-    schema = Schema(1, b"int16 frame\nstring extra", "ros2msg", messages.FEATURES)
+    schema = Schema(1, b"int16 frame\nstring extra", "ros2msg", message_types.FEATURES)
     channel = Channel(1, "/mic/features", "cdr", {}, 1)
-    assert replace(schema).name != definition(messages.FEATURES)
+    assert replace(schema).name != definition(message_types.FEATURES)
     path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)

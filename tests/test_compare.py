@@ -9,19 +9,19 @@ import pytest
 from kept import keep_models
 from spliced import run
 
-from hearthlog.analyzer.compare import compare_models
-from hearthlog.analyzer.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.clips import evaluate_model, scenario_of
-from hearthlog.analyzer.home import home_recordings
-from hearthlog.analyzer.manifest import read_manifest
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.scenario import load_scenario
-from hearthlog.analyzer.train import adapt_model
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.analyzer.evaluation.compare_models import compare_models
+from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model, scenario_of
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
+from hearthlog.analyzer.training.home_data import home_recordings
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.train import adapt_model
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 SECOND = 1_000_000_000

@@ -14,26 +14,25 @@ from sklearn.metrics import cohen_kappa_score, confusion_matrix
 from spliced import record_logs, run
 from stores import put
 
-from hearthlog.analyzer.diff.difference import compare_sides
-from hearthlog.analyzer.diff.doubt import uncertainty
-from hearthlog.analyzer.diff.listing import REASONS, Span, read_list, write_list
-from hearthlog.analyzer.diff.queue import make_queue
-from hearthlog.analyzer.diff.sources import Side, find_sources
-from hearthlog.analyzer.diff.windows import other_labels, windows_of
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.events import Events
-from hearthlog.analyzer.evaluation.reference import Labelling
-from hearthlog.analyzer.export.names import names_of
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
-from hearthlog.schemas import messages
-from hearthlog.schemas.columns import read_columns
+from hearthlog.analyzer.evaluation.difference import compare_sides
+from hearthlog.analyzer.evaluation.event_scores import Events
+from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import Side, find_sources
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.review.queue.ranking import make_queue
+from hearthlog.analyzer.review.queue.review_list import REASONS, Span, read_list, write_list
+from hearthlog.analyzer.review.queue.uncertainty import uncertainty
+from hearthlog.analyzer.review.queue.windows import other_labels, windows_of
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.times import read_time, time_text
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
 
 CLASSES = ("silence", "speech", "coughing")
 MIDNIGHT = read_time("2026-03-02T00:00:00")
@@ -69,7 +68,7 @@ def write_layer(log, other, name, kinds=("label", "segment"), change=lambda _: {
     found = read_columns([other], {f"/mic/{kind}" for kind in kinds})
     columns = {kind: found[f"/mic/{kind}"] for kind in kinds}
     base = f"/mic/relabel/{name}"
-    types = {"label": messages.LABEL, "segment": messages.SEGMENT}
+    types = {"label": message_types.LABEL, "segment": message_types.SEGMENT}
     named = {
         kind: {"probabilities": names_of(own.metadata, "probabilities")} if kind == "label" else {}
         for kind, own in columns.items()
@@ -309,7 +308,7 @@ def doubtful(start, end, own, *, uncertain):
     """Make a model doubt all of one segment, and nothing else; or only find it new."""
 
     def change(columns):
-        if columns.type != messages.LABEL:
+        if columns.type != message_types.LABEL:
             return {}
         stamps = columns["header.stamp"]
         here = (stamps >= start) & (stamps < end)
@@ -368,8 +367,8 @@ def write_home(path, rows, probabilities):
         "confidence": np.full(len(rows), 0.5, np.float32),
     }
     topics = [
-        Topic("/mic/label", messages.LABEL, array_names={"probabilities": CLASSES}),
-        Topic("/mic/segment", messages.SEGMENT),
+        Topic("/mic/label", message_types.LABEL, array_names={"probabilities": CLASSES}),
+        Topic("/mic/segment", message_types.SEGMENT),
     ]
     writer = LogWriter(path, topics, {})
     writer.write_columns([Rows("/mic/label", stamps, frames), Rows("/mic/segment", ends, spans)])

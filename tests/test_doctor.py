@@ -40,16 +40,16 @@ from rosbags.typesys import Stores, get_typestore
 from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Gap
 from hearthlog.recorder.log import RollingLog
 from hearthlog.recorder.pipeline import Pipeline, stream_info
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import describe_log, record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Gap
-from hearthlog.schemas.files import find_logs
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.records import MAGIC
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.mcap.records import MAGIC
+from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 NAME = "home_20260301T070000Z.mcap"

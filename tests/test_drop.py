@@ -11,7 +11,7 @@ from viewers import shown, viewer
 
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.sources.audio_files import FileSource
 
 __all__ = ["viewer"]  # a fixture
 

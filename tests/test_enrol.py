@@ -13,17 +13,17 @@ from conftest import HEARTHLOG
 from spliced import run
 from stores import put
 
-from hearthlog.analyzer.enrol import enrol_file
-from hearthlog.analyzer.heard import find_heard
-from hearthlog.analyzer.home import home_recordings
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.marks.enrol import enrol_file
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.training.home_data import home_recordings
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import topic
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
 
 RATE = 16_000
 FEATURES = topic("mic", "features")

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.events import (
+from hearthlog.analyzer.evaluation.evaluate_log import compare
+from hearthlog.analyzer.evaluation.event_scores import (
     Events,
     common,
     event_based,
@@ -18,18 +19,18 @@ from hearthlog.analyzer.evaluation.events import (
     segment_based,
     total,
 )
-from hearthlog.analyzer.evaluation.reference import Labelling, compare
-from hearthlog.analyzer.evaluation.scores import (
+from hearthlog.analyzer.evaluation.table import class_table, confusion_table
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.training.scores import (
     Bin,
     calibration_error,
     difference,
     reliability,
     score,
 )
-from hearthlog.analyzer.evaluation.table import class_table, confusion_table
-from hearthlog.analyzer.hmm import default_transitions
-from hearthlog.models.description import Smoothing
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.tools.home.simulate import write_training_set
 
 SECOND = 1_000_000_000

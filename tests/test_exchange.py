@@ -15,12 +15,12 @@ from pyannote.database.util import load_rttm
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.exchange import SUFFIXES, new_marks, read_labels, write_labels
-from hearthlog.analyzer.exchange.labels import seconds_text
-from hearthlog.analyzer.heard import Heard, find_heard
-from hearthlog.analyzer.marks import LATEST, ROUNDING, Mark, read_marks
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.analyzer.logs.coverage import ROUNDING, Heard, find_heard
+from hearthlog.analyzer.marks.formats import SUFFIXES, new_marks, read_labels, write_labels
+from hearthlog.analyzer.marks.formats.labels import seconds_text
+from hearthlog.analyzer.marks.marks import LATEST, Mark, read_marks
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 MILLISECOND = SECOND // 1000

@@ -16,13 +16,14 @@ from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from spliced import raw_messages, run, small_disk, write_log
 
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.schemas import messages
-from hearthlog.schemas.chunkwriter import ChunkWriter
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import NANOSECONDS, header, message, nanoseconds, time_message
-from hearthlog.schemas.reader import LogReader
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import header, message, nanoseconds, time_message
+from hearthlog.schemas.times import NANOSECONDS
 
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000
@@ -97,7 +98,7 @@ def bits(value):
 def clip(stamp, data, **fields):
     about = {"format": "pcm-s16", "sample_rate": RATE, "number_of_channels": 1} | fields
     content = np.frombuffer(data.tobytes(), np.uint8)
-    return message(messages.RAW_AUDIO, timestamp=time_message(stamp), data=content, **about)
+    return message(message_types.RAW_AUDIO, timestamp=time_message(stamp), data=content, **about)
 
 
 def clips(samples, start, size=800):
@@ -216,7 +217,7 @@ def test_audacity_labels_are_in_seconds_of_the_sound(recorded, exported):
 def test_audacity_labels_of_a_part_start_with_it_and_have_one_line_each(exported, tmp_path):
     def segment(start, label):
         return message(
-            messages.SEGMENT,
+            message_types.SEGMENT,
             header=header(start * NANOSECONDS, "mic"),
             duration=messages_duration(2),
             label=label,
@@ -227,7 +228,7 @@ def test_audacity_labels_of_a_part_start_with_it_and_have_one_line_each(exported
         return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=0)
 
     frames = [
-        message(messages.FEATURES, header=header(i * NANOSECONDS, "mic"), frame=i,
+        message(message_types.FEATURES, header=header(i * NANOSECONDS, "mic"), frame=i,
                 values=np.zeros(1, np.float32))
         for i in range(10)
     ]  # fmt: skip

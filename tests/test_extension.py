@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "extension"
 

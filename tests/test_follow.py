@@ -11,12 +11,12 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features
 
-from hearthlog.schemas import messages
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.follow import follow
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.follow import follow
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic
 
 pytestmark = pytest.mark.fast
 
@@ -55,7 +55,7 @@ class Followed(Thread):
 
 
 def log(folder, name):
-    return LogWriter(folder / name, [Topic(TOPIC, messages.FEATURES)], {})
+    return LogWriter(folder / name, [Topic(TOPIC, message_types.FEATURES)], {})
 
 
 def write(writer, first, count=20):

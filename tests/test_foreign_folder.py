@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.viewer.process import program
-from hearthlog.schemas.files import find_logs
+from hearthlog.analyzer.review.viewer.process import program
+from hearthlog.schemas.logs.files import find_logs
 
 TRAPS = (
     "hearthlog/__init__.py",
@@ -70,6 +70,6 @@ def test_where_rerun_is_missing_a_file_of_its_name_is_not_taken_for_it(trapped, 
     (trapped / "rerun").write_text("#!/bin/sh\n")
     (trapped / "rerun").chmod(0o755)
     monkeypatch.chdir(trapped)
-    monkeypatch.setattr("hearthlog.analyzer.viewer.process.find_spec", lambda _: None)
+    monkeypatch.setattr("hearthlog.analyzer.review.viewer.process.find_spec", lambda _: None)
     with pytest.raises(DataError, match="is not installed"):
         program()

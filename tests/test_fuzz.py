@@ -19,9 +19,9 @@ from rewriting import HEAD, Raw, as_raw, joined, parsed, split
 
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 NUMBERS = st.one_of(

@@ -37,15 +37,15 @@ from readers import (
 )
 from spliced import run as run_here
 
-from hearthlog.analyzer.marks import read_marks
-from hearthlog.analyzer.selection import select
-from hearthlog.analyzer.timeline.reading import read_timeline
-from hearthlog.models.modelfile import load_model
-from hearthlog.schemas import messages
-from hearthlog.schemas.columns import read_columns
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogWarning
-from hearthlog.schemas.files import find_logs, is_layer
-from hearthlog.schemas.versions import SCHEMA_VERSION
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 
 pytestmark = pytest.mark.fast
 
@@ -366,11 +366,11 @@ def test_logs_of_two_versions_are_one_series_of_the_later(later, tmp_path):
     with grown_definitions(tmp_path):
         columns = read_columns(logs)
         segments, labels = columns["/hall/segment"], columns["/hall/label"]
-        growth = GROWN[messages.SEGMENT]
+        growth = GROWN[message_types.SEGMENT]
         old = len(read_columns([first], ["/hall/segment"])["/hall/segment"])
         assert np.isnan(segments[growth.name][:old]).all()
         assert (segments[growth.name][old:] == growth.value).all()
-        assert {len(row) for row in labels[GROWN[messages.LABEL].name]} == {0, 3}
+        assert {len(row) for row in labels[GROWN[message_types.LABEL].name]} == {0, 3}
         assert columns["/hall/statistics"]["formula"][[0, -1]].tolist() == [
             "of the paper",
             "in two passes",

@@ -16,23 +16,23 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from spliced import run
 
 from hearthlog import __version__
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.selection import select
-from hearthlog.schemas import messages
-from hearthlog.schemas.columns import iterate_columns, join, read_columns
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.fields import difference, fields_of, type_hash_of
-from hearthlog.schemas.files import find_logs, is_layer
-from hearthlog.schemas.layout import message_type
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import definition, encode, header, message
-from hearthlog.schemas.provenance import provenance, read_provenance
-from hearthlog.schemas.reader import LogMessage, LogReader
-from hearthlog.schemas.rows import decode_rows, encode_rows
-from hearthlog.schemas.versions import APPENDED, SCHEMA_VERSION
+from hearthlog.schemas.logs.columns import iterate_columns, join, read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.provenance import provenance, read_provenance
+from hearthlog.schemas.logs.reader import LogMessage, LogReader
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import decode_rows, encode_rows
+from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.messages.fields import difference, fields_of, type_hash_of
+from hearthlog.schemas.messages.message_types import definition, encode, header, message
+from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION
 
 GOLDEN = Path(__file__).parent / "golden"
-OURS = messages._DEFINED_HERE[:-1]  # the last one is of Foxglove
+OURS = message_types._DEFINED_HERE[:-1]  # the last one is of Foxglove
 SEGMENTS = "/hall/segment"
 START = 1_772_348_370_123_456_789
 
@@ -47,9 +47,9 @@ def golden(tmp_path, monkeypatch) -> Path:
 
 def segment(**more):
     return message(
-        messages.SEGMENT,
+        message_types.SEGMENT,
         header=header(START, "hall"),
-        duration=messages.duration_message(1_500_000_000),
+        duration=message_types.duration_message(1_500_000_000),
         label="coughing",
         confidence=0.5,
         **more,
@@ -104,7 +104,7 @@ KINDS = {
     "uint16[]": (st.lists(st.integers(0, 65535), max_size=5), lambda v: np.array(v, np.uint16)),
     "float64[3]": (st.lists(st.floats(width=64), min_size=3, max_size=3), np.array),
     "string[]": (st.lists(st.text("abc", max_size=3), max_size=3), list),
-    "builtin_interfaces/Time": (st.integers(0, 1 << 60), messages.time_message),
+    "builtin_interfaces/Time": (st.integers(0, 1 << 60), message_types.time_message),
     "hearthlog_msgs/AudioSegment": (st.just(0), lambda _: segment()),
     "hearthlog_msgs/AudioSegment[]": (st.integers(0, 2), lambda n: [segment()] * n),
 }
@@ -114,37 +114,39 @@ KINDS = {
 @given(st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=5), st.data())
 def test_whatever_is_appended_what_was_there_reads_the_same(kinds, data):
     values = {f"new{i}": KINDS[k][1](data.draw(KINDS[k][0])) for i, k in enumerate(kinds)}
-    own, *nested = definition(messages.GAP).split("=" * 80 + "\n")
+    own, *nested = definition(message_types.GAP).split("=" * 80 + "\n")
     lines = "".join(f"{kind} new{i}\n" for i, kind in enumerate(kinds))
-    nested += definition(messages.SEGMENT).split("=" * 80 + "\n")[1:]
-    nested.append("MSG: hearthlog_msgs/AudioSegment\n" + definition(messages.SEGMENT).split("=")[0])
+    nested += definition(message_types.SEGMENT).split("=" * 80 + "\n")[1:]
+    nested.append(
+        "MSG: hearthlog_msgs/AudioSegment\n" + definition(message_types.SEGMENT).split("=")[0]
+    )
     text = ("=" * 80 + "\n").join([own + lines, *dict.fromkeys(nested)])
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(text, messages.GAP))
+    store.register(get_types_from_msg(text, message_types.GAP))
     gap = {
         "header": header(START, "hall"),
-        "duration": messages.duration_message(2_000_000_000),
+        "duration": message_types.duration_message(2_000_000_000),
         "reason": "overrun",
         "frames_lost": 40,
     }
     newer = store.serialize_cdr(
-        store.types[messages.GAP](**gap, **values), messages.GAP, little_endian=True
+        store.types[message_types.GAP](**gap, **values), message_types.GAP, little_endian=True
     )
-    kind = message_type(messages.GAP, "ros2msg", text.encode())
-    expected = decoded(message_type(messages.GAP), encode(message(messages.GAP, **gap)))
+    kind = message_type(message_types.GAP, "ros2msg", text.encode())
+    expected = decoded(message_type(message_types.GAP), encode(message(message_types.GAP, **gap)))
     read = decoded(kind, bytes(newer))
     assert read.keys() == expected.keys() == fields_of(kind).keys()
     assert all(np.array_equal(read[path], expected[path]) for path in expected)
     assert difference(kind, SCHEMA_VERSION) == ""
-    assert type_hash_of(kind) == store.hash_rihs01(messages.GAP)
+    assert type_hash_of(kind) == store.hash_rihs01(message_types.GAP)
 
 
 def test_what_older_messages_lack_is_a_full_column_of_the_type_it_has(tmp_path):
     older = {name: definition(name).encode() for name in OURS}
     payload = encode(segment())
     with grown_definitions(tmp_path):
-        kind = message_type(messages.SEGMENT, "ros2msg", older[messages.SEGMENT])
-        own = decoded(message_type(messages.SEGMENT), encode(segment()), encode(segment()))
+        kind = message_type(message_types.SEGMENT, "ros2msg", older[message_types.SEGMENT])
+        own = decoded(message_type(message_types.SEGMENT), encode(segment()), encode(segment()))
         read = decoded(kind, payload, payload)
         assert list(read) == list(own) == list(fields_of(kind))
         assert {p: v.dtype for p, v in read.items()} == {p: v.dtype for p, v in own.items()}
@@ -159,8 +161,8 @@ def test_what_older_messages_lack_is_a_full_column_of_the_type_it_has(tmp_path):
 def test_a_message_of_ours_within_another_grows_with_it(tmp_path):
     """As a type would that has segments, some day."""
     lines = "std_msgs/Header header\nhearthlog_msgs/AudioSegment best\n"
-    name, lines = messages.GAP, lines + "hearthlog_msgs/AudioSegment[] others\n"
-    nested = definition(messages.SEGMENT).partition("=" * 80 + "\n")
+    name, lines = message_types.GAP, lines + "hearthlog_msgs/AudioSegment[] others\n"
+    nested = definition(message_types.SEGMENT).partition("=" * 80 + "\n")
     text = lines + nested[1] + "MSG: hearthlog_msgs/AudioSegment\n" + "".join(nested)
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, name))
@@ -179,14 +181,14 @@ def test_a_message_of_ours_within_another_grows_with_it(tmp_path):
 
 def test_what_writes_need_not_know_what_was_appended(tmp_path):
     with grown_definitions(tmp_path):
-        for name in (messages.SEGMENT, messages.MARK):
+        for name in (message_types.SEGMENT, message_types.MARK):
             columns = {
                 "header.stamp": np.array([START, START + 5]),
                 "header.frame_id": "hall",
                 "duration": np.array([7, 8]),
                 "label": ["coughing", "speech"],
             }
-            if name == messages.SEGMENT:
+            if name == message_types.SEGMENT:
                 columns["confidence"] = np.array([0.5, 1.0], np.float32)
             else:
                 columns |= {"reviewer": "", "made": np.array([0, 0]), "corrects": ""}
@@ -194,7 +196,7 @@ def test_what_writes_need_not_know_what_was_appended(tmp_path):
             assert read["label"].tolist() == ["coughing", "speech"]
             default = read[GROWN[name].name]
             assert len(default) == 2
-            assert default.shape[1:] == ((0,) if name == messages.MARK else ())
+            assert default.shape[1:] == ((0,) if name == message_types.MARK else ())
         one = encode(segment())
         other = encode(segment(loudness=float("nan")))
         assert one == other != encode(segment(loudness=1.0))
@@ -205,17 +207,19 @@ def test_one_message_of_another_version_is_decoded_as_ours(tmp_path, golden):
     with grown_definitions(tmp_path):
         first = plain[0].decode()
         assert np.isnan(first.loudness)
-        newer, text = encode(segment(loudness=-3.0)), definition(messages.SEGMENT).encode()
-    schema = type(plain[0].schema)(1, text, "ros2msg", messages.SEGMENT)
-    schema.name, schema.encoding, schema.data = messages.SEGMENT, "ros2msg", text
-    message = LogMessage(SEGMENTS, messages.SEGMENT, START, newer, schema).decode()
+        newer, text = encode(segment(loudness=-3.0)), definition(message_types.SEGMENT).encode()
+    schema = type(plain[0].schema)(1, text, "ros2msg", message_types.SEGMENT)
+    schema.name, schema.encoding, schema.data = message_types.SEGMENT, "ros2msg", text
+    message = LogMessage(SEGMENTS, message_types.SEGMENT, START, newer, schema).decode()
     assert message == segment()
     assert plain[0].decode().label == first.label
 
 
 def test_a_field_that_is_not_there_is_named(golden):
     segments = read_columns([golden], [SEGMENTS])[SEGMENTS]
-    with pytest.raises(LogError, match=f"{SEGMENTS}: {messages.SEGMENT} has no field 'loudness'"):
+    with pytest.raises(
+        LogError, match=f"{SEGMENTS}: {message_types.SEGMENT} has no field 'loudness'"
+    ):
         segments["loudness"]
 
 
@@ -271,7 +275,7 @@ def test_the_doctor_names_what_no_version_has_changed(golden, capfd, case):
     found = json.loads(run(capfd, "doctor", golden, "--json").stdout)["findings"]
     (only,) = [each["what"] for each in found if each["rule"] == "type"]
     assert only.startswith(
-        f"{SEGMENTS}: {messages.SEGMENT} is defined otherwise than by hearthlog: "
+        f"{SEGMENTS}: {message_types.SEGMENT} is defined otherwise than by hearthlog: "
     )
     assert what in only
 
@@ -292,7 +296,7 @@ def test_the_doctor_accepts_a_definition_that_grew_and_its_own_type_hash_only(go
     log.write(golden)
     found = json.loads(run(capfd, "doctor", golden, "--json").stdout)["findings"]
     (only,) = [each["what"] for each in found if each["rule"] == "type"]
-    assert only == f"{SEGMENTS}: topic_type_hash is not that of {messages.SEGMENT}"
+    assert only == f"{SEGMENTS}: topic_type_hash is not that of {message_types.SEGMENT}"
     for record in log.records():
         if isinstance(record, Channel) and record.topic == SEGMENTS:
             record.metadata["topic_type_hash"] = type_hash_of(kind)
@@ -338,12 +342,12 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
     log.metadata("hearthlog").metadata["schema_version"] = str(NEXT)
     log.write(golden)
     with grown_definitions(tmp_path), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hearthlog.schemas.provenance._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
+        patch.setattr("hearthlog.schemas.logs.provenance._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
         said = json.loads(run(capfd, "doctor", golden, "--json").stdout)
     wrong = [each["what"] for each in said["findings"] if each["level"] == "error"]
-    assert said["errors"] == len({*OURS} - {messages.MARK})
+    assert said["errors"] == len({*OURS} - {message_types.MARK})
     assert any(
-        what.endswith(f"{messages.STATISTICS} has no field string formula") for what in wrong
+        what.endswith(f"{message_types.STATISTICS} has no field string formula") for what in wrong
     )
 
 
@@ -367,7 +371,7 @@ def test_segments_that_cannot_be_read_are_named(capfd, arguments, rest):
             schema.data = schema.data.replace(b"string label", b"string word")
             log.write(path)
     done = run(capfd, *arguments)
-    line = f"hearthlog: {SEGMENTS}: {messages.SEGMENT} is defined without label"
+    line = f"hearthlog: {SEGMENTS}: {message_types.SEGMENT} is defined without label"
     assert done.stderr.count(line) == 1
     assert rest in done.stdout + done.stderr
     assert done.returncode in {1, 3}

@@ -13,17 +13,17 @@ from mcap.records import Metadata
 from rewriting import Log
 from spliced import run
 
-from hearthlog.analyzer.export.names import names_of
-from hearthlog.models.description import Collection
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.models.classifiers.description import Collection
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import messages
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS
 STEERING = "\x1b]0;evil\x07\x9b31m\x00\r\n"
@@ -184,7 +184,7 @@ def gap_on(topic, path):
         "reason": "overrun",
         "frames_lost": np.full(3, 5, np.uint64),
     }
-    writer = LogWriter(path, [Topic(topic, messages.GAP)], {})
+    writer = LogWriter(path, [Topic(topic, message_types.GAP)], {})
     writer.write_columns([Rows(topic, times, fields)])
     return writer.finish()
 

@@ -20,11 +20,11 @@ from rosbags.interfaces import QosDurability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hearthlog.models.card import model_card
-from hearthlog.models.modelfile import load_model
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.reader import LogReader
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_370_123_456_789
 LOST = {5: 7, 9: 40}

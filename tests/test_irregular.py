@@ -10,7 +10,7 @@ from threading import Event
 import pytest
 from spliced import record_logs, run
 
-from hearthlog.schemas.follow import follow_messages
+from hearthlog.schemas.logs.follow import follow_messages
 
 KINDS = ("pipe", "socket", "device", "folder")
 AMONG = [

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 
-from hearthlog.schemas import messages
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.layout import message_type
-from hearthlog.schemas.messages import NANOSECONDS, definition, typestore
-from hearthlog.schemas.rows import decode_rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import decode_rows
+from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.messages.message_types import definition, typestore
+from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
@@ -31,8 +32,8 @@ TYPES = [
     "std_msgs/msg/String",
     "tf2_msgs/msg/TFMessage",
     "trajectory_msgs/msg/MultiDOFJointTrajectory",
-    messages.LABEL,
-    messages.STREAM_INFO,
+    message_types.LABEL,
+    message_types.STREAM_INFO,
 ]
 TEXT = st.text(st.characters(codec="utf-8"), max_size=9)
 FORMATS = {
@@ -130,13 +131,13 @@ def test_messages_of_any_lengths_come_out_as_rosbags_decodes_them(typename, data
 
 
 def test_a_definition_from_a_file_is_read_as_well_as_one_that_is_known():
-    text = definition(messages.SEGMENT).encode() + b"\n# and another word\n"
-    kind = message_type(messages.SEGMENT, "ros2msg", text)
-    payload = messages.encode(
-        messages.message(
-            messages.SEGMENT,
-            header=messages.header(5, "mic"),
-            duration=messages.duration_message(7),
+    text = definition(message_types.SEGMENT).encode() + b"\n# and another word\n"
+    kind = message_type(message_types.SEGMENT, "ros2msg", text)
+    payload = message_types.encode(
+        message_types.message(
+            message_types.SEGMENT,
+            header=message_types.header(5, "mic"),
+            duration=message_types.duration_message(7),
             label="speech",
             confidence=0.5,
         )
@@ -182,7 +183,7 @@ def test_a_hostile_definition_is_refused(text, what):
 @settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_no_bytes_make_it_fail_otherwise(payload):
-    for typename in (messages.LABEL, messages.DIAGNOSTICS, messages.STREAM_INFO):
+    for typename in (message_types.LABEL, message_types.DIAGNOSTICS, message_types.STREAM_INFO):
         try:
             decoded(typename, [b"\0\1\0\0" + payload])
         except LogError:
@@ -192,7 +193,9 @@ def test_no_bytes_make_it_fail_otherwise(payload):
 @pytest.mark.parametrize("damage", ["cut", "long", "no terminator", "not UTF-8", "XCDR2"])
 def test_a_message_that_is_not_of_its_type_is_refused(damage):
     payload = bytearray(
-        messages.encode(messages.message("std_msgs/msg/String", data="something long enough"))
+        message_types.encode(
+            message_types.message("std_msgs/msg/String", data="something long enough")
+        )
     )
     if damage == "cut":
         payload = payload[:-3]
@@ -212,8 +215,8 @@ def test_rows_of_more_layouts_than_are_tried_come_out_right():
     rng = np.random.default_rng(3)
     texts = ["x" * length for length in rng.permutation(100).repeat(2)]
     payloads = [
-        messages.encode(
-            messages.message(
+        message_types.encode(
+            message_types.message(
                 "diagnostic_msgs/msg/KeyValue", key=text, value="y" * (100 - len(text))
             )
         )

@@ -8,10 +8,11 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline, stream_info
 from hearthlog.recorder.service import Settings, describe_log
-from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 

@@ -3,8 +3,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.manifest import read_manifest
-from hearthlog.analyzer.scenario import BUILTIN, LABELS, load_scenario
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, load_scenario
 
 pytestmark = pytest.mark.fast
 

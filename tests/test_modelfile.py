@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.card import model_card
+from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 pytestmark = pytest.mark.fast
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile import load_model
-from hearthlog.recorder import lines
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.recorder import rosout as lines
+from hearthlog.recorder.events import Frames, Gap, Health
 from hearthlog.recorder.pipeline import Pipeline, opening
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.stream import Frames, Gap, Health
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.messages import (
+from hearthlog.schemas.messages.message_types import (
     LOG,
     SEGMENT,
     STREAM_INFO,

@@ -13,18 +13,18 @@ import soundfile
 from conftest import HEARTHLOG
 from logs import features, read
 
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.messages import nanoseconds
-from hearthlog.schemas.provenance import provenance
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages.message_types import nanoseconds
 
 pytestmark = pytest.mark.fast
 

@@ -13,13 +13,13 @@ from logs import features
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import record_files
-from hearthlog.recorder.sources.replayed import FileSource
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import active_path
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import topics_of
-from hearthlog.schemas.writer import LogWriter
+from hearthlog.schemas.logs.files import active_path
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages.topics import topics_of
 
 pytestmark = pytest.mark.fast
 

@@ -10,10 +10,10 @@ import pytest
 from kept import keep_models, put_by_hand
 from spliced import run
 
-from hearthlog.models.card import model_card
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile import load_model
-from hearthlog.models.registry import list_models, load, promote, rollback, target
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import list_models, load, promote, rollback, target
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ PROMOTING = """
 import sys
 from itertools import cycle
 from pathlib import Path
-from hearthlog.models.registry import promote, rollback
+from hearthlog.models.modelfile.registry import promote, rollback
 folder = Path(sys.argv[1])
 for number, name in enumerate(cycle(["two", "bands", "one"])):
     promote(folder, name)

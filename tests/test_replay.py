@@ -23,24 +23,30 @@ from lossy import LossySource
 from hearthlog.analyzer.replay.player import Wanted
 from hearthlog.analyzer.replay.replay import LogSet, find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.card import model_card
+from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Frames, Gap, Health
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Frames, Gap, Health
-from hearthlog.schemas import messages
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import find_logs
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import encode, header, message, nanoseconds, time_message
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import Topic, topics_of
-from hearthlog.schemas.writer import Attachment, LogWriter
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import Attachment, LogWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import (
+    encode,
+    header,
+    message,
+    nanoseconds,
+    time_message,
+)
+from hearthlog.schemas.messages.topics import Topic, topics_of
 from hearthlog.tools.cli.replay import Source
 from hearthlog.tools.cli.replay import replay as verb
 
@@ -413,11 +419,11 @@ def wait_until(condition):
 
 def write_clips(path, clips, rate=16_000, kind="pcm-s16"):
     """Write a log of clips: (time of the first sample, int16 samples of shape (n, channels))."""
-    topics = [Topic("/mic/audio", messages.RAW_AUDIO)]
+    topics = [Topic("/mic/audio", message_types.RAW_AUDIO)]
     log = LogWriter(path, topics, {"node": "home"})
     for stamp, samples in clips:
         clip = message(
-            messages.RAW_AUDIO,
+            message_types.RAW_AUDIO,
             timestamp=time_message(stamp),
             data=np.frombuffer(samples.astype("<i2").tobytes(), np.uint8),
             format=kind,
@@ -527,7 +533,7 @@ def write_log(path, values, *, metadata=None, configuration=b"{}", microphones=(
     log = LogWriter(path, unique, metadata or {}, [attachment])
     empty = {"device": "", "feature_set": "auros21", "model": "", "model_sha256": ""} | info
     about = message(
-        messages.STREAM_INFO,
+        message_types.STREAM_INFO,
         header=header(START, "mic"),
         sample_rate=16_000,
         frame_seconds=0.05,
@@ -540,7 +546,7 @@ def write_log(path, values, *, metadata=None, configuration=b"{}", microphones=(
     for frame, row in enumerate(values):
         stamp = START + frame * FRAME_NANOSECONDS
         data = message(
-            messages.FEATURES,
+            message_types.FEATURES,
             header=header(stamp, "mic"),
             frame=frame,
             values=np.asarray(row, np.float32),
@@ -591,7 +597,7 @@ def test_layers_are_no_part_of_a_recording(folder, model_file, tmp_path):
     shutil.copytree(folder, tmp_path / "recorded")
     log = find_logs(tmp_path / "recorded")[0]
     layer = log.with_name(log.stem + ".review.mcap")
-    LogWriter(layer, [Topic("/mic/review/segment", messages.SEGMENT)], {}).finish()
+    LogWriter(layer, [Topic("/mic/review/segment", message_types.SEGMENT)], {}).finish()
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)
     assert content(tmp_path / "again") == content(folder)
     assert len(result.sources) == 7

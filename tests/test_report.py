@@ -18,20 +18,21 @@ from PIL import Image
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.hometime import day_span, home_zone, local_time
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.logs.layers import find_shelf
+from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
+from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import topics_of as layer_topics
 from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
-from hearthlog.analyzer.report.figures import day_of, whole_home
-from hearthlog.analyzer.report.markup import paragraph
-from hearthlog.analyzer.report.reading import read_heard
+from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.report.html import paragraph
+from hearthlog.analyzer.report.read_home import read_heard
 from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.report.shelf import find_shelf
-from hearthlog.analyzer.report.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.schemas.content import Rows
-from hearthlog.schemas.messages import NANOSECONDS, nanoseconds
-from hearthlog.schemas.writer import LogWriter
+from hearthlog.schemas.logs.log_stream import Rows
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.times import NANOSECONDS
 
 DAY = date(2026, 3, 1)
 UTC = ZoneInfo("UTC")

@@ -23,23 +23,23 @@ from lossy import LossySource
 from spliced import run
 from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
 
-from hearthlog.analyzer.diff.listing import Span as Listed
-from hearthlog.analyzer.diff.listing import write_list
-from hearthlog.analyzer.diff.sources import find_sources
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.heard import Heard
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
-from hearthlog.analyzer.review.marking import Marking
-from hearthlog.analyzer.review.queue import queue_items
-from hearthlog.analyzer.review.session import Item, Session
-from hearthlog.analyzer.review.sound import sound_of
-from hearthlog.analyzer.timeline.contents import Clip
-from hearthlog.analyzer.timeline.reading import read_timeline
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.labellings import find_sources
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.review.queue.review_list import Span as Listed
+from hearthlog.analyzer.review.queue.review_list import write_list
+from hearthlog.analyzer.review.session.marking import Marking
+from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.session.session import Item, Session
+from hearthlog.analyzer.review.session.sound import sound_of
+from hearthlog.analyzer.review.timeline.contents import Clip
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas.files import find_logs, is_layer
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs, is_layer
 
 __all__ = ["display"]  # a fixture
 

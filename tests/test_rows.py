@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hearthlog.schemas import messages
-from hearthlog.schemas.messages import encode, header, message
-from hearthlog.schemas.rows import encode_rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import encode_rows
+from hearthlog.schemas.messages.message_types import encode, header, message
 
 pytestmark = pytest.mark.fast
 
@@ -28,11 +28,13 @@ def test_features(name, count, width, seed):
     rng = np.random.default_rng(seed)
     stamps, frames = rng.integers(0, 2**60, count), rng.integers(0, 2**63, count)
     values = rng.standard_normal((count, width)).astype(np.float32)
-    rows = encode_rows(messages.FEATURES, common(stamps, name, frames) | {"values": values}, count)
+    rows = encode_rows(
+        message_types.FEATURES, common(stamps, name, frames) | {"values": values}, count
+    )
     assert rows == [
         encode(
             message(
-                messages.FEATURES,
+                message_types.FEATURES,
                 header=header(int(stamps[i]), name),
                 frame=int(frames[i]),
                 values=values[i],
@@ -55,10 +57,10 @@ def test_labels_whose_strings_have_different_lengths(name, labels, seed):
         "novelty": np.full(count, np.nan, np.float32),
         "probabilities": probabilities,
     }
-    assert encode_rows(messages.LABEL, columns, count) == [
+    assert encode_rows(message_types.LABEL, columns, count) == [
         encode(
             message(
-                messages.LABEL,
+                message_types.LABEL,
                 header=header(int(stamps[i]), name),
                 frame=i,
                 label=labels[i],
@@ -77,6 +79,8 @@ def test_alignment_after_strings_of_every_length(length):
         "mean": np.ones((1, 3), np.float32),
         "std": np.zeros((1, 2), np.float32),
     }
-    decoded = messages.decode(encode_rows(messages.STATISTICS, columns, 1)[0], messages.STATISTICS)
+    decoded = message_types.decode(
+        encode_rows(message_types.STATISTICS, columns, 1)[0], message_types.STATISTICS
+    )
     assert (decoded.frame, decoded.header.frame_id) == (7, "x" * length)
     assert decoded.mean.tolist() == [1, 1, 1]

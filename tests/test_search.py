@@ -13,15 +13,15 @@ from blobs import blobs, ignore_progress
 from clusters import running, scheduler_in, worker_of
 from joblib import delayed
 
-from hearthlog.analyzer.adaptation import adaptation_curve
 from hearthlog.analyzer.errors import DataError, WorkerError
-from hearthlog.analyzer.evaluation.folds import evaluate_method
-from hearthlog.analyzer.method import cross_validate, prepare
-from hearthlog.analyzer.search import search
-from hearthlog.analyzer.svm_method import PAPER
-from hearthlog.analyzer.train import group_folds
+from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
+from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
+from hearthlog.analyzer.evaluation.grid_search import search
+from hearthlog.analyzer.training.method import cross_validate, prepare
+from hearthlog.analyzer.training.svm_method import PAPER
+from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.parallel import in_parallel, joblib_on
-from hearthlog.models.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.tools.home.simulate import write_training_set
 
 

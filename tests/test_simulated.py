@@ -8,9 +8,9 @@ from time import sleep
 
 import pytest
 
-from hearthlog.models.description import SIMULATED, Amount, Collection
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.recorder.modelwatch import ModelWatch
+from hearthlog.models.classifiers.description import SIMULATED, Amount, Collection
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.tools.home.simulate import write_training_set
 
 LINE = (

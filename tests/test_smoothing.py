@@ -10,34 +10,35 @@ from lossy import LossySource
 from rewriting import Log
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.analyzer.hmm import (
+from hearthlog.analyzer.replay.player import Wanted
+from hearthlog.analyzer.replay.replay import LogSet
+from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.training.transitions import (
     FRAME_SECONDS,
     LAG_SECONDS,
     default_transitions,
     transitions_from_durations,
     transitions_from_sequences,
 )
-from hearthlog.analyzer.replay.player import Wanted
-from hearthlog.analyzer.replay.replay import LogSet
-from hearthlog.analyzer.replay.replay import replay as replay_logs
-from hearthlog.analyzer.viterbi import smoothed, viterbi
-from hearthlog.models.classifier import Classifier
-from hearthlog.models.description import Smoothing
+from hearthlog.analyzer.training.viterbi import smoothed, viterbi
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.models.segments import Segmenter
-from hearthlog.models.smoothing import FixedLagSmoother
+from hearthlog.models.labels.segments import Segmenter
+from hearthlog.models.labels.smoothing import FixedLagSmoother
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Frames
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.recorder.stream import Frames
-from hearthlog.schemas.files import find_logs
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.messages import (
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.messages.message_types import (
     LOG,
     SEGMENT,
     decode,
@@ -45,7 +46,6 @@ from hearthlog.schemas.messages import (
     nanoseconds,
     time_message,
 )
-from hearthlog.schemas.reader import LogReader
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND

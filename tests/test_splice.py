@@ -11,17 +11,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from spliced import LOST, raw_messages, run, small_disk, write_log
 
-from hearthlog.analyzer.selection import select
-from hearthlog.analyzer.splice import splice
-from hearthlog.schemas import messages
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import message
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import Quality, Topic
-from hearthlog.schemas.writer import Attachment, LogWriter, Rows
+from hearthlog.analyzer.export.merge import splice
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import Attachment, LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import message
+from hearthlog.schemas.messages.topics import Quality, Topic
 
 INFO = Topic("/mic/info", "std_msgs/msg/String", Quality(depth=1, transient_local=True))
-FEATURES = Topic("/mic/features", messages.FEATURES, array_names={"values": ["a", "b"]})
+FEATURES = Topic("/mic/features", message_types.FEATURES, array_names={"values": ["a", "b"]})
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def small_log(path, topics, rows=(), info=(), about=({}, ())):
     """A log of some features, of strings on /mic/info, and of what it says of itself."""
     log = LogWriter(path, topics, *about)
     for time, text in info:
-        data = messages.encode(message("std_msgs/msg/String", data=text))
+        data = message_types.encode(message("std_msgs/msg/String", data=text))
         log.write("/mic/info", time, data)
     times = np.array(rows, np.int64)
     if rows:
@@ -127,7 +127,7 @@ def test_records_that_differ_are_all_kept(hearthlog, tmp_path):
 
 
 def test_channels_that_say_the_same_become_one_and_others_stay_apart(hearthlog, tmp_path):
-    other = Topic(FEATURES.name, messages.FEATURES, array_names={"values": ["a", "c", "d"]})
+    other = Topic(FEATURES.name, message_types.FEATURES, array_names={"values": ["a", "c", "d"]})
     small_log(tmp_path / "1.mcap", [FEATURES, INFO], rows=[10, 30])
     small_log(tmp_path / "2.mcap", [FEATURES, INFO], rows=[20])
     small_log(tmp_path / "3.mcap", [other, INFO], rows=[25])
@@ -284,7 +284,7 @@ def test_messages_of_one_time_keep_the_order_of_their_log(tmp_path):
 
 def test_logs_of_any_size_are_merged_in_little_memory(tmp_path):
     names = [f"v{i}" for i in range(21)]
-    topic = Topic("/mic/features", messages.FEATURES, array_names={"values": names})
+    topic = Topic("/mic/features", message_types.FEATURES, array_names={"values": names})
     logs = []
     for part in range(2):
         log = LogWriter(tmp_path / f"{part}.mcap", [topic], {})

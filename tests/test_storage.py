@@ -18,20 +18,20 @@ from conftest import HEARTHLOG
 from spliced import raw_messages, run
 from stores import account, put
 
-from hearthlog.analyzer.replay.origin import read_origin
-from hearthlog.analyzer.selection import select
-from hearthlog.analyzer.storage import location
+from hearthlog.analyzer.logs.locations import location
+from hearthlog.analyzer.logs.recorder_info import read_origin
+from hearthlog.analyzer.logs.selection import select
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas.chunks import read_chunks
-from hearthlog.schemas.columns import read_columns
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import check_new, find_logs, new_file, replaced_file
-from hearthlog.schemas.logfile import LogFile, time_span, topic_counts
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.series import iterate_messages
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import check_new, find_logs, new_file, replaced_file
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile, time_span, topic_counts
+from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_352_000 * NANOSECONDS
 
@@ -220,7 +220,7 @@ def test_the_name_of_a_file_is_a_plain_path(tmp_path):
 
 def test_a_path_of_a_store_goes_to_other_processes(bucket, logs):
     log = find_logs(put(logs, bucket / "home"))[0]
-    count = "import pickle, sys; from hearthlog.schemas.logfile import topic_counts; "
+    count = "import pickle, sys; from hearthlog.schemas.mcap.logfile import topic_counts; "
     count += "print(topic_counts(pickle.load(sys.stdin.buffer))['/mic/label'])"
     command = [sys.executable, "-c", count]
     done = subprocess.run(command, input=pickle.dumps(log), capture_output=True, check=True)
@@ -290,7 +290,7 @@ def test_what_others_put_in_a_bucket_is_seen_at_once(bucket, logs):
     before = find_logs(home)
     assert home.is_dir()
     layer = before[0].with_name("other.mcap")
-    add = "import sys; from hearthlog.analyzer.storage import location; "
+    add = "import sys; from hearthlog.analyzer.logs.locations import location; "
     add += "location(sys.argv[1]).write_bytes(b'x')"
     subprocess.run([sys.executable, "-c", add, str(layer)], check=True)
     assert layer.exists()

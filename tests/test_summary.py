@@ -15,17 +15,18 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.summary import GapSummary, Health, summarise
-from hearthlog.models.modelfile import load_model
+from hearthlog.analyzer.logs.summary import GapSummary, Health, summarise
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import messages
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
-from hearthlog.schemas.files import active_path, find_logs
-from hearthlog.schemas.messages import (
-    NANOSECONDS,
+from hearthlog.schemas.logs.files import active_path, find_logs
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import (
     definition,
     encode,
     header,
@@ -33,9 +34,8 @@ from hearthlog.schemas.messages import (
     nanoseconds,
     typestore,
 )
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import DIAGNOSTICS, Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
 START = 1_772_348_370_123_456_789
@@ -127,7 +127,7 @@ def test_topics_have_the_messages_bytes_and_times_that_are_read_one_by_one(logs)
         min(first for _, _, (first, _) in counted(logs).values()),
         max(last for _, _, (_, last) in counted(logs).values()),
     )
-    assert summary.topics["/hall/features"].type == messages.FEATURES
+    assert summary.topics["/hall/features"].type == message_types.FEATURES
     assert summary.topics["/hall/features"].encoding == "cdr"
     assert summary.size == sum(path.stat().st_size for path in logs)
     assert summary.raw_bytes > sum(size for _, size, _ in counted(logs).values())
@@ -242,7 +242,7 @@ def test_messages_of_other_encodings_are_counted_with_an_index_and_without(tmp_p
 
 
 def test_a_log_without_messages_has_no_span(tmp_path):
-    path = LogWriter(tmp_path / "a.mcap", [Topic("/mic/gap", messages.GAP)], {}).finish()
+    path = LogWriter(tmp_path / "a.mcap", [Topic("/mic/gap", message_types.GAP)], {}).finish()
     active = tmp_path / "b.mcap.active"
     active.touch()
     summary = summarise([path, active])
@@ -268,7 +268,7 @@ def test_a_relabelling_is_a_layer_with_labels_of_its_own(logs, tmp_path):
         "novelty": np.full(10, np.nan, np.float32),
         "probabilities": np.ones((10, 2), np.float32),
     }
-    writer = LogWriter(path, [Topic(topic, messages.LABEL)], {})
+    writer = LogWriter(path, [Topic(topic, message_types.LABEL)], {})
     writer.write_columns([Rows(topic, times, fields)])
     writer.finish()
     alone, both = summarise([path]), summarise([*logs, path])
@@ -307,10 +307,10 @@ def test_health_is_the_worst_that_was_said_and_of_that_the_last(tmp_path):
     paths = []
     for number, part in enumerate([said[:2], said[2:]]):
         writer = LogWriter(
-            tmp_path / f"{number}.mcap", [Topic(DIAGNOSTICS, messages.DIAGNOSTICS)], {}
+            tmp_path / f"{number}.mcap", [Topic(DIAGNOSTICS, message_types.DIAGNOSTICS)], {}
         )
         for i, statuses in enumerate(part, 2 * number):
-            array = message(messages.DIAGNOSTICS, header=header(START, "mic"), status=statuses)
+            array = message(message_types.DIAGNOSTICS, header=header(START, "mic"), status=statuses)
             writer.write(DIAGNOSTICS, START + i, encode(array))
         paths.append(writer.finish())
     worst = Health(2, START + 2, "b", "lost again")
@@ -322,7 +322,7 @@ def test_a_type_that_only_has_the_name_of_ours_is_counted(tmp_path):
     with path.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start(profile="ros2", library="another")
-        schema = writer.register_schema(messages.LABEL, "ros2msg", b"uint32 label\n")
+        schema = writer.register_schema(message_types.LABEL, "ros2msg", b"uint32 label\n")
         channel = writer.register_channel("/mic/label", "cdr", schema)
         writer.add_message(channel, START, b"\x00\x01\x00\x00\x05\x00\x00\x00", START)
         writer.finish()
@@ -335,10 +335,10 @@ def test_a_type_that_only_has_the_name_of_ours_is_counted(tmp_path):
 
 def test_a_type_of_ours_with_another_field_is_understood(tmp_path):
     path = tmp_path / "a.mcap"
-    lines = definition(messages.GAP).splitlines()
+    lines = definition(message_types.GAP).splitlines()
     lines.insert(lines.index("uint64 frames_lost") + 1, "uint32 later")
     gap = message(
-        messages.GAP,
+        message_types.GAP,
         header=header(START, "mic"),
         duration=message("builtin_interfaces/msg/Duration", sec=2, nanosec=0),
         reason="overrun",
@@ -347,7 +347,7 @@ def test_a_type_of_ours_with_another_field_is_understood(tmp_path):
     with path.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start(profile="ros2", library="a later version")
-        schema = writer.register_schema(messages.GAP, "ros2msg", "\n".join(lines).encode())
+        schema = writer.register_schema(message_types.GAP, "ros2msg", "\n".join(lines).encode())
         channel = writer.register_channel("/mic/gap", "cdr", schema)
         writer.add_message(channel, START, encode(gap) + bytes(4), START)
         writer.finish()
@@ -355,7 +355,7 @@ def test_a_type_of_ours_with_another_field_is_understood(tmp_path):
 
 
 def test_a_message_that_is_not_of_its_type_is_damage_in_its_file(tmp_path):
-    writer = LogWriter(tmp_path / "a.mcap", [Topic("/mic/gap", messages.GAP)], {})
+    writer = LogWriter(tmp_path / "a.mcap", [Topic("/mic/gap", message_types.GAP)], {})
     writer.write("/mic/gap", START, b"\x00\x01\x00\x00\x05\x00")
     path = writer.finish()
     summary = summarise([path])

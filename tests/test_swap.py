@@ -16,22 +16,22 @@ from kept import keep_models, put_by_hand
 from logs import features, read
 from spliced import run
 
-from hearthlog.models.card import model_card
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile import load_model
-from hearthlog.models.registry import promote
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import promote
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.modelwatch import ModelWatch
+from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline, stream_info
 from hearthlog.recorder.service import _attend, describe_log
-from hearthlog.recorder.sources.files import read_audio
-from hearthlog.recorder.stream import Frames, Gap
-from hearthlog.schemas.files import find_logs
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.reader import LogReader
 
 SECOND = 1_000_000_000
 START = 1_772_348_400 * SECOND
@@ -220,7 +220,7 @@ def test_a_file_that_is_written_over_in_its_place_is_taken_too(folder):
 
 
 def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.modelwatch._LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 0.01)
     path = folder / "one.safetensors"
     watch = ModelWatch(path, SimpleQueue())
     (folder / "copy").write_bytes(path.read_bytes())
@@ -232,7 +232,7 @@ def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
 
 
 def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.modelwatch._LOOK_SECONDS", 3600)
+    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 3600)
     asked = SimpleQueue()
     watch = ModelWatch(folder / "champion.safetensors", asked)
     promote(folder, "two")

@@ -23,25 +23,31 @@ from viewers import rerun_home, shown, viewer
 
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.timeline import reading
-from hearthlog.analyzer.timeline.contents import Labelling, Series, Spans, no_spans
-from hearthlog.analyzer.timeline.grid import Grid, Means, time_shares
-from hearthlog.analyzer.timeline.lanes import BLOCKS, changes, clock, disagreements, from_afar
-from hearthlog.analyzer.timeline.reading import SHARES, read_timeline
-from hearthlog.analyzer.train import train_model
-from hearthlog.analyzer.viewer.file import save_timeline
-from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.review.timeline import read_timeline as reading
+from hearthlog.analyzer.review.timeline.contents import Labelling, Series, Spans, no_spans
+from hearthlog.analyzer.review.timeline.grid import Grid, Means, time_shares
+from hearthlog.analyzer.review.timeline.lanes import (
+    BLOCKS,
+    changes,
+    clock,
+    disagreements,
+    from_afar,
+)
+from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
+from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
-from hearthlog.recorder.sources.replayed import FileSource
-from hearthlog.schemas import messages
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import audio_path, find_logs
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import header, message, nanoseconds
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.files import audio_path, find_logs
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import header, message, nanoseconds
+from hearthlog.schemas.messages.topics import Topic
 
 __all__ = ["viewer"]  # a fixture
 
@@ -309,7 +315,7 @@ def labels_log(path, names, count, width=2, **about):
         "novelty": np.full(count, np.nan, np.float32),
         "probabilities": probabilities,
     }
-    topic = Topic("/mic/label", messages.LABEL, array_names=names)
+    topic = Topic("/mic/label", message_types.LABEL, array_names=names)
     writer = LogWriter(path, [topic], about)
     writer.write_columns([Rows("/mic/label", times, fields)])
     return writer.finish()
@@ -397,7 +403,7 @@ def health(stamp, *levels):
         )
         for level in levels
     ]
-    return stamp, message(messages.DIAGNOSTICS, header=header(stamp, "mic"), status=status)
+    return stamp, message(message_types.DIAGNOSTICS, header=header(stamp, "mic"), status=status)
 
 
 def test_a_trouble_lasts_until_it_is_over_or_another_one_begins(tmp_path):
@@ -813,8 +819,8 @@ def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path,
 _SAVE = """
 import pathlib, resource, sys
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.timeline.reading import read_timeline
-from hearthlog.analyzer.viewer.file import save_timeline
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.viewer.file import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])
 if limit := int(sys.argv[3]): resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try: save_timeline(timeline, pathlib.Path(sys.argv[2]))

@@ -5,11 +5,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
 
-from hearthlog.schemas import messages
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import encode, message, time_message, typestore
-from hearthlog.schemas.topics import Topic, check_microphone_name, topics_of
-from hearthlog.schemas.writer import LogWriter
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import encode, message, time_message, typestore
+from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topics_of
 
 pytestmark = pytest.mark.fast
 
@@ -35,7 +35,7 @@ def test_without_classes_there_are_no_labels_and_all_else_is_there():
 def test_every_topic_has_a_type_with_a_definition():
     for item in topics_of("hall", ["energy"], ["speech"]):
         assert item.type in typestore().types
-        assert messages.definition(item.type)
+        assert message_types.definition(item.type)
 
 
 @pytest.mark.parametrize("name", ["hall", "mic2", "living_room", "a"])
@@ -50,22 +50,22 @@ def test_a_name_that_ros_refuses_in_a_topic_is_refused(name):
 
 
 def test_raw_audio_is_as_foxglove_defines_it():
-    theirs = get_types_from_msg(RAW_AUDIO, messages.RAW_AUDIO)[messages.RAW_AUDIO]
-    assert messages.RAW_AUDIO == "foxglove_msgs/msg/RawAudio"
-    assert typestore().fielddefs[messages.RAW_AUDIO] == theirs
+    theirs = get_types_from_msg(RAW_AUDIO, message_types.RAW_AUDIO)[message_types.RAW_AUDIO]
+    assert message_types.RAW_AUDIO == "foxglove_msgs/msg/RawAudio"
+    assert typestore().fielddefs[message_types.RAW_AUDIO] == theirs
 
 
 def test_raw_audio_in_a_log_is_read_with_the_types_of_the_file(tmp_path):
     samples = np.random.default_rng(3).integers(-32768, 32767, 800, np.int16)
     clip = message(
-        messages.RAW_AUDIO,
+        message_types.RAW_AUDIO,
         timestamp=time_message(1_772_348_400_123_456_789),
         data=samples.view(np.uint8),
         format="pcm-s16",
         sample_rate=16_000,
         number_of_channels=1,
     )
-    log = LogWriter(tmp_path / "log.mcap", [Topic("/mic/audio", messages.RAW_AUDIO)], {})
+    log = LogWriter(tmp_path / "log.mcap", [Topic("/mic/audio", message_types.RAW_AUDIO)], {})
     log.write("/mic/audio", 1_772_348_400_123_456_789, encode(clip))
     with AnyReader([log.finish()]) as reader:
         ((connection, _, data),) = reader.messages()

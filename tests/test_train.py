@@ -9,15 +9,15 @@ from blobs import SOURCES, blobs, ignore_progress
 from typer import Typer
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.dataset import SEGMENTS_PER_GROUP, build_dataset
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.manifest import Clip, read_manifest
-from hearthlog.analyzer.scenario import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.train import calibration_error, group_folds, train_model
-from hearthlog.models.classifier import Classifier
+from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
+from hearthlog.analyzer.training.manifest import Clip, read_manifest
+from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.models.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.home.simulate import write_training_set

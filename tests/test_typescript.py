@@ -13,10 +13,17 @@ import pytest
 from mcap.reader import make_reader
 from test_interoperability import TOPICS, chunks, logs, plain, recorded
 
-from hearthlog.schemas.messages import GAP, LABEL, duration_message, encode, header, message
-from hearthlog.schemas.reader import LogReader
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter
+from hearthlog.schemas.logs.reader import LogReader
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages.message_types import (
+    GAP,
+    LABEL,
+    duration_message,
+    encode,
+    header,
+    message,
+)
+from hearthlog.schemas.messages.topics import Topic
 
 __all__ = ["logs", "recorded"]  # fixtures
 

@@ -20,12 +20,12 @@ from viewers import (
 )
 
 from hearthlog.analyzer.colours import GAP, colour
-from hearthlog.analyzer.marks import Mark, write_marks
-from hearthlog.analyzer.timeline.lanes import from_afar
-from hearthlog.analyzer.timeline.reading import read_timeline
-from hearthlog.analyzer.viewer.file import save_timeline
-from hearthlog.analyzer.viewer.web import open_page
-from hearthlog.schemas.files import find_logs
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.review.timeline.lanes import from_afar
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.viewer.web import open_page
+from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["display", "viewer"]  # fixtures
 

@@ -21,10 +21,10 @@ from rerun.experimental import ViewerClient
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.hometime import home_zone
-from hearthlog.analyzer.timeline.contents import Lines
-from hearthlog.analyzer.timeline.lanes import Changes
-from hearthlog.analyzer.timeline.live import (
+from hearthlog.analyzer.logs.local_time import home_zone
+from hearthlog.analyzer.review.timeline.contents import Lines
+from hearthlog.analyzer.review.timeline.lanes import Changes
+from hearthlog.analyzer.review.timeline.live import (
     GAP_LANE,
     LIVE_LANE,
     NOT_HEARD,
@@ -33,13 +33,13 @@ from hearthlog.analyzer.timeline.live import (
     Means,
     last_time,
 )
-from hearthlog.analyzer.viewer.live import LiveServer
-from hearthlog.analyzer.viewer.process import Process, free_port
-from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.schemas.columns import read_columns
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.follow import follow_messages
+from hearthlog.analyzer.review.viewer.live import LiveServer
+from hearthlog.analyzer.review.viewer.process import Process, free_port
+from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.follow import follow_messages
 
 SECOND = 1_000_000_000
 MINUTES = 3

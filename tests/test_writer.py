@@ -10,23 +10,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from hearthlog.schemas import messages
-from hearthlog.schemas.chunks import read_chunks
-from hearthlog.schemas.chunkwriter import Block, ChunkWriter, blocks_of
-from hearthlog.schemas.content import LogContent
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import NANOSECONDS, encode, header, message
-from hearthlog.schemas.series import iterate_messages
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.log_stream import LogContent
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import encode, header, message
+from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
 LABELS = ["speech", "silence", "telephone_bell_ringing", ""]
 TOPICS = [
-    Topic("/mic/features", messages.FEATURES, array_names={"values": ["a", "b"]}),
-    Topic("/mic/label", messages.LABEL),
+    Topic("/mic/features", message_types.FEATURES, array_names={"values": ["a", "b"]}),
+    Topic("/mic/label", message_types.LABEL),
 ]
 
 
@@ -134,13 +135,13 @@ def rows(columns, part):
 
 def features(time, frame, values):
     about = header(int(time), "mic")
-    return encode(message(messages.FEATURES, header=about, frame=frame, values=values))
+    return encode(message(message_types.FEATURES, header=about, frame=frame, values=values))
 
 
 def label(time, frame, name, values):
     return encode(
         message(
-            messages.LABEL,
+            message_types.LABEL,
             header=header(int(time), "mic"),
             frame=frame,
             label=name,

@@ -2,10 +2,10 @@
 
 import pytest
 
-from hearthlog.recorder import zone
+from hearthlog.recorder import timezone as zone
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.schemas.reader import LogReader
+from hearthlog.schemas.logs.reader import LogReader
 
 
 @pytest.fixture

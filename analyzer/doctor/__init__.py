@@ -5,9 +5,9 @@ from pathlib import Path
 
 from hearthlog.analyzer.doctor.check import Examined, examine_file
 from hearthlog.analyzer.doctor.findings import Finding, Findings
-from hearthlog.analyzer.doctor.folder import check_leftovers, check_series
+from hearthlog.analyzer.doctor.folder_checks import check_leftovers, check_series
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["Examined", "Finding", "Findings", "examine", "examine_file"]
 

@@ -9,21 +9,20 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Footer
 
-from hearthlog.analyzer.doctor.about import About
-from hearthlog.analyzer.doctor.batch import Batch
-from hearthlog.analyzer.doctor.contract import ALWAYS, NAME, Contract, place_of
-from hearthlog.analyzer.doctor.data import Data
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.frames import Frames
-from hearthlog.analyzer.doctor.index import Summary
-from hearthlog.analyzer.doctor.source import Source
-from hearthlog.analyzer.doctor.walk import Walk
-from hearthlog.schemas.columns import decode
+from hearthlog.analyzer.doctor.frame_sequence import Frames
+from hearthlog.analyzer.doctor.mcap.batch import Batch
+from hearthlog.analyzer.doctor.mcap.byte_source import Source
+from hearthlog.analyzer.doctor.mcap.data_section import Data
+from hearthlog.analyzer.doctor.mcap.summary_section import Summary
+from hearthlog.analyzer.doctor.mcap.walk import Walk
+from hearthlog.analyzer.doctor.message_checks import ALWAYS, NAME, Contract, place_of
+from hearthlog.analyzer.doctor.metadata_checks import About
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import ACTIVE_SUFFIX
-from hearthlog.schemas.logfile import FOOTER_SIZE, LogFile
-from hearthlog.schemas.provenance import METADATA, provenance_records, unknown_version
-from hearthlog.schemas.records import HEAD, MAGIC, parse
+from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, FOOTER_SIZE, LogFile
+from hearthlog.schemas.mcap.records import HEAD, MAGIC, parse
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")

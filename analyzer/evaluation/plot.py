@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hearthlog.analyzer.evaluation.scores import Bin, Scores
 from hearthlog.analyzer.evaluation.table import shown
-from hearthlog.schemas.files import new_file
+from hearthlog.analyzer.training.scores import Bin, Scores
+from hearthlog.schemas.logs.files import new_file
 
 
 def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:

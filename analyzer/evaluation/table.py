@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from hearthlog.analyzer.evaluation.events import Detections
-from hearthlog.analyzer.evaluation.scores import Bin, Interval, Scores
+from hearthlog.analyzer.evaluation.event_scores import Detections
+from hearthlog.analyzer.training.scores import Bin, Interval, Scores
 from hearthlog.schemas.text import printable
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.search import Tried  # which imports scikit-learn
+    from hearthlog.analyzer.evaluation.grid_search import Tried  # which imports scikit-learn
 
 WIDTH = 100
 _NAME = 16  # objects_activity

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.pieces import Piece
-from hearthlog.analyzer.selection import Selection
+from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.fields import DURATION, TIME, Field
+from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
 _MOMENT = pa.timestamp("ns", "UTC")
 _TYPES = {

@@ -2,12 +2,12 @@
 
 from typing import BinaryIO
 
-from hearthlog.analyzer.pieces import Piece
-from hearthlog.analyzer.selection import Selection
-from hearthlog.schemas.columns import iterate_columns
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.messages.topics import topic as topic_of
 from hearthlog.schemas.text import printable
-from hearthlog.schemas.topics import topic as topic_of
+from hearthlog.schemas.times import NANOSECONDS
 
 FIELDS = {"header.stamp", "duration", "label"}
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
-from hearthlog.analyzer.export.names import names_of
-from hearthlog.analyzer.lines import json_texts
-from hearthlog.analyzer.pieces import Piece
-from hearthlog.analyzer.selection import Selection
+from hearthlog.analyzer.export.text import json_texts
+from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.fields import DURATION, Field
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.messages.fields import DURATION, Field
+from hearthlog.schemas.times import NANOSECONDS
 
 _OPTIONS = csv.WriteOptions(quoting_style="needed")
 _CONTROLS = r"[\x00-\x08\x0b-\x1f\x7f-\x9f]"  # CSV has tabs and the ends of lines alone

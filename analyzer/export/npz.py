@@ -8,13 +8,13 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.export.names import file_stem, names_of
-from hearthlog.analyzer.lines import json_texts
-from hearthlog.analyzer.selection import Selection
-from hearthlog.schemas.columns import Columns, read_columns
+from hearthlog.analyzer.export.text import json_texts
+from hearthlog.analyzer.logs.channel_names import file_stem, names_of
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.fields import DURATION, TIME, Field, fields_of
-from hearthlog.schemas.layout import message_type
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.messages.fields import DURATION, TIME, Field, fields_of
 
 _TEXTS_LIMIT = 1 << 30  # bytes
 

@@ -6,8 +6,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hearthlog.analyzer.export.arrow import batch_of, schema_of
-from hearthlog.analyzer.pieces import Piece
-from hearthlog.analyzer.selection import Selection
+from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.selection import Selection
 
 _ROW_GROUP = 32 << 20  # bytes
 

@@ -12,12 +12,13 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hearthlog.analyzer.selection import Progress, Selection
-from hearthlog.analyzer.splice import lasts
-from hearthlog.schemas.chunks import RawMessages
+from hearthlog.analyzer.export.merge import lasts
+from hearthlog.analyzer.logs.selection import Progress, Selection
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import NANOSECONDS, definition, typestore
-from hearthlog.schemas.writer import ENCODING, SCHEMA_ENCODING
+from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
+from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.messages.message_types import definition, typestore
+from hearthlog.schemas.times import NANOSECONDS
 
 _HEADER = "std_msgs/msg/Header"
 _NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*", re.ASCII)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from hearthlog.analyzer.selection import Progress, Selection
-from hearthlog.analyzer.splice import write_log
+from hearthlog.analyzer.export.merge import write_log
+from hearthlog.analyzer.logs.selection import Progress, Selection
 from hearthlog.schemas.errors import LogError
 
 

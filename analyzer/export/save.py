@@ -12,19 +12,19 @@ from typing import BinaryIO, Protocol
 from hearthlog.analyzer.export import audacity, wav
 from hearthlog.analyzer.export.audacity import LabelTrack
 from hearthlog.analyzer.export.csvfile import CsvFile
-from hearthlog.analyzer.export.names import file_stem, unused
 from hearthlog.analyzer.export.npz import save_npz
 from hearthlog.analyzer.export.parquet import ParquetFile
 from hearthlog.analyzer.export.rosbag1 import save_rosbag1
 from hearthlog.analyzer.export.rosbag2 import save_rosbag2
 from hearthlog.analyzer.export.wav import WavFiles
-from hearthlog.analyzer.known import is_of_type
-from hearthlog.analyzer.pieces import Piece, pieces
-from hearthlog.analyzer.selection import Progress, Selection
-from hearthlog.schemas import messages
+from hearthlog.analyzer.logs.channel_names import file_stem, unused
+from hearthlog.analyzer.logs.pieces import Piece, pieces
+from hearthlog.analyzer.logs.selection import Progress, Selection
+from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import check_new, new_file, sync_folder
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.logs.files import check_new, new_file, sync_folder
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.times import NANOSECONDS
 
 
 class Format(StrEnum):
@@ -41,8 +41,8 @@ class Format(StrEnum):
 
 ONE_TOPIC = {Format.parquet, Format.csv, Format.npz, Format.txt, Format.wav}
 _TYPES = {
-    Format.txt: (messages.SEGMENT, audacity.FIELDS),
-    Format.wav: (messages.RAW_AUDIO, wav.FIELDS),
+    Format.txt: (message_types.SEGMENT, audacity.FIELDS),
+    Format.wav: (message_types.RAW_AUDIO, wav.FIELDS),
 }
 
 

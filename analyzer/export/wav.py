@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.pieces import Piece
+from hearthlog.analyzer.logs.pieces import Piece
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
 
 FORMAT = "pcm-s16"
 FIELDS = {"timestamp", "data", "format", "sample_rate", "number_of_channels"}

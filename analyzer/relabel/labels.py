@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.logs.recorder_info import Origin
 from hearthlog.analyzer.relabel.layer import (
     About,
     Source,
@@ -28,17 +29,16 @@ from hearthlog.analyzer.relabel.reading import (
     recovered,
     warmed_up,
 )
-from hearthlog.analyzer.replay.origin import Origin
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.model import Model
-from hearthlog.models.modelfile import load_model
-from hearthlog.models.segments import Run, Segment
-from hearthlog.schemas.content import LogContent, Rows
+from hearthlog.models.labels.segments import Run, Segment
+from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import new_file, replaced_file, stem
-from hearthlog.schemas.provenance import METADATA
-from hearthlog.schemas.rows import Column
+from hearthlog.schemas.logs.files import new_file, replaced_file, stem
+from hearthlog.schemas.logs.log_stream import LogContent, Rows
+from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.messages.cdr_codec import Column
 
 
 class Job(NamedTuple):

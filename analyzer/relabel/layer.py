@@ -11,13 +11,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.models.segments import Run
-from hearthlog.schemas import messages
+from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import SUFFIX, stem
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.provenance import provenance, read_provenance
-from hearthlog.schemas.topics import Topic, topic
+from hearthlog.schemas.logs.files import SUFFIX, stem
+from hearthlog.schemas.logs.provenance import provenance, read_provenance
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic, topic
 
 _TAIL = 1 << 16  # bytes
 _NO_TOPIC = re.compile("[^A-Za-z0-9_]")
@@ -72,8 +72,8 @@ def topics_of(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topi
     name = _NO_TOPIC.sub("_", model)
     label, segment = (topic(microphone, f"relabel/{name}/{kind}") for kind in ("label", "segment"))
     return (
-        Topic(label, messages.LABEL, array_names={"probabilities": classes}),
-        Topic(segment, messages.SEGMENT),
+        Topic(label, message_types.LABEL, array_names={"probabilities": classes}),
+        Topic(segment, message_types.SEGMENT),
     )
 
 

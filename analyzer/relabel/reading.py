@@ -7,16 +7,16 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hearthlog.analyzer.relabel.neighbours import is_active
+from hearthlog.analyzer.logs.chains import is_active
+from hearthlog.analyzer.logs.recorder_info import Origin, read_origin
 from hearthlog.analyzer.relabel.stream import Stream
-from hearthlog.analyzer.replay.origin import Origin, read_origin
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.recorder.events import Gap
 from hearthlog.recorder.recovery import recover_log
-from hearthlog.recorder.stream import Gap
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.ranges import is_local
+from hearthlog.schemas.storage.byte_ranges import is_local
+from hearthlog.schemas.times import NANOSECONDS
 
 _WARM_UP = 30 * NANOSECONDS
 _EVER = (1 << 63) - 1

@@ -8,16 +8,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hearthlog.analyzer.logs.chains import Chain, find_chains, is_active
 from hearthlog.analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
 from hearthlog.analyzer.relabel.layer import About, digest, layer_path, read_about
-from hearthlog.analyzer.relabel.neighbours import Chain, find_chains, is_active
 from hearthlog.analyzer.workers import Workers
-from hearthlog.models.model import Model
-from hearthlog.models.segments import Run
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import stem
-from hearthlog.schemas.provenance import check_version
-from hearthlog.schemas.ranges import map_logs
+from hearthlog.schemas.logs.files import stem
+from hearthlog.schemas.logs.provenance import check_version
+from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.replay.recorded import Features
-from hearthlog.models.classifier import Classifier
-from hearthlog.models.segments import Run, Segment, Segmenter
-from hearthlog.recorder.stream import Gap
-from hearthlog.schemas.content import Rows
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.labels.segments import Run, Segment, Segmenter
+from hearthlog.recorder.events import Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.logs.log_stream import Rows
+from hearthlog.schemas.times import NANOSECONDS
 
 _STEP = NANOSECONDS // 5  # what the line through a sound card's times may jump by
 

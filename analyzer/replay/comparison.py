@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from hearthlog.recorder.pipeline import Record
-from hearthlog.schemas import messages
-from hearthlog.schemas.chunks import RawMessages
-from hearthlog.schemas.columns import decode
-from hearthlog.schemas.fields import fields_of, lacking
-from hearthlog.schemas.layout import MessageType, message_type
-from hearthlog.schemas.rows import Bytes, Int64, decode_rows
+from hearthlog.schemas.arrays import Bytes, Int64
+from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import decode_rows
+from hearthlog.schemas.messages.cdr_layout import MessageType, message_type
+from hearthlog.schemas.messages.fields import fields_of, lacking
 
 _Without = frozenset[str]  # fields that messages of another version do not have
 _Content = bytes | tuple[bytes, ...]  # of a message: all of it, or field by field
@@ -50,7 +51,7 @@ class Comparison:
         """Count the labels of one span of time; those from `end` on were not replayed."""
         for without, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, without) if time < end}
-            new = dict(_replayed(replayed, messages.LABEL, without))
+            new = dict(_replayed(replayed, message_types.LABEL, without))
             other = {time for time in old.keys() & new.keys() if new[time] != old[time]}
             identical = len(old.keys() & new.keys()) - len(other)
             self.labels += len(old)
@@ -75,7 +76,7 @@ class Comparison:
         met = self._waiting & {
             (time, without, data)
             for without in {without for _, without, _ in self._waiting}
-            for time, data in _replayed(replayed, messages.SEGMENT, without)
+            for time, data in _replayed(replayed, message_types.SEGMENT, without)
         }
         over = {item for item in self._waiting if item[0] < end}
         self.segments += len(met | over)
@@ -161,7 +162,7 @@ def _count_same(recorded: Sequence[RawMessages], replayed: Mapping[int, bytes]) 
         return 0
     sizes = np.array([len(data) for data in replayed.values()])
     buffer = np.frombuffer(b"".join(replayed.values()), np.uint8)
-    kind = message_type(messages.LABEL)
+    kind = message_type(message_types.LABEL)
     names = decode_rows(kind, buffer, np.cumsum(sizes) - sizes, sizes, ["label"])["label"]
     new = dict(zip(replayed, names.tolist(), strict=True))
     old = {

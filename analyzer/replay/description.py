@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from hearthlog.analyzer.replay.origin import Origin
-from hearthlog.models.card import CARD, DESCRIPTION, model_attachments
+from hearthlog.analyzer.logs.recorder_info import Origin
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.model import Model
+from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.log import LogDescription
 from hearthlog.recorder.pipeline import stream_info
-from hearthlog.schemas.provenance import provenance
-from hearthlog.schemas.topics import topics_of
+from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.messages.topics import topics_of
 
 
 def describe(

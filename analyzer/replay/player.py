@@ -7,21 +7,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event as Flag
 
+from hearthlog.analyzer.logs.recorder_info import Origin, features_of
 from hearthlog.analyzer.replay.comparison import Comparison
 from hearthlog.analyzer.replay.description import describe
-from hearthlog.analyzer.replay.origin import Origin, features_of
 from hearthlog.analyzer.replay.recorded import Features, Piece
-from hearthlog.models.classifier import Classifier
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.model import Model
+from hearthlog.recorder.events import Frames, Gap, Health
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline, Record
-from hearthlog.recorder.stream import Frames, Gap, Health
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import topic
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096

@@ -6,25 +6,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.known import is_of_type
-from hearthlog.analyzer.replay.origin import Origin, features_of
-from hearthlog.recorder.stream import Gap, Health
-from hearthlog.schemas import messages
-from hearthlog.schemas.chunks import RawMessages
-from hearthlog.schemas.columns import Columns, decode
+from hearthlog.analyzer.logs.recorder_info import Origin, features_of
+from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.recorder.events import Gap, Health
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.rows import Fields
-from hearthlog.schemas.series import iterate_messages
-from hearthlog.schemas.topics import DIAGNOSTICS, topic
+from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Fields
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, topic
 
-_HEARD = {"features": messages.FEATURES, "gap": messages.GAP}
-_TYPES = _HEARD | {"label": messages.LABEL, "segment": messages.SEGMENT}
+_HEARD = {"features": message_types.FEATURES, "gap": message_types.GAP}
+_TYPES = _HEARD | {"label": message_types.LABEL, "segment": message_types.SEGMENT}
 _FIELDS = {
-    messages.FEATURES: ("header.stamp", "frame", "values"),
-    messages.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
-    messages.DIAGNOSTICS: ("status",),
-    messages.LABEL: ("label",),
-    messages.SEGMENT: ("label",),
+    message_types.FEATURES: ("header.stamp", "frame", "values"),
+    message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
+    message_types.DIAGNOSTICS: ("status",),
+    message_types.LABEL: ("label",),
+    message_types.SEGMENT: ("label",),
 }
 _LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be made of
 _LARGEST_FRAME = 1 << 62
@@ -81,9 +81,9 @@ def read_recorded(
     kinds = _HEARD if heard_only else _TYPES
     topics = {topic(origin.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not heard_only:
-        topics[DIAGNOSTICS] = messages.DIAGNOSTICS
+        topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
     for batch in iterate_messages([origin.path], topics, start, end, check=heard_only):
-        found: _Found = {type_: [] for type_ in (*_TYPES.values(), messages.DIAGNOSTICS)}
+        found: _Found = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if is_of_type(raw.channel, raw.schema, type_, _FIELDS[type_]):
@@ -93,17 +93,23 @@ def read_recorded(
             events = _events(found, origin.microphone, width, buffers)
         except LogError as error:
             raise LogError(f"{origin.path}: {error}") from error
-        yield Piece(events, found[messages.LABEL], found[messages.SEGMENT])
+        yield Piece(events, found[message_types.LABEL], found[message_types.SEGMENT])
 
 
 def _events(
     found: _Found, microphone: str, width: int, buffers: Sequence[int]
 ) -> list[Features | Gap | Health]:
     """Put features, gaps and states into the order in which they were written."""
-    heard = [_features(raw, width) for raw in found[messages.FEATURES]]
-    others: list[Gap | Health | None] = [gap for raw in found[messages.GAP] for gap in _gaps(raw)]
-    others += [state for raw in found[messages.DIAGNOSTICS] for state in _health(raw, microphone)]
-    raws = found[messages.FEATURES] + found[messages.GAP] + found[messages.DIAGNOSTICS]
+    heard = [_features(raw, width) for raw in found[message_types.FEATURES]]
+    others: list[Gap | Health | None] = [
+        gap for raw in found[message_types.GAP] for gap in _gaps(raw)
+    ]
+    others += [
+        state for raw in found[message_types.DIAGNOSTICS] for state in _health(raw, microphone)
+    ]
+    raws = (
+        found[message_types.FEATURES] + found[message_types.GAP] + found[message_types.DIAGNOSTICS]
+    )
     if not raws:
         return []
     times = np.concatenate([raw.log_times for raw in raws])
@@ -134,7 +140,7 @@ def _runs(frames: Fields, rows: NDArray[np.intp]) -> Iterator[Features]:
 
 
 def _features(raw: RawMessages, width: int) -> Fields:
-    (columns,) = decode([raw], _FIELDS[messages.FEATURES])
+    (columns,) = decode([raw], _FIELDS[message_types.FEATURES])
     values, numbers = columns["values"], columns["frame"]
     if values.shape[1:] != (width,):
         raise LogError(f"{columns.topic}: frames are not of {width} values")
@@ -147,7 +153,7 @@ def _features(raw: RawMessages, width: int) -> Fields:
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:
-    (columns,) = decode([raw], _FIELDS[messages.GAP])
+    (columns,) = decode([raw], _FIELDS[message_types.GAP])
     starts = columns["header.stamp"]
     ends = starts + columns["duration"]
     _check_times(columns, ends)
@@ -157,7 +163,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
 
 def _health(raw: RawMessages, microphone: str) -> list[Health | None]:
     """Read the states of the source; None for messages about something else."""
-    (columns,) = decode([raw], _FIELDS[messages.DIAGNOSTICS])
+    (columns,) = decode([raw], _FIELDS[message_types.DIAGNOSTICS])
     name = f"hearthlog: {microphone}"
     return [
         next((_state(time, status) for status in array if status["name"] == name), None)

@@ -6,18 +6,18 @@ from threading import Event as Flag
 
 import numpy as np
 
-from hearthlog.analyzer.replay.clips import ClipFramer, read_clips
-from hearthlog.analyzer.replay.origin import Origin, read_origin
+from hearthlog.analyzer.logs.clips import ClipFramer, read_clips
+from hearthlog.analyzer.logs.recorder_info import Origin, read_origin
 from hearthlog.analyzer.replay.player import Player, Replay, Wanted
 from hearthlog.analyzer.replay.recorded import read_recorded
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.model import Model
-from hearthlog.models.modelfile import SUFFIX, load_model
-from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logfile import time_span
-from hearthlog.schemas.messages import NANOSECONDS
-from hearthlog.schemas.topics import topic
+from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
 
 _REWOUND = 60 * NANOSECONDS
 _EVER = (1 << 63) - 1

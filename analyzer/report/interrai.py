@@ -7,9 +7,9 @@ whose text is licensed. Most questions of the form are about the last three days
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.class_words import in_words, several_in_words
+from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.values import Count, Minutes
-from hearthlog.analyzer.report.words import in_words, several_in_words
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,

@@ -5,11 +5,21 @@ from collections.abc import Iterator, Sequence
 from html import escape
 
 from hearthlog.analyzer.colours import colour
-from hearthlog.analyzer.report import interrai, words
-from hearthlog.analyzer.report.account import Account
+from hearthlog.analyzer.report import class_words, interrai
 from hearthlog.analyzer.report.baseline import DAYS
-from hearthlog.analyzer.report.figures import Day
-from hearthlog.analyzer.report.gist import (
+from hearthlog.analyzer.report.class_words import (
+    clock_text,
+    in_words,
+    listed,
+    several_in_words,
+    times_in_words,
+)
+from hearthlog.analyzer.report.daily_metrics import Day
+from hearthlog.analyzer.report.html import box, figure, heading, page, paragraph, swatch, table
+from hearthlog.analyzer.report.read_home import LIVE
+from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
+from hearthlog.analyzer.report.summary_text import (
     gist_of_day,
     gist_of_week,
     longest_quiet,
@@ -18,17 +28,7 @@ from hearthlog.analyzer.report.gist import (
     percent,
     plain,
 )
-from hearthlog.analyzer.report.markup import box, figure, heading, page, paragraph, swatch, table
-from hearthlog.analyzer.report.reading import LIVE
-from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
 from hearthlog.analyzer.report.values import Count, Minutes, Value
-from hearthlog.analyzer.report.words import (
-    clock_text,
-    in_words,
-    listed,
-    several_in_words,
-    times_in_words,
-)
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
@@ -58,7 +58,7 @@ _RIGHT_IN_TESTS = (
 def day_page(account: Account, picture: bytes) -> str:
     """Write the page of a day."""
     day = account.days[0]
-    title = words.day_in_words(day.day)
+    title = class_words.day_in_words(day.day)
     body = [
         *_top(account, title, list(gist_of_day(account, day))),
         figure(picture, f"Timeline of {title}", _DAY_CAPTION),
@@ -75,7 +75,7 @@ def day_page(account: Account, picture: bytes) -> str:
 def week_page(account: Account, picture: bytes) -> str:
     """Write the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
-    spoken = f"{words.date_in_words(first)} to {words.date_in_words(last)}"
+    spoken = f"{class_words.date_in_words(first)} to {class_words.date_in_words(last)}"
     title = f"Week {first.isocalendar().week}, {spoken}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     absent = [in_words(name).lower() for name in account.classes if name not in (*names, SILENCE)]
@@ -204,7 +204,7 @@ def _week(account: Account, figures: Sequence[Figure]) -> str:
         heard = percent(share) if share else "not heard"
         values = [figure.value(day) if day.heard.length else None for figure in figures]
         cells = [escape(_short(value)) for value in values]
-        rows.append([escape(words.short_day(day.day)), heard, *cells])
+        rows.append([escape(class_words.short_day(day.day)), heard, *cells])
     rows.append(["All days", "", *(escape(_total(account.days, figure)) for figure in figures)])
     kinds = ["sum"]
     if account.comparable:

@@ -6,19 +6,19 @@ from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.hometime import day_span, midnight
-from hearthlog.analyzer.report.account import Account
+from hearthlog.analyzer.logs.health import Trouble
+from hearthlog.analyzer.logs.layers import Shelf, check_day
+from hearthlog.analyzer.logs.local_time import day_span, midnight
+from hearthlog.analyzer.logs.spans import common, one
 from hearthlog.analyzer.report.baseline import DAYS
-from hearthlog.analyzer.report.figures import HOUR, day_of, whole_home
+from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
 from hearthlog.analyzer.report.page import day_page, week_page
-from hearthlog.analyzer.report.picture import save_day, save_week
-from hearthlog.analyzer.report.reading import LIVE, Heard, read_heard
-from hearthlog.analyzer.report.shelf import Shelf, check_day
-from hearthlog.analyzer.report.spans import common, one
-from hearthlog.analyzer.report.trouble import Trouble
+from hearthlog.analyzer.report.read_home import LIVE, Heard, read_heard
+from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import check_new, new_file
+from hearthlog.schemas.logs.files import check_new, new_file
 
 WEEK = 7
 Progress = Callable[[float], None]

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from hearthlog.analyzer.report.figures import Day
+from hearthlog.analyzer.report.class_words import in_words, listed, several_in_words
+from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.values import Value
-from hearthlog.analyzer.report.words import in_words, listed, several_in_words
 from hearthlog.models.classes import COUGHING, CRYING, FLUSHING_WATER, SHOWER, TAP_WATER
 
 BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)

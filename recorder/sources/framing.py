@@ -7,9 +7,9 @@ import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.clock import SampleClock
-from hearthlog.recorder.stream import Frames, Gap
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
 
 _ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on no clock we know
 _LOSS_SECONDS = 0.010

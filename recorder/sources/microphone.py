@@ -9,10 +9,10 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.events import Event, Frames, Gap, Health
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import CaptureProcess
-from hearthlog.recorder.stream import Event, Frames, Gap, Health
-from hearthlog.schemas.messages import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _STALE_SECONDS = 3.0

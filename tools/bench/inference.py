@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
-from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.method import prepare, softmax
-from hearthlog.analyzer.svm_method import BANDS, LearnedSvm
-from hearthlog.models.classifier import Classifier
-from hearthlog.models.svm_rbf import SVM_RBF
+from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.method import prepare, softmax
+from hearthlog.analyzer.training.svm_method import BANDS, LearnedSvm
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
 from hearthlog.tools.bench.workload import Workload
@@ -55,7 +55,7 @@ def measure(work: Workload) -> Table:
 
 
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
-    """Fit what `hearthlog.analyzer.train` does, and calibrate it as scikit-learn does."""
+    """Fit what `hearthlog.analyzer.training.train` does, and calibrate it as scikit-learn does."""
     examples = prepare(BANDS, data)
     machine = BANDS.fit(examples).machine
     machine[-1].decision_function_shape = "ovr"  # the default, which its calibration needs

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from hearthlog.models.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.recorder.sources import capture
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.labmic import DEVICE, make_microphone

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-from hearthlog.schemas.columns import Columns, iterate_columns, read_columns
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.logfile import LogFile
-from hearthlog.schemas.messages import nanoseconds
-from hearthlog.schemas.records import HEAD, chunk_head
+from hearthlog.schemas.logs.columns import Columns, iterate_columns, read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import HEAD, chunk_head
+from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import BenchError, best_of, hearthlog
 from hearthlog.tools.bench.workload import Workload
@@ -32,7 +32,7 @@ _TWICE = Target(2, at_most=True)
 _PEAK_MEGABYTES = Target(100, at_most=True)
 _PEAK = """
 from pathlib import Path
-from hearthlog.schemas.columns import iterate_columns
+from hearthlog.schemas.logs.columns import iterate_columns
 def peak():  # of this process; what getrusage says begins with that of the one before it
     return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])
 before = peak()

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hearthlog.models.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of_processes
 from hearthlog.tools.bench.workload import Workload

@@ -12,15 +12,22 @@ import numpy as np
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from hearthlog.analyzer.dataset import Dataset
-from hearthlog.analyzer.train import train_model
-from hearthlog.analyzer.viterbi import viterbi
-from hearthlog.models.classifier import Classifier
-from hearthlog.models.model import Model
-from hearthlog.models.modelfile import save_model
-from hearthlog.models.svm_rbf import SVM_RBF
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import LABEL, definition, encode, header, message, nanoseconds
+from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.viterbi import viterbi
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.modelfile.modelfile import save_model
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.messages.message_types import (
+    LABEL,
+    definition,
+    encode,
+    header,
+    message,
+    nanoseconds,
+)
 from hearthlog.tools.bench.inference import fit_scikit_learn
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import HEARTHLOG, BenchError, hearthlog

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.viewer.window import open_hidden
+from hearthlog.analyzer.review.viewer.window import open_hidden
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import find_logs
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import BenchError, hearthlog
 from hearthlog.tools.bench.workload import Workload
@@ -26,9 +26,9 @@ _RUN = """
 import json, resource, sys, time
 began = float(sys.argv[1])
 from pathlib import Path
-from hearthlog.analyzer.viewer.window import open_hidden
+from hearthlog.analyzer.review.viewer.window import open_hidden
 with open_hidden() as viewer:
-    from hearthlog.analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     timeline = read_timeline([Path(sys.argv[2])])
     viewer.draw(timeline, close_up=False)
     viewer.wait_until_drawn()

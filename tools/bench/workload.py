@@ -9,13 +9,13 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.dataset import Dataset, build_dataset
-from hearthlog.analyzer.manifest import read_manifest
-from hearthlog.analyzer.scenario import BUILTIN, Scenario
-from hearthlog.analyzer.train import train_model
-from hearthlog.models.model import Model
-from hearthlog.models.modelfile import save_model
-from hearthlog.recorder.sources.files import read_audio
+from hearthlog.analyzer.training.dataset import Dataset, build_dataset
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.modelfile.modelfile import save_model
+from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.timing import BenchError
 from hearthlog.tools.home.simulate import write_day, write_training_set

@@ -9,11 +9,11 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from hearthlog.schemas.columns import Columns, read_columns
-from hearthlog.schemas.files import find_logs
-from hearthlog.schemas.messages import definition, encode, message, time_message
-from hearthlog.schemas.topics import Topic
-from hearthlog.schemas.writer import LogWriter, Rows
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.messages.message_types import definition, encode, message, time_message
+from hearthlog.schemas.messages.topics import Topic
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of, hearthlog
 from hearthlog.tools.bench.workload import Workload

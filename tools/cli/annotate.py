@@ -12,7 +12,7 @@ from hearthlog.tools.cli.reviewer import reviewer_name
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.marks import Mark
+    from hearthlog.analyzer.marks.marks import Mark
 
 annotate = typer.Typer(
     no_args_is_help=True,
@@ -41,9 +41,9 @@ def import_labels(
 
     Where they overlap older marks, they win; what stands there already stays as it is.
     """
-    from hearthlog.analyzer.exchange import new_marks, read_labels
-    from hearthlog.analyzer.heard import find_heard
-    from hearthlog.analyzer.marks import read_marks, write_marks
+    from hearthlog.analyzer.logs.coverage import find_heard
+    from hearthlog.analyzer.marks.formats import new_marks, read_labels
+    from hearthlog.analyzer.marks.marks import read_marks, write_marks
 
     _check_suffix(labels)
     name, now = reviewer_name(reviewer), time.time_ns()
@@ -72,10 +72,10 @@ def export_labels(
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.exchange import write_labels
-    from hearthlog.analyzer.heard import find_heard
-    from hearthlog.analyzer.marks import read_marks
-    from hearthlog.schemas.files import check_new
+    from hearthlog.analyzer.logs.coverage import find_heard
+    from hearthlog.analyzer.marks.formats import write_labels
+    from hearthlog.analyzer.marks.marks import read_marks
+    from hearthlog.schemas.logs.files import check_new
 
     _check_suffix(output)
     check_new(output)
@@ -94,7 +94,7 @@ def export_labels(
 
 
 def _check_suffix(path: Path) -> None:
-    from hearthlog.analyzer.exchange import SUFFIXES
+    from hearthlog.analyzer.marks.formats import SUFFIXES
 
     if path.suffix not in SUFFIXES:
         wrong_use(f"{path}: a label file is {_FORMS}")

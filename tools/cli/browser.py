@@ -8,7 +8,7 @@ import typer
 def show_page(address: str) -> None:
     """Say where a page is, and open it where there is a display."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.viewer.process import check_display
+    from hearthlog.analyzer.review.viewer.process import check_display
 
     typer.echo(f"hearthlog: open {address}", err=True)
     try:

@@ -10,7 +10,7 @@ from hearthlog.tools.cli.selection import End, Logs, Start, Topics, report_unfin
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.selection import Selection
+    from hearthlog.analyzer.logs.selection import Selection
 
 
 class Format(StrEnum):
@@ -35,7 +35,7 @@ def cat(
 
     Exit status 3: a log is unfinished.
     """
-    from hearthlog.analyzer.selection import select
+    from hearthlog.analyzer.logs.selection import select
 
     selection = select(logs, topics or [], *parse_span(start, end))
     if output_format is Format.csv and len(selection.channels) > 1:
@@ -49,8 +49,8 @@ def cat(
 
 
 def _print_lines(selection: "Selection", output_format: Format) -> None:
-    from hearthlog.analyzer.lines import in_order, json_lines, text_lines
-    from hearthlog.analyzer.pieces import pieces
+    from hearthlog.analyzer.export.text import in_order, json_lines, text_lines
+    from hearthlog.analyzer.logs.pieces import pieces
 
     lines = json_lines if output_format is Format.ndjson else text_lines
     for batch in selection.messages():
@@ -59,7 +59,7 @@ def _print_lines(selection: "Selection", output_format: Format) -> None:
 
 def _print_table(selection: "Selection") -> None:
     from hearthlog.analyzer.export.csvfile import CsvFile
-    from hearthlog.analyzer.pieces import pieces
+    from hearthlog.analyzer.logs.pieces import pieces
 
     for topic in selection.channels:
         table = CsvFile(sys.stdout.buffer, topic, selection)

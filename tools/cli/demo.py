@@ -20,11 +20,11 @@ def demo(
     ] = 24.0,
 ) -> None:
     """Simulate a home, learn its sounds, record and label a day of it, and draw the result."""
-    from hearthlog.analyzer.timeline.reading import read_timeline
-    from hearthlog.analyzer.viewer.file import save_timeline
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.viewer.file import save_timeline
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.service import record_files
-    from hearthlog.recorder.sources.replayed import FileSource
+    from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info
     from hearthlog.tools.cli.record import start_time
@@ -71,20 +71,15 @@ def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) ->
     """Share of the labels that the simulation meant in the middle of their window."""
     import numpy as np
 
-    from hearthlog.schemas import messages
-    from hearthlog.schemas.messages import nanoseconds
-    from hearthlog.schemas.reader import LogReader
+    from hearthlog.schemas.logs.columns import read_columns
+    from hearthlog.schemas.logs.files import find_logs
 
-    found = [
-        item.decode()
-        for log in sorted(logs.rglob("*.mcap"))
-        for item in LogReader(log).messages()
-        if item.type == messages.LABEL
-    ]
-    middle = np.array([(nanoseconds(m.header.stamp) - start) / 1e9 - 0.45 for m in found])
+    labels = read_columns(find_logs(logs), ["/mic/label"])["/mic/label"]
+    middle = (labels["header.stamp"] - start) / 1e9 - 0.45
     meant = np.searchsorted([end for _, end, _ in truth], middle, side="right")
-    agree = [m.label == truth[min(i, len(truth) - 1)][2] for m, i in zip(found, meant, strict=True)]
-    return float(np.mean(agree))
+    names = [name for _, _, name in truth]
+    true = np.array([*names, names[-1]], object)[meant]
+    return float(np.mean(labels["label"] == true))
 
 
 def _command(name: str) -> str:

@@ -15,8 +15,8 @@ from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.diff.listing import Span
-    from hearthlog.analyzer.diff.sources import Side, Sources
+    from hearthlog.analyzer.logs.labellings import Side, Sources
+    from hearthlog.analyzer.review.queue.review_list import Span
 
 _SHOWN, _QUEUED = 10, 60
 
@@ -57,7 +57,7 @@ def diff(
 
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
-    from hearthlog.analyzer.diff.sources import find_sources, segment_topic
+    from hearthlog.analyzer.logs.labellings import find_sources, segment_topic
 
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
@@ -91,9 +91,9 @@ class _Result(NamedTuple):
 
 
 def _difference(microphone: str, sides: "list[Side]", shown: int) -> _Result:
-    from hearthlog.analyzer.diff.difference import compare_sides
-    from hearthlog.analyzer.diff.listing import disagreements
-    from hearthlog.analyzer.diff.table import difference_table
+    from hearthlog.analyzer.evaluation.difference import compare_sides
+    from hearthlog.analyzer.evaluation.difference_table import difference_table
+    from hearthlog.analyzer.review.queue.review_list import disagreements
 
     found = compare_sides(*sides)
     about = {"microphone": microphone, **asdict(found)}
@@ -109,10 +109,10 @@ def _queue(
     limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:
-    from hearthlog.analyzer.diff.listing import queued
-    from hearthlog.analyzer.diff.queue import make_queue
-    from hearthlog.analyzer.diff.sources import REVIEW
-    from hearthlog.analyzer.diff.table import queue_table
+    from hearthlog.analyzer.logs.labellings import REVIEW
+    from hearthlog.analyzer.review.queue.queue_table import queue_table
+    from hearthlog.analyzer.review.queue.ranking import make_queue
+    from hearthlog.analyzer.review.queue.review_list import queued
 
     names = [side.name for side in sides]
     if REVIEW in names:
@@ -138,7 +138,7 @@ def _queue(
 
 
 def _write_list(path: Path, spans: "list[Span]") -> None:
-    from hearthlog.analyzer.diff.listing import write_list
+    from hearthlog.analyzer.review.queue.review_list import write_list
 
     write_list(path, spans)
     typer.echo(f"hearthlog: {len(spans)} spans are listed in {path}", err=True)
@@ -157,7 +157,7 @@ def _report_losses(sources: "Sources", topics: list[str]) -> None:
 
 
 def _check_list(path: Path | None) -> None:
-    from hearthlog.schemas.files import check_new
+    from hearthlog.schemas.logs.files import check_new
 
     if path is None:
         return

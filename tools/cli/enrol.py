@@ -37,7 +37,7 @@ def enrol(
 
     Features are kept, and no sound: a log in the folder `enrolled` of the home, all of it marked.
     """
-    from hearthlog.analyzer import enrol as enrolment
+    from hearthlog.analyzer.marks import enrol as enrolment
 
     least, most = enrolment.LEAST_SECONDS, enrolment.MOST_SECONDS
     if sum(given is not None for given in (file, log, microphone)) != 1:

@@ -13,11 +13,11 @@ from hearthlog.tools.cli.selection import wrong_use
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.dataset import Dataset
-    from hearthlog.analyzer.evaluation.events import Detections
-    from hearthlog.analyzer.evaluation.folds import Kind
-    from hearthlog.analyzer.evaluation.scores import Bin, Scores
-    from hearthlog.analyzer.method import Method
+    from hearthlog.analyzer.evaluation.evaluate_method import Kind
+    from hearthlog.analyzer.evaluation.event_scores import Detections
+    from hearthlog.analyzer.training.dataset import Dataset
+    from hearthlog.analyzer.training.method import Method
+    from hearthlog.analyzer.training.scores import Bin, Scores
 
 
 def evaluate(
@@ -116,11 +116,15 @@ def evaluate(
 def _evaluate_model(
     path: Path, data: Path, scenario: str | None, plot: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.evaluation.clips import check_classes, evaluate_model, scenario_of
+    from hearthlog.analyzer.evaluation.evaluate_model import (
+        check_classes,
+        evaluate_model,
+        scenario_of,
+    )
     from hearthlog.analyzer.evaluation.table import reliability_table
-    from hearthlog.analyzer.manifest import read_manifest
-    from hearthlog.analyzer.scenario import load_scenario
-    from hearthlog.models.modelfile import load_model
+    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.scenario import load_scenario
+    from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(path)
     chosen = scenario_of(model) if scenario is None else load_scenario(scenario)
@@ -167,7 +171,7 @@ def _evaluate_model(
 def _evaluate_method(
     data: Path, scenario: str, folds: str, method: str, plot: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.evaluation.folds import evaluate_method
+    from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
     from hearthlog.analyzer.evaluation.table import reliability_table
 
     chosen, by = chosen_method(method), _kind(folds)
@@ -201,8 +205,8 @@ def _evaluate_method(
 
 
 def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool) -> None:
+    from hearthlog.analyzer.evaluation.grid_search import search
     from hearthlog.analyzer.evaluation.table import search_table
-    from hearthlog.analyzer.search import search
 
     chosen, by = chosen_method(method), _kind(folds)
     segments = _segments(data, scenario, chosen)
@@ -223,7 +227,7 @@ def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool
 
 
 def _kind(folds: str) -> "Kind":
-    from hearthlog.analyzer.evaluation.folds import KINDS
+    from hearthlog.analyzer.evaluation.evaluate_method import KINDS
 
     kinds = [kind for kind in KINDS if kind == folds]
     if not kinds:
@@ -232,7 +236,7 @@ def _kind(folds: str) -> "Kind":
 
 
 def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: bool) -> None:
-    from hearthlog.analyzer.adaptation import adaptation_curve
+    from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
 
     chosen = chosen_method(method)
     segments = _segments(data, scenario, chosen)
@@ -250,9 +254,9 @@ def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: boo
 
 
 def _segments(data: Path, scenario: str, method: "Method") -> "Dataset":
-    from hearthlog.analyzer.dataset import build_dataset
-    from hearthlog.analyzer.manifest import read_manifest
-    from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.scenario import load_scenario
 
     chosen = load_scenario(scenario)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
@@ -263,8 +267,8 @@ def _segments(data: Path, scenario: str, method: "Method") -> "Dataset":
 def _evaluate_log(
     log: Path, reference: str, topic: str | None, plot: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.evaluation.labellings import read_labelled, read_reference
-    from hearthlog.analyzer.evaluation.reference import compare
+    from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
+    from hearthlog.analyzer.logs.labelling import read_labelled
 
     labelled = read_labelled(log, topic)
     wanted = read_reference(reference, log, labelled.microphone)
@@ -327,7 +331,7 @@ def _print_json(result: dict[str, Any]) -> None:
 
 
 def _check_plot(path: Path | None) -> None:
-    from hearthlog.schemas.files import check_new
+    from hearthlog.schemas.logs.files import check_new
 
     if path is None:
         return

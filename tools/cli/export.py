@@ -41,7 +41,7 @@ def export(
     """
     from hearthlog.analyzer.export.save import ONE_TOPIC, Format, fitting
     from hearthlog.analyzer.export.save import export as save
-    from hearthlog.analyzer.selection import select
+    from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
     one_file = output.suffix[1:] in _FORMATS[:-1]

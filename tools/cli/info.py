@@ -15,7 +15,7 @@ from hearthlog.tools.cli.selection import log_location
 from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.summary import Summary
+    from hearthlog.analyzer.logs.summary import Summary
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
 
@@ -44,12 +44,12 @@ def info(
     Exit status 3: a file is unfinished or damaged, or (without --catalog) sound is missing.
     """
     if catalog:
-        from hearthlog.tools.cli.fleet import make_catalog
+        from hearthlog.tools.cli.catalog import make_catalog
 
         make_catalog(path, as_json=as_json)
         return
-    from hearthlog.analyzer.summary import summarise
-    from hearthlog.schemas.files import find_logs
+    from hearthlog.analyzer.logs.summary import summarise
+    from hearthlog.schemas.logs.files import find_logs
     from hearthlog.tools.cli.progress import track
 
     summary = summarise(track(find_logs(path), "reading logs"))

@@ -17,8 +17,8 @@ def merge(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from hearthlog.analyzer.selection import select
-    from hearthlog.analyzer.splice import splice
+    from hearthlog.analyzer.export.merge import splice
+    from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
     check_log_name(output)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.method import Method
+    from hearthlog.analyzer.training.method import Method
 
 
 def chosen_method(name: str, **parameters: float | None) -> "Method":
     """Return a way to learn, with other parameters where they are given."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.methods import method_named
+    from hearthlog.analyzer.training.methods import method_named
 
     given = {key: value for key, value in parameters.items() if value is not None}
     for key, value in given.items():

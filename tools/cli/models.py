@@ -11,11 +11,11 @@ import typer
 from hearthlog.schemas.text import printable
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.compare import Comparison
-    from hearthlog.analyzer.dataset import Recording
-    from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.analyzer.evaluation.compare_models import Comparison
+    from hearthlog.analyzer.training.dataset import Recording
+    from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.features.feature_set import FeatureSet
-    from hearthlog.models.registry import Entry
+    from hearthlog.models.modelfile.registry import Entry
 
 models = typer.Typer(
     no_args_is_help=True, help="Keep models in a folder: compare them, and choose which speaks."
@@ -41,7 +41,7 @@ _Json = Annotated[bool, typer.Option("--json", help="Print it as JSON.")]
 @models.command("list")
 def list_(folder: _Folder = None, as_json: _Json = False) -> None:
     """List the models; exit status 3: one of them cannot be used."""
-    from hearthlog.models.registry import list_models
+    from hearthlog.models.modelfile.registry import list_models
 
     found = list_models(_folder(folder))
     bad = [entry for entry in found if entry.model is None]
@@ -62,8 +62,8 @@ def show(
     as_json: _Json = False,
 ) -> None:
     """Print a model's card: what it tells apart, how well, and what it learned from."""
-    from hearthlog.models.card import model_card
-    from hearthlog.models.registry import load
+    from hearthlog.models.modelfile.card import model_card
+    from hearthlog.models.modelfile.registry import load
 
     model = load(_folder(folder), name)
     if as_json:
@@ -98,11 +98,11 @@ def compare(
 
     Sources that one of them has learned from are left out. Exit status 3: there are no others.
     """
-    from hearthlog.analyzer.compare import compare_models
-    from hearthlog.analyzer.evaluation.clips import scenario_of
-    from hearthlog.analyzer.scenario import load_scenario
+    from hearthlog.analyzer.evaluation.compare_models import compare_models
+    from hearthlog.analyzer.evaluation.evaluate_model import scenario_of
+    from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.models.registry import load
+    from hearthlog.models.modelfile.registry import load
     from hearthlog.tools.cli.selection import wrong_use
 
     if (data is None) == (logs is None):
@@ -132,7 +132,7 @@ def promote(
     to: Annotated[Alias, typer.Option(help="What it becomes.")] = Alias.champion,
 ) -> None:
     """Check a model, and make it the champion in one step; a recorder that runs takes it over."""
-    from hearthlog.models.registry import promote as promote_model
+    from hearthlog.models.modelfile.registry import promote as promote_model
 
     place = _folder(folder)
     model, before = promote_model(place, name, to.value)
@@ -145,7 +145,7 @@ def promote(
 @models.command()
 def rollback(folder: _Folder = None) -> None:
     """Make the champion before the champion again."""
-    from hearthlog.models.registry import rollback as roll_back
+    from hearthlog.models.modelfile.registry import rollback as roll_back
 
     model, before = roll_back(_folder(folder))
     print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
@@ -154,9 +154,9 @@ def rollback(folder: _Folder = None) -> None:
 def _recordings(
     data: Path | None, logs: Path | None, scenario: "Scenario", features: "FeatureSet"
 ) -> "list[Recording]":
-    from hearthlog.analyzer.dataset import clip_recordings
-    from hearthlog.analyzer.home import home_recordings
-    from hearthlog.analyzer.manifest import read_manifest
+    from hearthlog.analyzer.training.dataset import clip_recordings
+    from hearthlog.analyzer.training.home_data import home_recordings
+    from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.tools.cli.progress import share_done
 
     if logs is not None:

@@ -71,7 +71,7 @@ def record(
     """
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.service import record_files, record_microphone
-    from hearthlog.recorder.sources.replayed import FileSource
+    from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.tools.cli.progress import share_done
 
     given = {

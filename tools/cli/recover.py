@@ -61,7 +61,7 @@ def recover(
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
     from hearthlog.recorder.recovery import recover_in_place, recover_log
-    from hearthlog.schemas.files import SUFFIX, new_file, stem
+    from hearthlog.schemas.logs.files import SUFFIX, new_file, stem
     from hearthlog.tools.cli.progress import share_done
 
     with share_done(f"recovering {log.name}") as progress:

@@ -40,7 +40,7 @@ def relabel(
     """
     from hearthlog.analyzer.relabel.run import relabel as run
     from hearthlog.analyzer.workers import open_workers
-    from hearthlog.models.modelfile import load_model
+    from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.tools.cli.progress import steps_done
 
     loaded = load_model(model)

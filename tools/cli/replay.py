@@ -19,10 +19,10 @@ import typer
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.replay.origin import Origin
+    from hearthlog.analyzer.logs.recorder_info import Origin
     from hearthlog.analyzer.replay.player import Replay, Wanted
     from hearthlog.analyzer.replay.replay import LogSet
-    from hearthlog.models.model import Model
+    from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
 
@@ -76,7 +76,7 @@ def replay(
     """
     from hearthlog.analyzer.replay.player import Wanted
     from hearthlog.analyzer.replay.replay import LogSet
-    from hearthlog.schemas.files import find_logs
+    from hearthlog.schemas.logs.files import find_logs
 
     if not 0 <= start_offset < math.inf:
         wrong_use(f"--start-offset {start_offset}: not a number of seconds from 0")
@@ -125,7 +125,7 @@ class _Models:
     """
 
     def __init__(self, given: Path | None, folders: Sequence[Path]) -> None:
-        from hearthlog.models.modelfile import load_model
+        from hearthlog.models.modelfile.modelfile import load_model
 
         self._given = None if given is None else load_model(given)
         self._folders = folders
@@ -177,12 +177,12 @@ def _parse_rate(text: str) -> float | None:
 def _check_output(output: Path | None, source: Path) -> None:
     """Refuse an output that exists, or that would get among what is replayed."""
     from hearthlog.schemas.errors import LogError
-    from hearthlog.schemas.files import check_new
+    from hearthlog.schemas.logs.files import check_new
 
     if output is None:
         return
     if output.suffix == ".rrd":
-        from hearthlog.analyzer.viewer.file import check_output
+        from hearthlog.analyzer.review.viewer.file import check_output
 
         check_output(output)
         return
@@ -204,8 +204,8 @@ def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
 
     if wanted.output is None or wanted.output.suffix != ".rrd":
         return run(wanted)
-    from hearthlog.analyzer.timeline.reading import read_timeline
-    from hearthlog.analyzer.viewer.file import save_timeline
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.viewer.file import save_timeline
 
     output = wanted.output
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:

@@ -11,7 +11,7 @@ from hearthlog.tools.cli.selection import Logs, wrong_use
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.report.shelf import Shelf
+    from hearthlog.analyzer.logs.layers import Shelf
 
 _YEARS = range(1970, 2200)
 
@@ -50,9 +50,9 @@ def report(
         wrong_use(f"--output {output}: a page is named *.html")
     first = None if day is None and week is None else _first_day(day, week)
 
-    from hearthlog.analyzer.hometime import home_zone
+    from hearthlog.analyzer.logs.layers import find_shelf
+    from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
-    from hearthlog.analyzer.report.shelf import find_shelf
 
     shelf = find_shelf(logs)
     zone = home_zone(timezone, shelf.records())

@@ -20,10 +20,10 @@ from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.review.marking import Marking
-    from hearthlog.analyzer.review.session import Item
-    from hearthlog.analyzer.timeline.contents import Timeline
-    from hearthlog.analyzer.viewer.viewer import Viewer
+    from hearthlog.analyzer.review.session.marking import Marking
+    from hearthlog.analyzer.review.session.session import Item
+    from hearthlog.analyzer.review.timeline.contents import Timeline
+    from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _SPANS = 60
 _ALL_FRAMES = 3 * 3600 * 10**9  # ns: of more, the viewer would take a gigabyte
@@ -98,8 +98,8 @@ def _end(number: int, _frame: object) -> None:
 
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
     """Read the option --day: from midnight to midnight, at home."""
-    from hearthlog.analyzer.hometime import day_span
-    from hearthlog.analyzer.timeline.files import zone_of
+    from hearthlog.analyzer.logs.local_time import day_span
+    from hearthlog.analyzer.logs.timeline_files import zone_of
 
     zone = zone_of(logs, timezone)
     today = datetime.now(zone).date()
@@ -113,7 +113,7 @@ def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None,
 def _read(
     logs: list[Path], limits: tuple[int | None, int | None], timezone: str | None
 ) -> "Timeline":
-    from hearthlog.analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 
     with share_done("reading logs") as progress:
         return read_timeline(logs, *limits, zone=timezone, progress=progress)
@@ -125,7 +125,7 @@ def _save(
     timezone: str | None,
     output: Path,
 ) -> "Timeline":
-    from hearthlog.analyzer.viewer.file import check_output, save_timeline
+    from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
 
     check_output(output)
     timeline = _read(logs, limits, timezone)
@@ -139,10 +139,10 @@ def _save(
 def _open(*, web: bool, port: int | None) -> "Viewer":
     """Start the viewer before logs are read: it takes its time as well."""
     if web:
-        from hearthlog.analyzer.viewer.web import open_page
+        from hearthlog.analyzer.review.viewer.web import open_page
 
         return open_page(port)
-    from hearthlog.analyzer.viewer.window import open_window
+    from hearthlog.analyzer.review.viewer.window import open_window
 
     return open_window(port)
 
@@ -160,10 +160,10 @@ class _Choice(NamedTuple):
 
 def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
     """Show a timeline until the reviewer is done."""
-    from hearthlog.analyzer.hometime import home_zone
-    from hearthlog.analyzer.review.session import Session
-    from hearthlog.analyzer.review.sound import listen
-    from hearthlog.analyzer.timeline.reading import read_timeline
+    from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.analyzer.review.session.session import Session
+    from hearthlog.analyzer.review.session.sound import listen
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 
     microphone = _microphone(timeline, choice.microphone)
     items, marking = _work(timeline, logs, choice, microphone)
@@ -209,10 +209,10 @@ def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[Item], Marking]":
     """Find what is to be gone through, and what is corrected."""
-    from hearthlog.analyzer.diff.sources import find_sources
-    from hearthlog.analyzer.review.marking import Marking
-    from hearthlog.analyzer.review.queue import queue_items
-    from hearthlog.analyzer.timeline.contents import LIVE, no_spans
+    from hearthlog.analyzer.logs.labellings import find_sources
+    from hearthlog.analyzer.review.session.marking import Marking
+    from hearthlog.analyzer.review.session.queue_items import queue_items
+    from hearthlog.analyzer.review.timeline.contents import LIVE, no_spans
 
     known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []

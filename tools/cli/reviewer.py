@@ -7,7 +7,7 @@ from hearthlog.tools.cli.selection import wrong_use
 
 def reviewer_name(given: str | None) -> str:
     """Name the reviewer; empty if nobody is named, and the login has no name."""
-    from hearthlog.analyzer.marks import NAME
+    from hearthlog.analyzer.marks.marks import NAME
 
     if given is not None:
         name = given.strip()

@@ -8,14 +8,14 @@ import typer
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.selection import Selection
+    from hearthlog.analyzer.logs.selection import Selection
 
 
 def log_location(text: str) -> Path:
     """Read the name of a log or a folder, which may be the URL of a store."""
     if "://" not in text:
         return Path(text)
-    from hearthlog.analyzer.storage import location
+    from hearthlog.analyzer.logs.locations import location
 
     return location(text)
 

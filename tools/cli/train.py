@@ -12,11 +12,11 @@ from hearthlog.tools.cli.progress import steps_done
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.dataset import Dataset, Recording
-    from hearthlog.analyzer.method import Method
-    from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.analyzer.training.dataset import Dataset, Recording
+    from hearthlog.analyzer.training.method import Method
+    from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.models.classifiers.model import Model
     from hearthlog.models.features.feature_set import FeatureSet
-    from hearthlog.models.model import Model
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
@@ -58,7 +58,7 @@ def train(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Learn a model from labelled sound, and measure it on sources it has not heard."""
-    from hearthlog.models.modelfile import check_output, load_model, save_model
+    from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
 
     check_output(output)
     if base is not None:
@@ -87,10 +87,10 @@ def train(
 def _learned(
     data: list[Path], scenario: str, home: list[Path], method: "Method", smoothing: str
 ) -> tuple["Model", "Dataset"]:
-    from hearthlog.analyzer.dataset import build_dataset
-    from hearthlog.analyzer.manifest import read_manifest
-    from hearthlog.analyzer.scenario import load_scenario
-    from hearthlog.analyzer.train import SMOOTHINGS, train_model
+    from hearthlog.analyzer.training.dataset import build_dataset
+    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.scenario import load_scenario
+    from hearthlog.analyzer.training.train import SMOOTHINGS, train_model
 
     if smoothing not in SMOOTHINGS:
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
@@ -105,11 +105,11 @@ def _learned(
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
-    from hearthlog.analyzer.dataset import cut_recordings
-    from hearthlog.analyzer.home import home_sequences
-    from hearthlog.analyzer.train import adapt_model
+    from hearthlog.analyzer.training.dataset import cut_recordings
+    from hearthlog.analyzer.training.home_data import home_sequences
+    from hearthlog.analyzer.training.train import adapt_model
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.models.modelfile import load_model
+    from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(base)
     features = feature_set(model.description.feature_set)
@@ -120,7 +120,7 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
 
 
 def _scenario(model: "Model") -> "Scenario":
-    from hearthlog.analyzer.scenario import Scenario
+    from hearthlog.analyzer.training.scenario import Scenario
 
     about = model.description
     classes = {name: tuple(labels) for name, labels in about.scenario.items()}
@@ -132,7 +132,7 @@ def _manifest(path: Path) -> Path:
 
 
 def _heard_at(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
-    from hearthlog.analyzer.home import home_recordings
+    from hearthlog.analyzer.training.home_data import home_recordings
 
     for folder in folders:
         yield from home_recordings(folder, features)
@@ -149,7 +149,7 @@ def _warn_of_few(segments: "Dataset") -> None:
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
-    from hearthlog.models.classifier import classifier_kind
+    from hearthlog.models.classifiers.classifier import classifier_kind
 
     about, metrics = model.description, model.description.metrics
     width = max(len(name) for name in (*about.classes, "class"))

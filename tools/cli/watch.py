@@ -13,8 +13,8 @@ from hearthlog.tools.cli.browser import show_page
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.viewer.live import LiveServer
-    from hearthlog.analyzer.viewer.viewer import Viewer
+    from hearthlog.analyzer.review.viewer.live import LiveServer
+    from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _LOOPBACK = "127.0.0.1"
 _POLL_SECONDS = 0.2
@@ -53,8 +53,8 @@ def watch(
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
-    from hearthlog.analyzer.hometime import home_zone
-    from hearthlog.analyzer.timeline.live import last_time
+    from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.analyzer.review.timeline.live import last_time
 
     newest = last_time(logs)
     home_zone(timezone)
@@ -77,8 +77,8 @@ def watch(
 
 
 def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool) -> "LiveServer":
-    from hearthlog.analyzer.viewer.live import PORT, LiveServer
-    from hearthlog.analyzer.viewer.process import free_port
+    from hearthlog.analyzer.review.viewer.live import PORT, LiveServer
+    from hearthlog.analyzer.review.viewer.process import free_port
 
     if serve:
         port = port or PORT
@@ -88,8 +88,8 @@ def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool
 
 
 def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
-    from hearthlog.analyzer.viewer.web import open_page
-    from hearthlog.analyzer.viewer.window import open_window
+    from hearthlog.analyzer.review.viewer.web import open_page
+    from hearthlog.analyzer.review.viewer.window import open_window
 
     if not web:
         return open_window(data=url)
@@ -118,10 +118,10 @@ def _follow(
     logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
-    from hearthlog.analyzer.timeline.files import zone_of
-    from hearthlog.analyzer.timeline.live import Live
+    from hearthlog.analyzer.logs.timeline_files import zone_of
+    from hearthlog.analyzer.review.timeline.live import Live
     from hearthlog.schemas.errors import LogError
-    from hearthlog.schemas.follow import follow_messages
+    from hearthlog.schemas.logs.follow import follow_messages
 
     told: deque[str] = deque(maxlen=_MOST_TROUBLES)
 

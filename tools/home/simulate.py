@@ -10,7 +10,7 @@ import soundfile
 from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.description import SIMULATED
+from hearthlog.models.classifiers.description import SIMULATED
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.sounds import (
     LABELS,

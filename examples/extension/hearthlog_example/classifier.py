@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from hearthlog.models.classifier_kind import ClassifierKind
-from hearthlog.models.model import Array, Model
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.model import Array, Model
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

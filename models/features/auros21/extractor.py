@@ -10,9 +10,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.models.batch_invariant import rowwise_matmul
 from hearthlog.models.features.auros21.inputs import dct_weights
 from hearthlog.models.features.auros21.names import CEPSTRA, FEATURE_NAMES, MEL_BANDS
-from hearthlog.models.rowwise import rowwise_matmul
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 _BINS = FRAME_SAMPLES // 2

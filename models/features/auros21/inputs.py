@@ -10,9 +10,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.models.batch_invariant import rowwise_matmul
 from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY, FEATURE_NAMES, FLUX, MEL_BANDS
 from hearthlog.models.features.window_inputs import WindowStatistics
-from hearthlog.models.rowwise import rowwise_matmul
 
 WINDOW_FRAMES = 20
 _SCALARS, _WIDTH = CEPSTRA.start, len(FEATURE_NAMES)

@@ -1,1 +1,0 @@
-"""Two labellings of the same logs: where they differ, and what to review next."""

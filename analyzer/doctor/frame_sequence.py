@@ -1,0 +1,335 @@
+"""Frame numbers, stamps and gaps of one microphone: what the messages must say together."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+
+# Behind a sound server stamps are steered by when blocks arrive, at first by up to 45 % (ns).
+_STEP_TOLERANCE = FRAME_NANOSECONDS // 2
+_RATE_TOLERANCE = 2e-3  # of a sound card's clock
+_DELAY = 1_000_000_000  # ns; of a block that comes late
+_GAP_TOLERANCE = 1_000_000  # ns
+_NONE = np.empty((0, 3), np.int64)
+
+FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
+
+
+class _Steps(NamedTuple):
+    """The way to each frame from the one before it; arrays of one row a frame.
+
+    Attributes
+    ----------
+    rows : np.ndarray [shape=(n, 3)]
+        Log time, frame and stamp.
+    known : np.ndarray [shape=(n,)], bool
+        Whether there is one before it.
+    numbers, elapsed : np.ndarray [shape=(n,)], int64
+        By how much the frame number and the stamp (ns) have grown.
+    gaps, lost : np.ndarray [shape=(n,)], int64
+        How many gaps lie between, and the frames that they lost.
+    """
+
+    rows: Int64
+    known: NDArray[np.bool_]
+    numbers: Int64
+    elapsed: Int64
+    gaps: Int64
+    lost: Int64
+
+
+class Frames:
+    """Follows one microphone through a file.
+
+    Messages are added as rows of three numbers: log time, frame and stamp; of segments log time,
+    start and end; of gaps log time (their end), start, and the frames that they lost.
+
+    Parameters
+    ----------
+    findings : Findings
+    microphone : str
+    statistics_every : int or None
+        Frames from one statistics message to the next, if that is known.
+    window_frames : int
+        Which end with a frame that has a label.
+    labelled : bool
+        Whether there is a model.
+
+    Attributes
+    ----------
+    first, last : tuple of int, or None
+        Frame and stamp of the first and the last frame.
+    lost_before : int
+        Frames that gaps before the first frame lost.
+    gap_before : tuple of int, or None
+        Start and end of the first of these gaps.
+    """
+
+    def __init__(
+        self,
+        findings: Findings,
+        microphone: str,
+        statistics_every: int | None,
+        window_frames: int,
+        *,
+        labelled: bool,
+    ) -> None:
+        self.first: tuple[int, int] | None = None
+        self.last: tuple[int, int] | None = None
+        self.lost_before = 0
+        self.gap_before: tuple[int, int] | None = None
+        self._findings = findings
+        self._name = microphone
+        self._every = statistics_every
+        self._window = window_frames
+        self._labelled = labelled
+        self._pending: dict[str, list[Int64]] = {}
+        self._previous: tuple[int, int] | None = None
+        self._run: tuple[int, int] | None = None  # the first frame since the last gap
+        self._heard = 0  # frames since then
+        self._segment_end: int | None = None
+        self._gap_ends: Int64 = np.empty(0, np.int64)
+        self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
+
+    def add(self, kind: str, rows: Int64) -> None:
+        """Add messages of one kind [shape=(n, 3)], in the order of their log times."""
+        self._pending.setdefault(kind, []).append(rows)
+
+    def interrupt(self) -> None:
+        """Take note that messages are missing here, because the file is damaged."""
+        self.finish()
+        self._pending.clear()
+        self._previous = self._run = self._segment_end = None
+
+    def begin_anew(self, time: int) -> None:
+        """Take note that from a log time on this is another recording, or its next log."""
+        self.settle(time)
+        self._previous = self._run = self._segment_end = None
+
+    def finish(self) -> None:
+        """Check the last frame; what a killed recorder did not write of it is not missed."""
+        self._check_features(self._take(FEATURES, None), self._take(GAP, None))
+        self._check_segments(self._take(SEGMENT, None))
+
+    def settle(self, until: int | None) -> None:
+        """Check everything before some log time, of which nothing more will come."""
+        features, statistics, labels, segments, gaps = (
+            self._take(kind, until) for kind in (FEATURES, STATISTICS, LABEL, SEGMENT, GAP)
+        )
+        runs = self._check_features(features, gaps)
+        self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
+        if self._labelled:
+            self._check_same(features, labels, LABEL, self._with_label(features, labels, runs))
+        self._check_segments(segments)
+
+    def _take(self, kind: str, until: int | None) -> Int64:
+        parts = self._pending.pop(kind, None)
+        if not parts:
+            return _NONE
+        rows = np.concatenate(parts)
+        if until is None:
+            return rows
+        done = rows[:, 0] < until
+        if not done.all():
+            self._pending[kind] = [rows[~done]]
+        return rows[done]
+
+    def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
+        """Compare frame numbers, stamps and gaps; return at which frames a known gap ends."""
+        following = np.searchsorted(rows[:, 2], gaps[:, 0])
+        waiting = following == len(rows)
+        if waiting.any():  # for the next frame
+            self._pending[GAP] = [gaps[waiting], *self._pending.get(GAP, [])]
+        if not len(rows):
+            self._begins = np.empty(0, bool)
+            return self._begins
+        gaps, following = gaps[~waiting], following[~waiting]
+        self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
+        count = np.bincount(following, minlength=len(rows))
+        lost = np.zeros(len(rows), np.int64)
+        np.add.at(lost, following, gaps[:, 2])
+        if self.first is None:
+            self.first = int(rows[0, 1]), int(rows[0, 2])
+            self.lost_before = int(lost[0])
+            if count[0]:
+                self.gap_before = int(gaps[0, 1]), int(gaps[0, 0])
+        # Before the first frame of which the one before is not known, one is made up.
+        before = self._previous or (int(rows[0, 1]) - 1, int(rows[0, 2]))
+        known = np.ones(len(rows), bool)
+        known[0] = self._previous is not None
+        numbers = np.diff(rows[:, 1], prepend=before[0])
+        elapsed = np.diff(rows[:, 2], prepend=before[1])
+        steps = _Steps(rows, known, numbers, elapsed, count, lost)
+        self._check_steps(steps)
+        self._check_gaps(steps, gaps, following)
+        self._begins = (count > 0) | (numbers != 1) | ~known
+        self._check_rate(rows)
+        self._previous = self.last = int(rows[-1, 1]), int(rows[-1, 2])
+        return (count > 0) | (rows[:, 1] == 0)
+
+    def _check_steps(self, steps: _Steps) -> None:
+        """Check numbers and stamps, and that a gap speaks of every jump."""
+        rows, known, numbers, elapsed, gaps, lost = steps
+        times, frames, _ = rows.T
+        report = self._report
+        report(
+            "frame-order",
+            known & (numbers <= 0),
+            times,
+            lambda i: f"frame {frames[i]} follows frame {frames[i] - numbers[i]}",
+        )
+        report(
+            "frame-jump",
+            known & (numbers > 1) & (gaps == 0),
+            times,
+            lambda i: f"frame {frames[i]} comes after {numbers[i] - 1} others that no gap explains",
+        )
+        report(
+            "gap-frames",
+            known & (gaps > 0) & (numbers > 0) & (numbers != lost + 1),
+            times,
+            lambda i: f"a gap of {lost[i]} frames where the numbers jump by {numbers[i] - 1}",
+        )
+        wrong = np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
+        report(
+            "stamp-step",
+            known & (numbers == 1) & (gaps == 0) & wrong,
+            times,
+            lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
+        )
+
+    def _check_gaps(self, steps: _Steps, gaps: Int64, following: NDArray[np.intp]) -> None:
+        """Check that gaps begin where the frame before them ends, and end where the next begins."""
+        alone = steps.gaps[following] == 1
+        stamps = steps.rows[following, 2]
+        early = stamps - steps.elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
+        wrong = steps.known[following] & (np.abs(early) > _GAP_TOLERANCE)
+        wrong |= np.abs(stamps - gaps[:, 0]) > _GAP_TOLERANCE
+        self._report(
+            "gap-times",
+            alone & wrong,
+            gaps[:, 0],
+            lambda _: "a gap does not lie between the frames before and behind it",
+        )
+
+    def _check_rate(self, rows: Int64) -> None:
+        """Compare stamps with frame numbers, from the last gap on."""
+        times, frames, stamps = rows.T
+        starts = np.flatnonzero(self._begins)
+        if len(starts):
+            self._run = int(frames[starts[-1]]), int(stamps[starts[-1]])
+        if self._run is None:
+            return
+        heard = (int(frames[-1]) - self._run[0]) * FRAME_NANOSECONDS
+        elapsed = int(stamps[-1]) - self._run[1]
+        if abs(elapsed - heard) > _RATE_TOLERANCE * heard + _DELAY:
+            what = (
+                f"{self._name}: {heard / 1e9:.2f} s of frames lie {elapsed / 1e9:.2f} s apart "
+                "by their stamps"
+            )
+            self._findings.error("stamp-rate", what, DISTRUST, time=int(times[-1]))
+            self._run = int(frames[-1]), int(stamps[-1])
+
+    def _with_statistics(self, features: Int64) -> NDArray[np.bool_] | None:
+        if self._every is None:
+            return None
+        return features[:, 1] % self._every == 0
+
+    def _with_label(
+        self, features: Int64, labels: Int64, known_start: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Tell which frames end a second that was heard as a whole."""
+        heard = np.empty(len(features), np.int64)
+        if not len(features):
+            return heard > 0
+        starts = np.flatnonzero(self._begins).tolist()
+        for start, end in zip([0, *starts], [*starts, len(features)], strict=True):
+            if start == end:
+                continue
+            if self._begins[start]:
+                first = int(features[start, 1])
+                self._heard = 0 if known_start[start] else self._guess(first, labels)
+            heard[start:end] = self._heard + np.arange(1, end - start + 1)
+            self._heard = min(int(heard[end - 1]), self._window)
+        return heard >= self._window
+
+    def _guess(self, frame: int, labels: Int64) -> int:
+        """Guess how many frames were heard before one of which that is not known."""
+        first = np.searchsorted(labels[:, 1], frame)
+        if first == len(labels):
+            return 0
+        return int(max(self._window - 1 - (labels[first, 1] - frame), 0))
+
+    def _check_same(
+        self, features: Int64, rows: Int64, kind: str, wanted: NDArray[np.bool_] | None
+    ) -> None:
+        """Compare messages of another kind with the features of the same frames."""
+        times, frames, stamps = rows.T
+        expected = features if wanted is None else features[wanted]
+        extra = ~np.isin(frames, expected[:, 1])
+        report = self._report
+        report(
+            "frame-order",
+            np.diff(frames, prepend=frames[:1] - 1) <= 0,
+            times,
+            lambda i: f"{kind} of frame {frames[i]} follow a later frame",
+        )
+        report(
+            f"{kind}-frames",
+            extra,
+            times,
+            lambda i: f"there should be no {kind} of frame {frames[i]}",
+        )
+        if wanted is not None:
+            report(
+                f"{kind}-frames",
+                ~np.isin(expected[:, 1], frames),
+                expected[:, 0],
+                lambda i: f"there is no {kind} of frame {expected[i, 1]}",
+            )
+        order = np.argsort(expected[:, 1], kind="stable")
+        same = np.flatnonzero(~extra)
+        at = order[np.searchsorted(expected[order, 1], frames[same])]
+        wrong = np.zeros(len(rows), bool)
+        wrong[same] = expected[at, 2] != stamps[same]
+        report(
+            "frame-stamp",
+            wrong,
+            times,
+            lambda i: f"{kind} of frame {frames[i]} have another stamp than its features",
+        )
+
+    def _check_segments(self, rows: Int64) -> None:
+        """Segments follow each other, with nothing but gaps between them."""
+        if not len(rows):
+            return
+        times, starts, ends = rows.T
+        first = int(starts[0]) if self._segment_end is None else self._segment_end
+        before = np.concatenate([[first], ends[:-1]])
+        late = starts - before
+        self._report(
+            "segment-overlap",
+            late < 0,
+            times,
+            lambda i: f"a segment begins {-late[i] / 1e9:.3f} s before the last one has ended",
+        )
+        gaps = np.searchsorted(self._gap_ends, starts, "right")
+        gaps -= np.searchsorted(self._gap_ends, before, "right")
+        self._report(
+            "segment-hole",
+            (late > 0) & (gaps <= 0),
+            times,
+            lambda i: f"nothing is said of the {late[i] / 1e9:.3f} s before a segment",
+        )
+        self._segment_end = int(ends[-1])
+        self._gap_ends = self._gap_ends[self._gap_ends > self._segment_end]
+
+    def _report(
+        self, rule: str, wrong: NDArray[np.bool_], times: Int64, what: Callable[[int], str]
+    ) -> None:
+        self._findings.rows(rule, wrong, times, lambda row: f"{self._name}: {what(row)}")

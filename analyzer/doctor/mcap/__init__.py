@@ -1,0 +1,1 @@
+"""Whether a file is sound MCAP: its records, chunks, indexes and summary."""

@@ -1,0 +1,70 @@
+"""Messages of some chunks, in the order in which they are in the file."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD, RawMessages
+
+BATCH_SIZE = 4 << 20  # bytes
+
+
+class Batch(NamedTuple):
+    """Some messages, still encoded.
+
+    Attributes
+    ----------
+    buffer : np.ndarray [shape=(b,)], uint8
+        Holds their records, and others.
+    starts : np.ndarray [shape=(n,)], int64
+        Where in the buffer their records begin.
+    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
+    """
+
+    buffer: Bytes
+    starts: Int64
+    heads: NDArray[np.void]
+
+    def by_channel(
+        self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
+    ) -> Iterator[RawMessages]:
+        """Sort them by channel; those of unknown channels are left out."""
+        for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
+            if identity in channels:
+                channel = channels[identity]
+                rows = self.heads["channel"] == identity
+                offsets = self.starts[rows] + MESSAGE_HEAD.itemsize
+                schema = schemas.get(channel.schema_id)
+                yield RawMessages(channel, schema, self.buffer, offsets, self.heads[rows])
+
+
+def heads_at(content: bytes, starts: Int64) -> NDArray[np.void]:
+    """Read the heads of the messages that begin at some places of a chunk."""
+    if not len(starts):
+        return np.empty(0, MESSAGE_HEAD)
+    buffer = np.frombuffer(content, np.uint8)
+    return gather(buffer, starts, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+
+
+def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[Batch]:
+    """Put chunks together: their contents, where messages begin in them, and the heads of these.
+
+    Yields
+    ------
+    Batch
+        Of a few megabytes each, however large a chunk is.
+    """
+    sizes = [len(content) for content, _, _ in parts]
+    firsts = np.cumsum([0, *sizes[:-1]])
+    buffer = np.frombuffer(b"".join(content for content, _, _ in parts), np.uint8)
+    starts = np.concatenate([s + first for (_, s, _), first in zip(parts, firsts, strict=True)])
+    heads = np.concatenate([heads for _, _, heads in parts])
+    number = np.cumsum(heads["length"]) // BATCH_SIZE
+    for rows in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(number)) + 1):
+        if len(rows):
+            some = slice(rows[0], rows[-1] + 1)
+            yield Batch(buffer, starts[some], heads[some])

@@ -1,0 +1,60 @@
+"""One file, read once from its beginning to its end, with the checksum of what was read."""
+
+import os
+import zlib
+from pathlib import Path
+from typing import Self
+
+from hearthlog.schemas.storage.regular_file import open_regular
+
+_PIECE = 1 << 20  # bytes
+_READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and has no end
+
+
+class Source:
+    """The bytes of a file, as many as it had when it was opened.
+
+    Attributes
+    ----------
+    size : int
+    offset : int
+        Of the next byte.
+    crc : int or None
+        Checksum of all bytes before that; None if some were not read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._stream = os.fdopen(open_regular(path), "rb", buffering=_PIECE)
+        self.size = os.fstat(self._stream.fileno()).st_size
+        self.offset = 0
+        self.crc: int | None = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def take(self, length: int) -> bytes:
+        """Read some bytes; fewer at the end."""
+        data = self._stream.read(min(length, self.size - self.offset))
+        self.offset += len(data)
+        if self.crc is not None:
+            self.crc = zlib.crc32(data, self.crc)
+        return data
+
+    def skip(self, offset: int) -> None:
+        """Go on to a later byte."""
+        if offset - self.offset > _READ_ANYWAY:
+            self.crc = None
+            self.offset = self._stream.seek(offset)
+        while self.offset < offset and self.take(min(_PIECE, offset - self.offset)):
+            pass
+
+    def tail(self, length: int) -> bytes:
+        """Read the last bytes, and stay where we are."""
+        return self.at(max(self.size - length, 0), length)
+
+    def at(self, offset: int, length: int) -> bytes:
+        """Read some bytes anywhere, and stay where we are."""
+        return os.pread(self._stream.fileno(), length, offset)

@@ -1,0 +1,270 @@
+"""One chunk and the message indexes behind it."""
+
+import struct
+import zlib
+from array import array
+from typing import NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.mcap.batch import heads_at
+from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of
+from hearthlog.analyzer.doctor.mcap.walk import Record
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD
+from hearthlog.schemas.mcap.records import HEAD, ChunkHead, McapError, chunk_head, decompress
+
+_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
+_INDEX_HEAD = struct.Struct("<HI")
+_PLACE = struct.Struct("<HQ")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_FIXED = MESSAGE_HEAD.itemsize - HEAD.size
+
+
+class Content(NamedTuple):
+    """The records of a chunk: their bytes, where messages begin in them, and the heads of these."""
+
+    records: bytes
+    starts: Int64
+    heads: NDArray[np.void]
+
+
+class Chunk:
+    """A chunk, checked when the message indexes behind it are known.
+
+    Attributes
+    ----------
+    content : Content or None
+        None if the chunk is too damaged to be read.
+    whole : bool
+        Whether all of its messages are in `content`.
+    """
+
+    def __init__(self, record: Record, findings: Findings, definitions: Definitions) -> None:
+        self.content: Content | None = None
+        self.whole = False
+        self.offset = record.offset
+        self._length = record.length
+        self._findings = findings
+        self._definitions = definitions
+        self._head: ChunkHead | None = None
+        self._records = b""
+        self._indexes: dict[int, bytes] = {}
+        self._places: list[tuple[int, int]] = []  # channel, and offset of its message index
+        self._index_length = 0
+        try:
+            self._head = chunk_head(record.content)
+            self._records = decompress(self._head, record.content)
+        except McapError as error:
+            self._error("chunk-data", str(error))
+            return
+        if self._head.crc and zlib.crc32(self._records) != self._head.crc:
+            self._error("chunk-crc", "a chunk has another checksum than it claims")
+            return
+        self.whole = True
+
+    def add_index(self, record: Record) -> None:
+        """Take a message index that stands behind the chunk."""
+        self._index_length += record.length
+        try:
+            channel, size = _INDEX_HEAD.unpack_from(record.content)
+        except struct.error:
+            channel, size = 0, -1
+        if size % _ENTRY.itemsize or size > len(record.content) - _INDEX_HEAD.size or size < 0:
+            what = "a message index has another length than it says"
+            self._findings.error("message-index", what, REINDEX, offset=record.offset)
+        elif channel in self._indexes:
+            what = f"a second message index of channel {channel} behind one chunk"
+            self._findings.error("message-index", what, REINDEX, offset=record.offset)
+        else:
+            entries = record.content[_INDEX_HEAD.size : _INDEX_HEAD.size + size]
+            self._indexes[channel] = entries
+            if entries:
+                self._places.append((channel, record.offset))
+
+    def check(self, *, cut: bool) -> None:
+        """Check what is in it; `cut`: its message indexes may not all be there."""
+        if not self.whole:
+            return
+        counts = [len(entries) // _ENTRY.itemsize for entries in self._indexes.values()]
+        entries = np.frombuffer(b"".join(self._indexes.values()), _ENTRY)
+        channels = np.repeat([*self._indexes], counts)
+        order = np.argsort(entries["offset"], kind="stable")
+        entries, channels = entries[order], channels[order]
+        self._find_records(entries["offset"])
+        if self.content is not None and self.whole:
+            self._check_times()
+        if self.content is not None and self.whole and not cut:
+            self._check_index(entries, channels)
+
+    def index_content(self) -> bytes | None:
+        """Return what the chunk index should say of this chunk."""
+        if self._head is None:
+            return None
+        head = self._head
+        first = _CHUNK_INDEX.pack(
+            head.start, head.end, self.offset, self._length, len(self._places) * _PLACE.size
+        )
+        places = b"".join(_PLACE.pack(*place) for place in self._places)
+        text = struct.pack("<QI", self._index_length, len(head.compression)) + head.compression
+        size = head.data.stop - head.data.start
+        return first + places + text + struct.pack("<QQ", size, head.size)
+
+    def _find_records(self, hints: Int64) -> None:
+        """Find messages, take schemas and channels."""
+        records = self._records
+        starts, others, end = _split(records, hints)
+        if end != len(records):
+            self._error("chunk-records", "the last record of a chunk is longer than the chunk")
+            self.whole = False
+        new: dict[int, int] = {}
+        for opcode, start, length in others:
+            content = records[start + HEAD.size : start + HEAD.size + length]
+            new |= self._other(opcode, start, content)
+        self.content = Content(records, starts, heads_at(records, starts))
+        check_channels(self._findings, self._definitions, self.content, new, self.offset)
+
+    def _other(self, opcode: int, start: int, content: bytes) -> dict[int, int]:
+        """Take a record that is no message; return the channel that it defines, and where."""
+        if opcode == Opcode.MESSAGE:
+            self._error("message-short", f"a message at byte {start} of a chunk is too short")
+            self.whole = False
+        elif opcode not in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            self._error("chunk-opcode", f"{name_of(opcode)} inside a chunk")
+        else:
+            channel = self._definitions.add(opcode, self.offset, content)
+            return {} if channel is None else {channel: start}
+        return {}
+
+    def _check_times(self) -> None:
+        assert self.content is not None
+        assert self._head is not None
+        times = self.content.heads["log_time"].astype(np.uint64)
+        said = self._head.start, self._head.end
+        span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
+        if said != span:
+            what = f"a chunk says that it spans {said[0]} to {said[1]} ns, and spans {span[0]} to "
+            self._error("chunk-times", f"{what}{span[1]} ns", REINDEX)
+
+    def _check_index(self, entries: NDArray[np.void], channels: Int64) -> None:
+        """Compare the message indexes, in the order of their offsets, with the messages."""
+        assert self.content is not None
+        heads, starts = self.content.heads, self.content.starts
+        if not self._indexes:
+            if self._definitions.ours and len(heads):
+                self._error("message-index", "a chunk has no message index", REINDEX)
+            return
+        if (
+            len(entries) == len(heads)
+            and (
+                (entries["offset"] == starts)
+                & (entries["time"] == heads["log_time"])
+                & (channels == heads["channel"])
+            ).all()
+        ):
+            return
+        right = np.intersect1d(
+            _keys(channels, entries["time"], entries["offset"]),
+            _keys(heads["channel"], heads["log_time"], starts),
+        )
+        what = (
+            f"the message indexes of a chunk leave out {len(heads) - len(right)} of its "
+            f"{len(heads)} messages and have {len(entries) - len(right)} entries that are wrong"
+        )
+        self._error("message-index", what, REINDEX)
+
+    def _error(self, rule: str, what: str, advice: str = RECOVER) -> None:
+        self._findings.error(rule, what, advice, offset=self.offset)
+
+
+def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, int]], int]:
+    """Find the records of a chunk.
+
+    Parameters
+    ----------
+    records : bytes
+    hints : np.ndarray [shape=(n,)], int64
+        Where messages begin, ascending, if the index can be believed.
+
+    Returns
+    -------
+    starts : np.ndarray [shape=(m,)], int64
+        Where messages begin.
+    others : list of tuple of int
+        Opcode, start and length of the other records, and of messages that are too short.
+    end : int
+        Of the last record; not the length of the chunk if that is damaged.
+    """
+    if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
+        heads = heads_at(records, hints)
+        lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
+        firsts = np.concatenate([[0], hints + HEAD.size + lengths])
+        lasts = np.concatenate([hints, [len(records)]])
+        if ((firsts <= lasts) & (lasts <= len(records))).all() and (
+            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= _FIXED)
+        ).all():
+            others: list[tuple[int, int, int]] = []
+            for place in np.flatnonzero(firsts < lasts).tolist():
+                starts, found, end = _walk(records, int(firsts[place]), int(lasts[place]))
+                if len(starts) or end != lasts[place]:
+                    break  # a message that the index does not know, or no whole records
+                others += found
+            else:
+                return hints, others, len(records)
+    return _walk(records, 0, len(records))
+
+
+def _walk(records: bytes, place: int, end: int) -> tuple[Int64, list[tuple[int, int, int]], int]:
+    """Go from record to record; returns what `_split` does."""
+    starts = array("q")
+    others: list[tuple[int, int, int]] = []
+    while place + HEAD.size <= end:
+        opcode, length = HEAD.unpack_from(records, place)
+        following = place + HEAD.size + length
+        if following > end:
+            break
+        if opcode == Opcode.MESSAGE and length >= _FIXED:
+            starts.append(place)
+        else:
+            others.append((opcode, place, length))
+        place = following
+    return np.frombuffer(starts, np.int64), others, place
+
+
+def check_channels(
+    findings: Findings,
+    definitions: Definitions,
+    content: Content,
+    new: dict[int, int],
+    offset: int,
+) -> None:
+    """Say if messages come before their channels.
+
+    Parameters
+    ----------
+    findings : Findings
+    definitions : Definitions
+    content : Content
+    new : dict of int to int
+        Channels that were defined among these messages, and where.
+    offset : int
+        Of the chunk in the file.
+    """
+    numbers = content.heads["channel"]
+    for channel in np.flatnonzero(np.bincount(numbers)).tolist():
+        if channel not in definitions.channels:
+            what = f"messages of channel {channel}, which is not defined"
+            findings.error("channel-missing", what, RECOVER, offset=offset)
+        elif channel in new and (content.starts[numbers == channel] < new[channel]).any():
+            what = f"messages of channel {channel} stand before it is defined"
+            findings.error("channel-missing", what, RECOVER, offset=offset)
+
+
+def _keys(channels: Int64, times: Int64, offsets: Int64) -> NDArray[np.void]:
+    """Return an array of one comparable thing for each message."""
+    keys = np.empty(len(channels), [("channel", "<u2"), ("time", "<i8"), ("offset", "<i8")])
+    keys["channel"], keys["time"], keys["offset"] = channels, times, offsets
+    return keys

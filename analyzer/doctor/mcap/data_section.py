@@ -1,0 +1,259 @@
+"""The data section of a file, checked against the specification of MCAP."""
+
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, DataEnd, Header, Metadata
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.analyzer.doctor.mcap.batch import BATCH_SIZE, Batch, batches, heads_at
+from hearthlog.analyzer.doctor.mcap.chunk import Chunk, Content, check_channels
+from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of, parse_strictly
+from hearthlog.analyzer.doctor.mcap.walk import Record
+from hearthlog.models.modelfile.card import CARD, DESCRIPTION
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD
+from hearthlog.schemas.mcap.records import HEAD
+
+ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
+_NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept
+_KEPT_SIZE = 1 << 20  # bytes
+_INDEX_SIZE = 4096  # bytes; what has a longer name is not compared with its index
+_RESERVED = 0x80
+_INDEXES = {
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.STATISTICS,
+    Opcode.SUMMARY_OFFSET,
+    Opcode.FOOTER,
+}
+
+
+class Data:
+    """What the data section of a file holds.
+
+    Attributes
+    ----------
+    findings : Findings
+    definitions : Definitions
+    header : mcap.records.Header or None
+    metadata : dict of str to list of dict
+        Of ours, by name: the first two records, if they are not too large.
+    attachments : dict of str to list of bytes
+        Likewise.
+    counts : Counter of int
+        Messages by channel.
+    span : tuple of int, or None
+        First and last log time.
+    places : dict of int to dict of int to bytes
+        By the opcode of the index, and by offset: what the index should say of a chunk, an
+        attachment or a metadata record.
+    whole : bool
+        Whether everything could be read.
+    loose : bool
+        Whether there are messages outside of chunks.
+    ended : bool
+        Whether there was a Data End.
+    """
+
+    def __init__(self, findings: Findings, *, ours: bool) -> None:
+        self.definitions = Definitions(findings, ours=ours)
+        self.header: Header | None = None
+        self.metadata: dict[str, list[dict[str, str]]] = {}
+        self.attachments: dict[str, list[bytes]] = {}
+        self.counts: Counter[int] = Counter()
+        self.span: tuple[int, int] | None = None
+        self.places: dict[int, dict[int, bytes]] = {
+            Opcode.CHUNK_INDEX: {},
+            Opcode.ATTACHMENT_INDEX: {},
+            Opcode.METADATA_INDEX: {},
+        }
+        self.whole = True
+        self.loose = False
+        self.ended = False
+        self.findings = findings
+        self._chunk: Chunk | None = None
+        self._run = bytearray()  # of messages outside of chunks
+        self._run_offset = 0
+        self._parts: list[tuple[bytes, Int64, NDArray[np.void]]] = []
+        self._size = 0
+        self._first = True
+
+    def add(self, record: Record) -> Iterator[Batch | None]:
+        """Take the next record.
+
+        Parameters
+        ----------
+        record : Record
+
+        Yields
+        ------
+        Batch or None
+            Messages, whenever a few megabytes of them have come together; None where some are
+            missing, because a chunk is damaged.
+        """
+        self._check_first(record)
+        if record.opcode == Opcode.MESSAGE:
+            self._add_message(record)
+        else:
+            self._end_run()
+        if record.opcode == Opcode.MESSAGE_INDEX:
+            self._add_index(record)
+        else:
+            yield from self._end_chunk()
+        if record.opcode == Opcode.CHUNK:
+            self._chunk = Chunk(record, self.findings, self.definitions)
+        elif record.opcode not in {Opcode.MESSAGE, Opcode.MESSAGE_INDEX}:
+            self._add_other(record)
+        if self._size >= BATCH_SIZE:
+            yield from self._batches()
+
+    def finish(self, *, cut: bool) -> Iterator[Batch | None]:
+        """Hand out the last messages; `cut`: something is missing behind them."""
+        self._end_run()
+        yield from self._end_chunk(cut=cut)
+        yield from self._batches()
+
+    def _check_first(self, record: Record) -> None:
+        if self._first and record.opcode != Opcode.HEADER:
+            what = f"the first record is no Header, but {name_of(record.opcode)}"
+            self.findings.error("header", what, RECOVER, offset=record.offset)
+        elif not self._first and record.opcode == Opcode.HEADER:
+            self.findings.error("header", "a second Header", RECOVER, offset=record.offset)
+        self._first = False
+
+    def _add_other(self, record: Record) -> None:
+        if record.opcode in _INDEXES:
+            what = f"{name_of(record.opcode)} before the Data End"
+            self.findings.error("data-opcode", what, RECOVER, offset=record.offset)
+            return
+        if record.opcode > Opcode.DATA_END:
+            if record.opcode < _RESERVED:
+                what = f"{name_of(record.opcode)}, which MCAP keeps for later versions"
+                self.findings.warning("reserved-opcode", what, offset=record.offset)
+            return
+        if record.opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            self.definitions.add(record.opcode, record.offset, record.content)
+            return
+        found = parse_strictly(self.findings, record.opcode, record.offset, record.content)
+        if isinstance(found, Header):
+            self.header = self.header or found
+            self.definitions.profile = self.header.profile
+        elif isinstance(found, Metadata):
+            self._add_metadata(found, record)
+        elif isinstance(found, Attachment):
+            self._add_attachment(found, record)
+        elif isinstance(found, DataEnd):
+            self.ended = True
+            if found.data_section_crc and record.crc not in {None, found.data_section_crc}:
+                what = "the data section has another checksum than its Data End says"
+                self.findings.error("data-crc", what, RECOVER, offset=record.offset)
+        else:
+            self.whole = False
+
+    def _add_metadata(self, found: Metadata, record: Record) -> None:
+        name = found.name.encode()
+        index = struct.pack("<QQI", record.offset, record.length, len(name)) + name
+        self.places[Opcode.METADATA_INDEX][record.offset] = (
+            index if len(index) < _INDEX_SIZE else b""
+        )
+        _keep(self.metadata, found.name, found.metadata, record)
+
+    def _add_attachment(self, found: Attachment, record: Record) -> None:
+        index = struct.pack("<QQ", record.offset, record.length)
+        index += struct.pack("<QQQ", found.log_time, found.create_time, len(found.data))
+        for text in (found.name.encode(), found.media_type.encode()):
+            index += struct.pack("<I", len(text)) + text
+        self.places[Opcode.ATTACHMENT_INDEX][record.offset] = (
+            index if len(index) < _INDEX_SIZE else b""
+        )
+        _keep(self.attachments, found.name, found.data, record)
+        texts = len(found.name.encode()) + len(found.media_type.encode())
+        end = 8 + 8 + 4 + 4 + 8 + texts + len(found.data)
+        (crc,) = struct.unpack_from("<I", record.content, end)
+        if crc and zlib.crc32(record.content[:end]) != crc:
+            what = f"attachment {found.name} has another checksum than it claims"
+            self.findings.error("attachment-crc", what, RECOVER, offset=record.offset)
+
+    def _add_index(self, record: Record) -> None:
+        if self._chunk is None:
+            what = "a message index that does not stand behind a chunk"
+            self.findings.error("message-index-place", what, RECOVER, offset=record.offset)
+        else:
+            self._chunk.add_index(record)
+
+    def _end_chunk(self, *, cut: bool = False) -> Iterator[Batch | None]:
+        chunk, self._chunk = self._chunk, None
+        if chunk is None:
+            return
+        chunk.check(cut=cut)
+        self.whole &= chunk.whole
+        index = chunk.index_content()
+        if index is not None:
+            self.places[Opcode.CHUNK_INDEX][chunk.offset] = index
+        if chunk.content is not None:
+            self._add_messages(chunk.content)
+        if not chunk.whole:
+            yield from self._batches()
+            yield None
+
+    def _add_message(self, record: Record) -> None:
+        self.loose = True
+        if record.length < MESSAGE_HEAD.itemsize:
+            what = "a message is too short"
+            self.findings.error("message-short", what, RECOVER, offset=record.offset)
+            self.whole = False
+            return
+        if not self._run:
+            self._run_offset = record.offset
+        self._run += HEAD.pack(record.opcode, len(record.content)) + record.content
+        if len(self._run) >= BATCH_SIZE:
+            self._end_run()
+
+    def _end_run(self) -> None:
+        if not self._run:
+            return
+        records, self._run = bytes(self._run), bytearray()
+        starts = [0]
+        while (end := starts[-1] + HEAD.size + HEAD.unpack_from(records, starts[-1])[1]) < len(
+            records
+        ):
+            starts.append(end)
+        places = np.array(starts, np.int64)
+        content = Content(records, places, heads_at(records, places))
+        check_channels(self.findings, self.definitions, content, {}, self._run_offset)
+        self._add_messages(content)
+
+    def _add_messages(self, content: Content) -> None:
+        heads = content.heads
+        if not len(heads):
+            return
+        counts = np.bincount(heads["channel"])
+        for channel in np.flatnonzero(counts).tolist():
+            self.counts[channel] += int(counts[channel])
+        times = heads["log_time"].astype(np.uint64)
+        first, last = int(times.min()), int(times.max())
+        if self.span is not None:
+            first, last = min(first, self.span[0]), max(last, self.span[1])
+        self.span = first, last
+        self._parts.append((content.records, content.starts, heads))
+        self._size += len(content.records)
+
+    def _batches(self) -> Iterator[Batch]:
+        parts, self._parts, self._size = self._parts, [], 0
+        if parts:
+            yield from batches(parts)
+
+
+def _keep(kept: dict[str, list[Any]], name: str, content: Any, record: Record) -> None:
+    if name in _NAMES and record.length <= _KEPT_SIZE and len(kept.get(name, ())) < 2:
+        kept.setdefault(name, []).append(content)

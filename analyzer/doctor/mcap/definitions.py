@@ -1,0 +1,152 @@
+"""The schemas and channels of a file, and what the specification and its profile ask of them."""
+
+import re
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, McapRecord, Schema
+
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.records import McapError, parse
+from hearthlog.schemas.messages.cdr_layout import message_type
+
+PROFILE = "ros2"
+_ENCODINGS = ("ros2msg", "ros2idl")
+_SIZE_LIMIT = 16 << 20  # bytes of a record that is neither chunk nor attachment
+_TOTAL_LIMIT = 64 << 20  # bytes of all schemas and channels of a file
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
+
+
+def parse_strictly(
+    findings: Findings, opcode: int, offset: int, content: bytes
+) -> McapRecord | None:
+    """Parse a record; say if it is too short, holds what is no text, or a key twice."""
+    if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
+        what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
+        findings.error("too-large", what, RECOVER, offset=offset)
+        return None
+    try:
+        record = parse(opcode, content)
+    except (McapError, UnicodeDecodeError) as error:
+        findings.error("fields", f"{name_of(opcode)}: {error}", RECOVER, offset=offset)
+        return None
+    if record is not None and opcode != Opcode.ATTACHMENT:
+        builder = RecordBuilder()
+        record.write(builder)
+        if not content.startswith(builder.end()[9:]):  # behind it may be fields of later versions
+            what = f"{name_of(opcode)}: a map in it has a key twice, or another length than it says"
+            findings.error("fields", what, RECOVER, offset=offset)
+    return record
+
+
+def name_of(opcode: int) -> str:
+    """Name a kind of record."""
+    try:
+        return Opcode(opcode).name.capitalize().replace("_", " ")
+    except ValueError:
+        return f"record of opcode {opcode}"
+
+
+class Definitions:
+    """The schemas and channels that were defined so far.
+
+    Attributes
+    ----------
+    schemas : dict of int to Schema
+    channels : dict of int to Channel
+    ours : bool
+        Whether hearthlog made this file.
+    profile : str
+        Of the header.
+    """
+
+    def __init__(self, findings: Findings, *, ours: bool) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.ours = ours
+        self.profile = ""
+        self._size = 0
+        self._findings = findings
+
+    def add(self, opcode: int, offset: int, content: bytes) -> int | None:
+        """Take a schema or a channel; return the number of a channel that is new."""
+        record = parse_strictly(self._findings, opcode, offset, content)
+        if isinstance(record, Schema):
+            self._add_schema(record, offset, len(content))
+        elif isinstance(record, Channel) and self._add_channel(record, offset, len(content)):
+            return record.id
+        return None
+
+    def _keeps(self, size: int, offset: int) -> bool:
+        """Tell whether there is room for another definition."""
+        self._size += size
+        if self._size > _TOTAL_LIMIT:
+            what = "more schemas and channels than hearthlog reads"
+            self._findings.error("too-large", what, RECOVER, offset=offset)
+        return self._size <= _TOTAL_LIMIT
+
+    def _add_schema(self, schema: Schema, offset: int, size: int) -> None:
+        """Check a schema, and keep the first of its number."""
+        error = self._findings.error
+        if schema.id == 0:
+            error("schema-id", f"schema {schema.name} has the number 0", RECOVER, offset=offset)
+            return
+        if schema.id in self.schemas:
+            if schema != self.schemas[schema.id]:
+                what = f"schema {schema.id} ({schema.name}) differs from the first of its number"
+                error("redefined", what, RECOVER, offset=offset)
+            return
+        if not self._keeps(size, offset):
+            return
+        self.schemas[schema.id] = schema
+        if not schema.encoding and schema.data:
+            what = f"schema {schema.name} has data, but no encoding"
+            error("schema-encoding", what, RECOVER, offset=offset)
+        if schema.encoding in _ENCODINGS:
+            self._check_definition(schema, offset)
+        elif self.profile == PROFILE:
+            what = f"schema {schema.name} is {schema.encoding!r}, neither ros2msg nor ros2idl"
+            self._profile("profile-schema", what, offset)
+
+    def _add_channel(self, channel: Channel, offset: int, size: int) -> bool:
+        """Check a channel, and keep the first of its number; tell whether it is that."""
+        error = self._findings.error
+        topic = f"channel {channel.id} ({channel.topic})"
+        if channel.id in self.channels:
+            if channel != self.channels[channel.id]:
+                what = f"{topic} differs from the first of its number"
+                error("redefined", what, RECOVER, offset=offset)
+            return False
+        if not self._keeps(size, offset):
+            return False
+        self.channels[channel.id] = channel
+        if channel.schema_id and channel.schema_id not in self.schemas:
+            what = f"{topic} has schema {channel.schema_id}, which is not defined before it"
+            error("schema-missing", what, RECOVER, offset=offset)
+        if not channel.message_encoding:
+            error("channel-encoding", f"{topic} has no message encoding", RECOVER, offset=offset)
+        elif self.profile == PROFILE:
+            if channel.message_encoding != "cdr":
+                what = f"{topic} is encoded as {channel.message_encoding!r}, not as cdr"
+                self._profile("profile-channel", what, offset)
+            elif not channel.schema_id:
+                self._profile("profile-channel", f"{topic} has no schema", offset)
+        if self.profile == PROFILE and "offered_qos_profiles" not in channel.metadata:
+            self._profile("profile-qos", f"{topic} has no offered_qos_profiles", offset)
+        return True
+
+    def _profile(self, rule: str, what: str, offset: int) -> None:
+        """Say what the profile asks for: it only should be followed, in a file that is not ours."""
+        report = self._findings.error if self.ours else self._findings.warning
+        report(rule, what, "its profile, ros2, asks for that", offset=offset)
+
+    def _check_definition(self, schema: Schema, offset: int) -> None:
+        error = self._findings.error
+        if not _TYPE_NAME.fullmatch(schema.name):
+            what = f"schema {schema.name!r} is not named as a ROS message type"
+            error("schema-name", what, RECOVER, offset=offset)
+        try:
+            message_type(schema.name, schema.encoding, schema.data)
+        except LogError as failure:
+            error("schema-definition", str(failure), RECOVER, offset=offset)

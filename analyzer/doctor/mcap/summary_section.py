@@ -1,0 +1,260 @@
+"""The summary section of a file and its footer, compared with what is in the file."""
+
+import struct
+import zlib
+from collections import Counter
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Schema, Statistics, SummaryOffset
+
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.mcap.data_section import Data
+from hearthlog.analyzer.doctor.mcap.definitions import name_of, parse_strictly
+from hearthlog.analyzer.doctor.mcap.walk import Record
+from hearthlog.schemas.mcap.records import HEAD, parse
+
+_ALLOWED = {
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.STATISTICS,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+}
+_OFFSETS = {  # where in an index record the offset of what it speaks of stands
+    Opcode.CHUNK_INDEX: 16,
+    Opcode.ATTACHMENT_INDEX: 0,
+    Opcode.METADATA_INDEX: 0,
+}
+_THINGS = {
+    Opcode.CHUNK_INDEX: "chunk",
+    Opcode.ATTACHMENT_INDEX: "attachment",
+    Opcode.METADATA_INDEX: "metadata record",
+}
+_RESERVED = 0x80
+
+
+class Summary:
+    """The summary section, the summary offsets, and the footer.
+
+    Parameters
+    ----------
+    data : Data
+        The whole data section before it.
+    whole : bool
+        Whether all of that could be read: if not, what the index says is not compared with it.
+    """
+
+    def __init__(self, data: Data, findings: Findings, *, whole: bool) -> None:
+        self._data = data
+        self._findings = findings
+        self._whole = whole
+        self._starts: dict[int, int] = {}  # of the groups, by opcode
+        self._lengths: Counter[int] = Counter()
+        self._last = 0
+        self._offsets: list[tuple[int, SummaryOffset]] = []
+        self._copies: dict[type, dict[int, McapRecord]] = {Schema: {}, Channel: {}}
+        self._unseen = {opcode: dict(places) for opcode, places in data.places.items()}
+        self._indexed: set[int] = set()  # channels of which the chunk indexes speak
+        self._statistics: list[tuple[int, Statistics]] = []
+        self._crc = 0
+
+    def add(self, record: Record) -> None:
+        """Take the next record behind the Data End."""
+        opcode = record.opcode
+        if opcode not in _ALLOWED:
+            if opcode < _RESERVED:
+                what = f"{name_of(opcode)} in the summary section"
+                self._findings.error("summary-opcode", what, REINDEX, offset=record.offset)
+        else:
+            self._group(record)
+            if opcode in _OFFSETS:
+                self._add_index(record)
+            else:
+                self._add_other(record)
+        self._crc = zlib.crc32(HEAD.pack(opcode, len(record.content)), self._crc)
+        self._crc = zlib.crc32(record.content, self._crc)
+
+    def finish(self, record: Record) -> None:
+        """Take the footer."""
+        footer = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        if not isinstance(footer, Footer):
+            return
+        if len(record.content) != 20:
+            self._error("footer", "the Footer is too long", record.offset)
+        first = min((s for o, s in self._starts.items() if o != Opcode.SUMMARY_OFFSET), default=0)
+        offsets = self._starts.get(Opcode.SUMMARY_OFFSET, 0)
+        if footer.summary_start not in {first, first or offsets}:
+            what = f"the Footer says the summary begins at byte {footer.summary_start}, and it "
+            where = f"begins at {first}" if first else "is empty"
+            self._error("footer", what + where, record.offset)
+        if footer.summary_offset_start != offsets:
+            what = f"the Footer says the summary offsets begin at {footer.summary_offset_start}"
+            where = f"they begin at {offsets}" if offsets else "there are none"
+            self._error("footer", f"{what}, and {where}", record.offset)
+        if footer.summary_crc:
+            head = HEAD.pack(Opcode.FOOTER, len(record.content)) + record.content[:16]
+            if zlib.crc32(head, self._crc) != footer.summary_crc:
+                what = "the summary has another checksum than the Footer says"
+                self._error("summary-crc", what, record.offset)
+        self._check_offsets()
+        self._check_complete(record.offset)
+        if self._whole:
+            for offset, statistics in self._statistics:
+                self._check_statistics(offset, statistics)
+
+    def _error(self, rule: str, what: str, offset: int) -> None:
+        self._findings.error(rule, what, REINDEX, offset=offset)
+
+    def _group(self, record: Record) -> None:
+        """Note the group of a record: those of one opcode must stand together."""
+        opcode = record.opcode
+        if opcode not in self._starts:
+            self._starts[opcode] = record.offset
+            if self._last == Opcode.SUMMARY_OFFSET:
+                what = f"{name_of(opcode)} behind the summary offsets"
+                self._error("summary-groups", what, record.offset)
+        elif opcode != self._last:
+            what = f"{name_of(opcode)} apart from the others of its kind"
+            self._error("summary-groups", what, record.offset)
+        self._last = opcode
+        self._lengths[opcode] += record.length
+
+    def _add_other(self, record: Record) -> None:
+        found = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        if isinstance(found, Schema):
+            self._copy(found, self._data.definitions.schemas, record)
+        elif isinstance(found, Channel):
+            self._copy(found, self._data.definitions.channels, record)
+        elif isinstance(found, SummaryOffset):
+            self._offsets.append((record.offset, found))
+        elif isinstance(found, Statistics):
+            self._add_statistics(found, record.offset)
+
+    def _copy(self, found: Any, originals: Any, record: Record) -> None:
+        self._copies[type(found)][found.id] = found
+        if not self._whole or originals.get(found.id) == found:
+            return
+        name = f"{name_of(record.opcode)} {found.id}"
+        if found.id in originals:
+            self._error("summary-copy", f"{name} is not that of the data section", record.offset)
+        else:
+            what = f"{name} is in the summary alone"
+            self._findings.warning("summary-only", what, offset=record.offset)
+
+    def _add_index(self, record: Record) -> None:
+        """Compare an index record with what is at the place of which it speaks."""
+        at = _OFFSETS[Opcode(record.opcode)]
+        if len(record.content) < at + 8:
+            parse_strictly(self._findings, record.opcode, record.offset, record.content)
+            return
+        (offset,) = struct.unpack_from("<Q", record.content, at)
+        expected = self._unseen[record.opcode].pop(offset, None)
+        if expected is None:
+            thing = _THINGS[Opcode(record.opcode)]
+            if offset in self._data.places[record.opcode]:
+                what = f"a second {name_of(record.opcode)} for the {thing} at byte {offset}"
+                self._error("index-twice", what, record.offset)
+            elif self._whole:
+                what = f"{name_of(record.opcode)} for byte {offset}, where no {thing} is"
+                self._error("index-place", what, record.offset)
+            return
+        if not record.content.startswith(expected):
+            self._compare(record, expected)
+        if record.opcode == Opcode.CHUNK_INDEX:
+            (size,) = struct.unpack_from("<I", expected, 32)
+            self._indexed |= {i for i, _ in struct.iter_unpack("<HQ", expected[36 : 36 + size])}
+
+    def _compare(self, record: Record, expected: bytes) -> None:
+        found = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        try:
+            wanted = parse(record.opcode, expected)
+        except UnicodeDecodeError:  # the compression of a damaged chunk, of which is said there
+            return
+        if found is None or wanted is None:
+            return
+        differing = [
+            f"{name} {getattr(found, name)} and should say {value}"
+            for name, value in vars(wanted).items()
+            if getattr(found, name) != value and not self._without_index(found, name)
+        ]
+        if differing:
+            what = f"{name_of(record.opcode)} says {'; '.join(differing)}"
+            self._error("index-differs", what, record.offset)
+
+    def _without_index(self, found: McapRecord, name: str) -> bool:
+        """Tell whether a chunk index leaves out message indexes of no messages, as it may."""
+        if not isinstance(found, ChunkIndex) or name != "message_index_offsets":
+            return False
+        return not found.message_index_offsets
+
+    def _add_statistics(self, found: Statistics, offset: int) -> None:
+        self._statistics.append((offset, found))
+        if len(self._statistics) > 1:
+            self._error("statistics", "more than one record of statistics", offset)
+            self._statistics.pop()
+        channels = self._data.definitions.channels.keys()
+        if found.channel_message_counts and not channels <= self._copies[Channel].keys():
+            what = "statistics with counts stand before copies of all channels"
+            self._error("statistics-channels", what, offset)
+
+    def _check_statistics(self, offset: int, found: Statistics) -> None:
+        data = self._data
+        start, end = data.span or (0, 0)
+        schemas = (data.definitions.schemas.keys() | self._copies[Schema].keys()) - {0}
+        channels = data.definitions.channels.keys() | self._copies[Channel].keys()
+        wanted: dict[str, Any] = {
+            "message_count": sum(data.counts.values()),
+            "schema_count": len(schemas),
+            "channel_count": len(channels),
+            "attachment_count": len(data.places[Opcode.ATTACHMENT_INDEX]),
+            "metadata_count": len(data.places[Opcode.METADATA_INDEX]),
+            "chunk_count": len(data.places[Opcode.CHUNK_INDEX]),
+            "message_start_time": start,
+            "message_end_time": end,
+        }
+        if counts := found.channel_message_counts:
+            found.channel_message_counts = {k: n for k, n in counts.items() if n}
+            wanted["channel_message_counts"] = {k: n for k, n in data.counts.items() if n}
+        differing = [
+            f"{name} {getattr(found, name)} and should say {value}"
+            for name, value in wanted.items()
+            if getattr(found, name) != value
+        ]
+        if differing:
+            self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
+
+    def _check_offsets(self) -> None:
+        for place, found in self._offsets:
+            group = found.group_opcode
+            start, length = self._starts.get(group, 0), self._lengths[group]
+            if not length and not found.group_length:
+                continue  # writers say it of groups that are empty, too
+            if (found.group_start, found.group_length) != (start, length):
+                what = (
+                    f"Summary offset says {name_of(group)} is at {found.group_start}, "
+                    f"{found.group_length} bytes, and should say {start}, {length} bytes"
+                )
+                self._error("summary-offset", what, place)
+
+    def _check_complete(self, offset: int) -> None:
+        for opcode, unseen in self._unseen.items():
+            if not unseen or not (opcode in self._starts or self._data.definitions.ours):
+                continue
+            first = min(unseen)
+            what = f"{len(unseen)} of kind {_THINGS[Opcode(opcode)]} are not indexed, the first at "
+            self._error("index-missing", f"{what}byte {first}", offset)
+        if Opcode.CHUNK_INDEX in self._starts and self._data.loose:
+            what = "messages outside of chunks, which the index cannot find"
+            self._findings.warning("loose-messages", what, RECOVER)
+        channels = self._data.definitions.channels
+        needed = {channels[i].schema_id for i in self._indexed if i in channels} - {0}
+        if not self._indexed <= self._copies[Channel].keys() or not (
+            needed <= self._copies[Schema].keys()
+        ):
+            what = "the summary lacks copies of channels or schemas of which the index speaks"
+            self._error("summary-copies", what, offset)
+        if not self._statistics and self._data.definitions.ours:
+            self._error("statistics", "there are no statistics", offset)

@@ -1,0 +1,126 @@
+"""From record to record through a file, over what is damaged to where it goes on."""
+
+import bisect
+import re
+import struct
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+
+from hearthlog.analyzer.doctor.findings import RECOVER, Findings
+from hearthlog.analyzer.doctor.mcap.byte_source import Source
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC
+
+_CHUNK = re.compile(
+    rb"\x06.{36}(?:\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\x00lz4.{8}\x04\x22\x4d\x18)",
+    re.DOTALL,
+)
+_LENGTH = struct.Struct("<Q")
+_WINDOW, _OVERLAP = 1 << 20, 64  # bytes
+_CUT = 2 << 20  # bytes; a longer end was not left by a writer that was killed
+
+
+class Record(NamedTuple):
+    """A record in a file.
+
+    Attributes
+    ----------
+    opcode : int
+    offset : int
+    length : int
+        In bytes, opcode and length included.
+    content : bytes
+    crc : int or None
+        Checksum of the file up to here, if it is known.
+    """
+
+    opcode: int
+    offset: int
+    length: int
+    content: bytes
+    crc: int | None
+
+
+class Walk:
+    """All records of a file, those inside chunks excepted.
+
+    Parameters
+    ----------
+    source : Source
+        Behind the magic.
+    findings : Findings
+    finished : bool
+        Whether the file has an end.
+    places : sequence of int
+        Offsets of records, ascending, as the index of the file has them: here the walk goes on
+        when it has lost its way.
+
+    Attributes
+    ----------
+    losses : int
+        How often something was passed over.
+    """
+
+    def __init__(
+        self, source: Source, findings: Findings, places: Sequence[int], *, finished: bool
+    ) -> None:
+        self.losses = 0
+        self._source = source
+        self._findings = findings
+        self._finished = finished
+        self._places = places
+
+    @property
+    def damaged(self) -> bool:
+        """Whether something was passed over."""
+        return self.losses > 0
+
+    def __iter__(self) -> Iterator[Record]:
+        source = self._source
+        while (rest := source.size - source.offset) > 0:
+            offset, crc = source.offset, source.crc
+            head = source.take(HEAD.size)
+            if self._finished and head == MAGIC:
+                return
+            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+            if opcode == 0 or length > rest - HEAD.size:
+                if not self._lost(offset, rest):
+                    return
+            elif length > LIMIT:
+                self.losses += 1
+                what = f"a record of {length} bytes is larger than hearthlog reads: not checked"
+                self._findings.warning("too-large", what, offset=offset)
+                source.skip(offset + HEAD.size + length)
+            else:
+                yield Record(opcode, offset, HEAD.size + length, source.take(length), crc)
+                if opcode == Opcode.FOOTER:
+                    return
+
+    def _lost(self, offset: int, rest: int) -> bool:
+        """Say that here is no record; tell whether there is a place to go on from."""
+        following = next(iter(self._places[bisect.bisect_right(self._places, offset) :]), None)
+        if following is None:
+            following = self._search(offset + 1)
+        if following is None and not self._finished and rest < _CUT:
+            return False  # that it is unfinished is said elsewhere
+        self.losses += 1
+        where = "nor behind it" if following is None else f"the next one at byte {following}"
+        self._findings.error("framing", f"no record begins here; {where}", RECOVER, offset=offset)
+        if following is None:
+            return False
+        self._source.skip(following)
+        return self._source.offset == following
+
+    def _search(self, offset: int) -> int | None:
+        """Find the next compressed chunk that is not longer than the file."""
+        source = self._source
+        while offset < source.size:
+            window = source.at(offset, _WINDOW + _OVERLAP)
+            for found in _CHUNK.finditer(window):
+                place = offset + found.start()
+                (length,) = _LENGTH.unpack_from(window, found.start() + 1)
+                if place + HEAD.size + length <= source.size:
+                    return place
+            offset += _WINDOW
+        return None

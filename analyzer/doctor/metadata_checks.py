@@ -1,0 +1,234 @@
+"""What a log of hearthlog says of itself, checked against docs/log.md and its messages."""
+
+import hashlib
+import json
+import re
+from collections import Counter
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any
+
+from mcap.records import Channel, Schema
+
+from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.analyzer.doctor.mcap.data_section import ATTACHMENTS, Data
+from hearthlog.analyzer.doctor.message_checks import NAME, Contract, place_of, type_of
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.logs.provenance import METADATA, schema_version
+from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.logs.writer import PROFILE, SCHEMA_ENCODING
+from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.messages.fields import difference, type_hash_of
+from hearthlog.schemas.messages.topics import Topic, topics_of
+from hearthlog.schemas.messages.versions import SCHEMA_VERSION
+from hearthlog.schemas.times import NANOSECONDS
+
+_FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
+_KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
+_CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS
+
+
+class About:
+    """Checks what is said once in a file, when all of it was read.
+
+    Parameters
+    ----------
+    data : Data
+    contract : Contract
+    findings : Findings
+    finished : bool
+        Whether the file was completed.
+    whole : bool
+        Whether all of it could be read: only then counts are compared.
+    """
+
+    def __init__(
+        self, data: Data, contract: Contract, findings: Findings, *, finished: bool, whole: bool
+    ) -> None:
+        self._data = data
+        self._contract = contract
+        self._findings = findings
+        self._finished = finished
+        self._whole = whole
+        self._channels = {c.topic: c for c in data.definitions.channels.values()}
+
+    def check(self) -> None:
+        """Check all of it."""
+        if self._data.header is not None and self._data.header.profile != PROFILE:
+            self._error("profile", f"the profile is {self._data.header.profile!r}, not {PROFILE}")
+        self._check_metadata()
+        self._check_name()
+        if not self._data.counts:
+            return
+        for microphone, info in self._contract.infos.items():
+            self._check_info(microphone, info)
+        self._check_topics()
+        if self._finished:
+            self._check_rosbag2()
+
+    def _error(self, rule: str, what: str) -> None:
+        self._findings.error(rule, what, DISTRUST)
+
+    def _check_metadata(self) -> None:
+        records = self._data.metadata.get(METADATA, [])
+        if len(records) != 1:
+            self._error(
+                "metadata", f"there are {len(records)} metadata records {METADATA}, not one"
+            )
+            return
+        if missing := sorted(_KEYS - records[0].keys()):
+            self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
+        found = self._data.attachments
+        one = 1 if records[0].get("model") else 0
+        counts = {_CONFIGURATION: (1, 1), _MODEL_CARD: (one, one), _MODEL: (0, one)}
+        for name, (least, most) in counts.items():
+            count = len(found.get(name, ()))
+            if not least <= count <= most:
+                what = f"there are {count} attachments {name}, not {most}"
+                self._error("attachments", what)
+        if len(found.get(_CONFIGURATION, ())) == 1:
+            digest = hashlib.sha256(found[_CONFIGURATION][0]).hexdigest()
+            if records[0].get("configuration_sha256") != digest:
+                self._error(
+                    "attachments", f"{_CONFIGURATION} is not the one of metadata {METADATA}"
+                )
+
+    def _check_name(self) -> None:
+        """Compare the name, if it is one as the recorder gives it, with the contents."""
+        path = self._findings.path
+        named = NAME.fullmatch(path.name)
+        if named is None:
+            return
+        records = self._data.metadata.get(METADATA, [])
+        node = records[0].get("node", named["node"]) if records else named["node"]
+        if node != named["node"]:
+            self._error("name", f"the name says node {named['node']}, the file {node}")
+        if self._data.span is None:
+            return
+        try:
+            start = datetime.fromtimestamp(self._data.span[0] // NANOSECONDS, UTC)
+        except (OverflowError, ValueError, OSError):
+            start = datetime.min.replace(tzinfo=UTC)
+        if f"{start:%Y%m%dT%H%M%SZ}" != named["time"]:
+            self._error("name", f"the name says {named['time']}, the first message {start:%c}")
+        folders = "/".join(path.absolute().parts[-4:-1])
+        if _FOLDERS.fullmatch(folders) and folders != f"{start:%Y/%m/%d}":
+            self._error("name", f"the folder says {folders}, the first message {start:%Y/%m/%d}")
+
+    def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
+        expected: dict[str, Any] = {
+            "sample_rate": SAMPLE_RATE,
+            "frame_seconds": FRAME_SECONDS,
+        }
+        with suppress(ModelError):  # of a set that is not installed nothing is known
+            features = feature_set(str(info["feature_set"]))
+            expected["window_seconds"] = features.window_seconds
+            expected["feature_names"] = list(features.feature_names)
+        for record in self._data.metadata.get(METADATA, [])[:1]:
+            expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
+        for name, value in expected.items():
+            if _plain(info[name]) != value:
+                what = f"{microphone}: info says {name} {_plain(info[name])}, not {value}"
+                self._error("info", what)
+        said = {bool(info["model"]), len(info["labels"]) > 0, bool(info["model_sha256"])}
+        if len(said) > 1:
+            what = f"{microphone}: info has only some of model, model_sha256 and labels"
+            self._error("info", what)
+
+    def _check_topics(self) -> None:
+        """Compare the channels with those that a recorder writes."""
+        expected: dict[str, Topic] = {}
+        for microphone, info in self._contract.infos.items():
+            classes = list(info["labels"]) or None
+            found = topics_of(microphone, list(info["feature_names"]), classes)
+            expected |= {topic.name: topic for topic in found}
+        for name, topic in expected.items():
+            if name not in self._channels and place_of(name)[0]:
+                self._error("topics", f"{name} is missing")
+            if name in self._channels:
+                self._check_arrays(self._channels[name], topic)
+        topics = Counter(c.topic for c in self._data.definitions.channels.values())
+        for name, channel in self._channels.items():
+            if topics[name] > 1:
+                self._error("topics", f"{name} has {topics[name]} channels")
+            if place_of(name)[0] and expected and name not in expected:
+                self._error("topics", f"{name} should not be there")
+            typename = type_of(name)
+            if typename is None:
+                self._findings.warning("other-topic", f"{name} is no topic of hearthlog")
+            else:
+                self._check_type(channel, typename)
+
+    def _check_type(self, channel: Channel, typename: str) -> None:
+        schema = self._data.definitions.schemas.get(channel.schema_id)
+        if schema is None:
+            return  # which is said already
+        if (schema.name, schema.encoding) != (typename, SCHEMA_ENCODING):
+            what = f"{channel.topic} is of type {schema.name} ({schema.encoding}), not {typename}"
+            self._error("type", what)
+        else:
+            self._check_definition(channel, schema)
+        try:
+            profiles = json.loads(channel.metadata.get("offered_qos_profiles", "[{}]"))
+            good = isinstance(profiles, list) and all(isinstance(p, dict) for p in profiles)
+        except (ValueError, RecursionError):
+            good = False
+        if not good or not profiles:
+            self._error("qos", f"{channel.topic}: offered_qos_profiles is no list of profiles")
+
+    def _check_definition(self, channel: Channel, schema: Schema) -> None:
+        """Compare a definition with those that were released, and its hash with what is said."""
+        records = self._data.metadata.get(METADATA, [{}])
+        try:
+            kind = message_type(schema.name, schema.encoding, schema.data)
+            what = difference(kind, schema_version(records[0]) or SCHEMA_VERSION)
+            if not what and channel.metadata.get("topic_type_hash") != type_hash_of(kind):
+                self._error("type", f"{channel.topic}: topic_type_hash is not that of {kind.name}")
+        except LogError as error:
+            what = str(error)
+        if what:
+            what = f"{channel.topic}: {schema.name} is defined otherwise than by hearthlog: {what}"
+            self._error("type", what)
+
+    def _check_arrays(self, channel: Channel, topic: Topic) -> None:
+        for key, names in topic.array_names.items():
+            if channel.metadata.get(f"{key}_names") != json.dumps(list(names)):
+                self._error("array-names", f"{topic.name}: {key}_names are not those of info")
+
+    def _check_rosbag2(self) -> None:
+        records = self._data.metadata.get(ROSBAG2, [])
+        if len(records) != 1:
+            self._error("rosbag2", f"there are {len(records)} metadata records {ROSBAG2}, not one")
+            return
+        try:
+            said = json.loads(records[0]["serialized_metadata"])
+            counts = {
+                topic["topic_metadata"]["name"]: topic["message_count"]
+                for topic in said["topics_with_message_count"]
+            }
+            start = said["starting_time"]["nanoseconds_since_epoch"]
+            span = start, start + said["duration"]["nanoseconds"]
+            total = said["message_count"]
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            self._error("rosbag2", f"metadata {ROSBAG2} cannot be read ({error!r})")
+            return
+        if not self._whole:
+            return
+        actual: Counter[str] = Counter()
+        for number, channel in self._data.definitions.channels.items():
+            actual[channel.topic] += self._data.counts[number]
+        counts |= dict.fromkeys(actual.keys() - counts.keys(), 0)
+        actual.update(dict.fromkeys(counts.keys() - actual.keys(), 0))
+        if counts != actual or total != sum(actual.values()):
+            wrong = [topic for topic in actual if counts.get(topic) != actual[topic]]
+            what = ", ".join(sorted(map(str, wrong))) or "in all"
+            self._error("rosbag2", f"metadata {ROSBAG2} has other counts than the file: {what}")
+        if span != self._data.span:
+            self._error("rosbag2", f"metadata {ROSBAG2} has other times than the file")
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, list | tuple) else value

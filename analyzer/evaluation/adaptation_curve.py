@@ -1,0 +1,130 @@
+"""What some corrected seconds of a new home are worth.
+
+A collection that the machine has never heard stands for the home: it is adapted to segments from
+half of the collection's groups, and tried on those of the other half.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import delayed
+from numpy.typing import NDArray
+from sklearn.metrics import f1_score
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.home_data import HOME_WEIGHT
+from hearthlog.analyzer.training.method import Examples, Method, prepare
+from hearthlog.analyzer.workers.parallel import in_parallel
+
+CORRECTED = (0, 10, 30, 60)  # segments
+_FEWEST_GROUPS = 8
+_FEWEST_CLASSES = 2
+_FEWEST_SEGMENTS = max(CORRECTED)  # to correct, and as many to be tried on
+_SHUFFLES = 3
+
+Indices = NDArray[np.intp]
+
+
+class Curve(NamedTuple):
+    """Macro F1 against the number of corrected segments.
+
+    Attributes
+    ----------
+    corrected : tuple of int
+    collections : dict of str to list of float
+        Of each collection that was left out, over the classes that it has.
+    mean : list of float
+    """
+
+    corrected: tuple[int, ...]
+    collections: dict[str, list[float]]
+    mean: list[float]
+
+
+def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve:
+    """Leave each collection out in turn and adapt to ever more of it.
+
+    Parameters
+    ----------
+    data : Dataset
+    method : Method
+    progress : callable
+        Told how many fits of how many are done.
+
+    Raises
+    ------
+    DataError
+        If no collection is large and varied enough to stand for a home.
+    """
+    names = data.collection_names
+    chosen = [number for number in range(len(names)) if _is_like_a_home(data, number)]
+    if not chosen:
+        raise DataError(
+            f"no collection has {_FEWEST_CLASSES} classes, {_FEWEST_GROUPS} source groups and "
+            f"{2 * _FEWEST_SEGMENTS} segments: none can stand for a new home"
+        )
+    examples = prepare(method, data)
+    splits = [_split(data, number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
+    calls = (delayed(_scores)(method, len(data.classes), split, *examples) for split in splits)
+    scores = np.empty((len(splits), len(CORRECTED)))
+    for place, found in enumerate(in_parallel(calls)):
+        scores[place] = found
+        progress(place + 1, len(splits))
+    each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
+    found = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
+    return Curve(CORRECTED, found, each.mean(axis=0).tolist())
+
+
+def _is_like_a_home(data: Dataset, number: int) -> bool:
+    inside = data.collection == number
+    return (
+        len(np.unique(data.target[inside])) >= _FEWEST_CLASSES
+        and len(np.unique(data.group[inside])) >= _FEWEST_GROUPS
+        and inside.sum() >= 2 * _FEWEST_SEGMENTS
+    )
+
+
+class _Split(NamedTuple):
+    """Segments of other homes, those of this one to correct, in this order, and to be tried on."""
+
+    others: Indices
+    pool: Indices
+    test: Indices
+
+
+def _split(data: Dataset, number: int, shuffle: int) -> _Split:
+    rng = np.random.default_rng(shuffle)
+    inside = data.collection == number
+    groups = rng.permutation(np.unique(data.group[inside]))
+    mine = np.isin(data.group, groups[: len(groups) // 2])
+    pool = _turn_about(np.flatnonzero(inside & mine), data.target, rng)
+    others = np.flatnonzero(~inside & ~np.isin(data.group, groups))
+    return _Split(others, pool, np.flatnonzero(inside & ~mine))
+
+
+def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[float]:
+    examples = Examples(*arrays)
+    inputs, target = examples.inputs[0], examples.target
+    right = target[split.test]
+    scores = []
+    for count in CORRECTED:
+        home = split.pool[:count]
+        weight = examples.weight.copy()
+        weight[home] = HOME_WEIGHT
+        seen = np.concatenate([split.others, home])
+        learned = method.fit(examples._replace(weight=weight), seen, home)
+        decision = learned.decide(inputs[split.test], classes)
+        predicted, labels = decision.argmax(axis=1), np.unique(right)
+        scores.append(f1_score(right, predicted, labels=labels, average="macro", zero_division=0))
+    return scores
+
+
+def _turn_about(rows: Indices, target: Indices, rng: np.random.Generator) -> Indices:
+    """Order segments at random, but so that the classes take turns, as a person would correct."""
+    rows = rng.permutation(rows)
+    turn = np.empty(len(rows), np.intp)
+    for value in np.unique(target[rows]):
+        same = target[rows] == value
+        turn[same] = np.arange(same.sum())
+    return rows[np.argsort(turn, kind="stable")]

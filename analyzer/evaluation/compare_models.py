@@ -1,0 +1,161 @@
+"""Two models on the same sound that neither has learned from: which is better, and how surely."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.evaluate_model import check_classes
+from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.scores import (
+    Difference,
+    Scores,
+    calibration_error,
+    difference,
+    score,
+)
+from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
+from hearthlog.models.classifiers.model import Model
+
+Float32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One of the models.
+
+    Attributes
+    ----------
+    name, sha256 : str
+    scores : Scores
+    expected_calibration_error : float
+    sources_learned : int
+        Sources of the data that it has learned from.
+    """
+
+    name: str
+    sha256: str
+    scores: Scores
+    expected_calibration_error: float
+    sources_learned: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What came of it.
+
+    Attributes
+    ----------
+    a, b : Judged
+    difference : Difference
+        Macro F1 of b minus that of a.
+    sources_left_out : int
+        One of the models has learned from these.
+    held_out : bool
+        False if there are no others, and all were used.
+    skipped : dict of str to int
+        Why recordings gave no segment, and how many.
+    """
+
+    a: Judged
+    b: Judged
+    difference: Difference
+    sources_left_out: int
+    held_out: bool
+    skipped: Mapping[str, int]
+
+    @property
+    def clear(self) -> bool:
+        """Whether one is better: the interval of the difference does not include 0."""
+        interval = self.difference.interval
+        return interval is not None and not interval[0] <= 0.0 <= interval[1]
+
+
+def compare_models(
+    a: Model, b: Model, recordings: Iterable[Recording], scenario: Scenario
+) -> Comparison:
+    """Run two models on the same segments of a second.
+
+    Sources that one of them has learned from are left out.
+
+    Parameters
+    ----------
+    a, b : Model
+    recordings : iterable of Recording
+    scenario : Scenario
+        With the classes of both.
+
+    Raises
+    ------
+    DataError
+        If the classes of a model are not those of the scenario, or there is no segment.
+    """
+    check_classes(a, scenario)
+    check_classes(b, scenario)
+    first, second = Classifier(a), Classifier(b)
+    features = first.feature_set
+    if features != second.feature_set:
+        raise DataError(
+            f"{a.name} is for feature set {features.name}, {b.name} for {second.feature_set.name}: "
+            "they cannot be compared on the same features; evaluate each of them on clips"
+        )
+    data = cut_recordings(recordings, scenario, features)
+    if not len(data):
+        reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
+        raise DataError(f"there is no segment to compare on ({reasons[:300] or 'no marks'})")
+    inputs = [one.inputs.of_windows(data.windows) for one in (first, second)]
+    sources = [_learned_sources(m, i, data) for m, i in zip((a, b), inputs, strict=True)]
+    learned = np.isin(data.group, np.concatenate(sources))
+    kept = np.ones(len(data), bool) if learned.all() else ~learned
+    target, group = data.target[kept], data.group[kept]
+    probabilities = [
+        _probabilities(one, i[kept], data.classes)
+        for one, i in zip((first, second), inputs, strict=True)
+    ]
+    judged = [
+        Judged(
+            name=model.name,
+            sha256=model.sha256,
+            scores=score(target, p.argmax(axis=1), group, data.classes),
+            expected_calibration_error=calibration_error(p, target),
+            sources_learned=len(learned_from),
+        )
+        for model, p, learned_from in zip((a, b), probabilities, sources, strict=True)
+    ]
+    return Comparison(
+        a=judged[0],
+        b=judged[1],
+        difference=difference(target, probabilities[0], probabilities[1], group, data.classes),
+        sources_left_out=0 if learned.all() else len(np.unique(data.group[learned])),
+        held_out=not learned.all(),
+        skipped=data.skipped,
+    )
+
+
+def _probabilities(classifier: Classifier, inputs: Float32, classes: Sequence[str]) -> Float32:
+    order = [classifier.classes.index(name) for name in classes]
+    return classifier.probabilities(inputs)[:, order]
+
+
+def _learned_sources(model: Model, inputs: Float32, data: Dataset) -> NDArray[np.intp]:
+    """Return the groups that a model has learned from: of which it has kept a segment."""
+    kept_inputs = classifier_kind(model.description.kind).kept_inputs(model)
+    learned = np.zeros(len(data), bool)
+    for rows, kept in (
+        *((inputs, kept) for kept in kept_inputs),
+        (data.windows, model.training_windows),
+    ):
+        if len(kept):
+            learned |= np.isin(_as_bytes(rows), _as_bytes(kept))
+    learned &= (data.windows != data.windows[:, :1]).any(axis=(1, 2))  # digital silence is alike
+    return np.unique(data.group[learned])
+
+
+def _as_bytes(rows: Float32) -> NDArray[np.void]:
+    """Make one value of each row, shape (n,)."""
+    rows = np.ascontiguousarray(rows).reshape(len(rows), -1)
+    return rows.view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]

@@ -1,0 +1,276 @@
+"""Where two labellings agree, and where they do not: counted from segments, not frame by frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import Events, Int64
+from hearthlog.analyzer.logs.labellings import Side
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
+
+DAY = 86_400 * NANOSECONDS
+_MINUTE = 60 * NANOSECONDS
+
+Float64 = NDArray[np.float64]
+
+
+class Pieces(NamedTuple):
+    """Time in which no labelling changes.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+    rows : np.ndarray [shape=(m, n)], int64
+        For each labelling the row of its event; -1 where it has none.
+    """
+
+    starts: Int64
+    ends: Int64
+    rows: Int64
+
+    @property
+    def labelled(self) -> NDArray[np.bool_]:
+        """Where all labellings have an event."""
+        return np.logical_and.reduce(self.rows >= 0)
+
+    def taken(self, which: NDArray[np.bool_]) -> "Pieces":
+        """Return some of them."""
+        return Pieces(self.starts[which], self.ends[which], self.rows[:, which])
+
+
+class Runs(NamedTuple):
+    """Time in which both labels stay what they are.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+    a, b : np.ndarray [shape=(n,)], int64
+        Indices of classes.
+    """
+
+    starts: Int64
+    ends: Int64
+    a: Int64
+    b: Int64
+
+    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Runs":
+        """Return some of them."""
+        return Runs(*(column[which] for column in self))
+
+
+@dataclass(frozen=True)
+class ClassAmounts:
+    """How much of a class each side has in the time that both label.
+
+    Attributes
+    ----------
+    minutes_a, minutes_b, minutes_both : float
+        The last: where both sides say so.
+    events_a, events_b : int
+        Segments.
+    """
+
+    minutes_a: float
+    minutes_b: float
+    minutes_both: float
+    events_a: int
+    events_b: int
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """Agreement in some time that both label.
+
+    Attributes
+    ----------
+    minutes : float
+    agreement : float
+        Share of it in which both say the same.
+    kappa : float or None
+        Cohen's; None where both say the same single class throughout.
+    per_class : dict of str to ClassAmounts
+        Of the classes that occur.
+    """
+
+    minutes: float
+    agreement: float
+    kappa: float | None
+    per_class: dict[str, ClassAmounts]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Two labellings compared.
+
+    Attributes
+    ----------
+    a, b : str
+        Their names.
+    minutes_a, minutes_b : float
+        What each labels.
+    only_a, only_b : list of str
+        Classes that the other does not know.
+    classes : list of str
+    total : Amounts
+    confusion : list of list of float
+        Minutes; the classes of a in rows, those of b in columns.
+    days : dict of str to Amounts
+        By UTC day; an event belongs to the day it begins in.
+    disagreements : Runs
+        Where they differ, longest first.
+    """
+
+    a: str
+    b: str
+    minutes_a: float
+    minutes_b: float
+    only_a: list[str]
+    only_b: list[str]
+    classes: list[str]
+    total: Amounts
+    confusion: list[list[float]]
+    days: dict[str, Amounts]
+    disagreements: Runs
+
+
+def compare_sides(a: Side, b: Side) -> Difference:
+    """Compare two labellings where both have a label.
+
+    What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
+
+    Raises
+    ------
+    DataError
+        If they have no time in common.
+    """
+    b = b.called_as(a.classes)
+    classes = list(dict.fromkeys([*a.classes, *b.classes]))
+    events = [events_of(side, classes) for side in (a, b)]
+    pieces = laid_over(events, DAY)
+    pieces = pieces.taken(pieces.labelled)
+    if not len(pieces.starts):
+        raise DataError(f"{a.name} and {b.name} have no time in common")
+    counts = _Counts(pieces, events, len(classes))
+    runs = runs_of(pieces, *events)
+    differing = runs.taken(runs.a != runs.b)
+    return Difference(
+        a=a.name,
+        b=b.name,
+        minutes_a=_minutes(events[0]),
+        minutes_b=_minutes(events[1]),
+        only_a=[name for name in a.classes if name not in b.classes],
+        only_b=[name for name in b.classes if name not in a.classes],
+        classes=classes,
+        total=counts.amounts(classes, slice(None)),
+        confusion=counts.confusion().tolist(),
+        days={
+            str(np.datetime64(day, "D")): counts.amounts(classes, i)
+            for i, day in enumerate(counts.days.tolist())
+        },
+        disagreements=differing.taken(np.argsort(differing.starts - differing.ends, kind="stable")),
+    )
+
+
+def events_of(side: Side, classes: Sequence[str]) -> Events:
+    """Return the segments of a side, their labels as places in `classes`."""
+    place = {name: i for i, name in enumerate(classes)}
+    found = side.labelling
+    labels = np.fromiter(map(place.__getitem__, found.labels), np.int64, len(found))
+    return Events(found.starts, found.ends, labels)
+
+
+def laid_over(labellings: Sequence[Events], every: int = 0) -> Pieces:
+    """Cut the time wherever one of some labellings changes.
+
+    Parameters
+    ----------
+    labellings : sequence of Events
+        Each in the order of time, one label at a time.
+    every : int, optional
+        Cut it also at the multiples of so many nanoseconds.
+    """
+    edges = [times for events in labellings for times in (events.starts, events.ends)]
+    if every:
+        first, last = min(int(e[0]) for e in edges), max(int(e[-1]) for e in edges)
+        edges.append(np.arange(-(-first // every) * every, last, every))
+    times = np.unique(np.concatenate(edges))
+    rows = [_rows_at(events, times[:-1]) for events in labellings]
+    return Pieces(times[:-1], times[1:], np.stack(rows))
+
+
+def runs_of(pieces: Pieces, a: Events, b: Events) -> Runs:
+    """Join successive pieces whose labels are the same; they may be a frame apart."""
+    label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
+    new = np.ones(len(pieces.starts), bool)
+    new[1:] = (
+        (label_a[1:] != label_a[:-1])
+        | (label_b[1:] != label_b[:-1])
+        | (pieces.starts[1:] - pieces.ends[:-1] > FRAME_NANOSECONDS)
+    )
+    last = np.append(new[1:], True)
+    return Runs(pieces.starts[new], pieces.ends[last], label_a[new], label_b[new])
+
+
+class _Counts:
+    """Nanoseconds and events by day and class."""
+
+    def __init__(self, pieces: Pieces, events: Sequence[Events], classes: int) -> None:
+        self.days, day = np.unique(pieces.starts // DAY, return_inverse=True)
+        labels = [e.labels[rows] for e, rows in zip(events, pieces.rows, strict=True)]
+        self._labels, self._lengths, self._classes = labels, pieces.ends - pieces.starts, classes
+        shape = len(self.days), classes
+        self._minutes = [_added(day, label, self._lengths, shape) for label in labels]
+        same = labels[0] == labels[1]
+        self._both = _added(day[same], labels[0][same], self._lengths[same], shape)
+        self._events = []
+        for label, rows in zip(labels, pieces.rows, strict=True):
+            _, first = np.unique(rows, return_index=True)
+            self._events.append(_added(day[first], label[first], None, shape))
+
+    def confusion(self) -> Float64:
+        """Minutes of each pair of classes."""
+        a, b = self._labels
+        return _added(a, b, self._lengths, (self._classes, self._classes)) / _MINUTE
+
+    def amounts(self, classes: Sequence[str], days: int | slice) -> Amounts:
+        """Sum up a day, or all of them."""
+        a, b, both, events_a, events_b = (
+            np.atleast_2d(table[days]).sum(axis=0)
+            for table in (*self._minutes, self._both, *self._events)
+        )
+        total = a.sum()
+        agreement, chance = both.sum() / total, (a / total) @ (b / total)
+        columns = (
+            a / _MINUTE,
+            b / _MINUTE,
+            both / _MINUTE,
+            events_a.astype(int),
+            events_b.astype(int),
+        )
+        rows = zip(classes, *(column.tolist() for column in columns), strict=True)
+        return Amounts(
+            minutes=float(total / _MINUTE),
+            agreement=float(agreement),
+            kappa=float((agreement - chance) / (1.0 - chance)) if chance < 1.0 else None,
+            per_class={name: ClassAmounts(*row) for name, *row in rows if row[0] or row[1]},
+        )
+
+
+def _rows_at(events: Events, times: Int64) -> Int64:
+    rows = np.searchsorted(events.starts, times, side="right") - 1
+    return np.where((rows >= 0) & (events.ends[rows] > times), rows, -1)
+
+
+def _added(row: Int64, column: Int64, weight: Int64 | None, shape: tuple[int, int]) -> Float64:
+    """Add up weights, or count, in a table."""
+    places = row * shape[1] + column
+    return np.bincount(places, weight, shape[0] * shape[1]).astype(np.float64).reshape(shape)
+
+
+def _minutes(events: Events) -> float:
+    return float((events.ends - events.starts).sum() / _MINUTE)

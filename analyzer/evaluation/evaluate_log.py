@@ -1,0 +1,207 @@
+"""A labelled log against a reference labelling of the same time."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import (
+    Detections,
+    Events,
+    Int64,
+    common,
+    detect,
+    laid_out,
+    merged,
+    total,
+)
+from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.logs.labelling import REVIEW, Labelling
+from hearthlog.analyzer.marks.formats import read_lines
+from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.analyzer.training.scores import Scores, score
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.times import NANOSECONDS
+
+_BLOCK = 300 * NANOSECONDS
+_MOST_BLOCKS = 1000
+_LATEST = 1 << 62  # nanoseconds
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a labelled log fits a reference.
+
+    Attributes
+    ----------
+    scores : Scores
+        Of frames of 50 ms; the groups are blocks of five minutes, or more in long references.
+    detections : Detections
+    reference_seconds : float
+        What the reference labels.
+    evaluated_seconds : float
+        What of it the log has labelled too.
+    ambiguous_seconds : float
+        What of that has two labels in the reference; no part of the scores of frames.
+    unknown_labels : dict of str to float
+        Labels of the reference that the log does not know, and for how many evaluated seconds; no
+        part of the scores of frames. Whatever was found there is a false alarm.
+    """
+
+    scores: Scores
+    detections: Detections
+    reference_seconds: float
+    evaluated_seconds: float
+    ambiguous_seconds: float
+    unknown_labels: Mapping[str, float]
+
+
+def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> Comparison:
+    """Compare labels where both the reference and the log have some.
+
+    Parameters
+    ----------
+    reference : Labelling
+        May have several labels at a time, and other names for the classes (see
+        `hearthlog.models.classes`).
+    found : Labelling
+        Has one at a time.
+    classes : sequence of str
+        What the log may be labelled with.
+
+    Raises
+    ------
+    DataError
+        If the two have no time in common, or the reference no label that the log knows.
+    """
+    covered = merged(reference.starts, reference.ends, FRAME_NANOSECONDS)
+    spans = common(covered, merged(found.starts, found.ends, FRAME_NANOSECONDS))
+    if not total(spans):
+        raise DataError(
+            f"the reference ({_between(reference)}) and what is labelled in the log "
+            f"({_between(found)}) have no time in common"
+        )
+    reference = reference.called_as(classes)
+    names = [*classes, *sorted(set(reference.labels) - set(classes))]
+    true, said = (laid_out(_events(each, names), spans) for each in (reference, found))
+    lengths = np.bincount(true.labels, true.ends - true.starts, len(names)) / NANOSECONDS
+    unknown = {
+        name: float(length)
+        for name, length in zip(names[len(classes) :], lengths[len(classes) :], strict=True)
+        if length
+    }
+    known = true.taken(true.labels < len(classes))
+    if not len(known):
+        raise DataError(
+            f"the reference has none of the labels of the log ({', '.join(classes)}) where they "
+            f"have time in common, but {', '.join(unknown)[:200]}"
+        )
+    scores, ambiguous = _frames(true, said, classes)
+    return Comparison(
+        scores=scores,
+        detections=detect(known, said, classes, total(spans)),
+        reference_seconds=_seconds(total(covered)),
+        evaluated_seconds=_seconds(total(spans)),
+        ambiguous_seconds=_seconds(ambiguous * FRAME_NANOSECONDS),
+        unknown_labels=unknown,
+    )
+
+
+def _events(labelling: Labelling, names: Sequence[str]) -> Events:
+    place = {name: i for i, name in enumerate(names)}
+    labels = np.fromiter(map(place.__getitem__, labelling.labels), np.int64, len(labelling))
+    return Events(labelling.starts, labelling.ends, labels)
+
+
+def _frames(reference: Events, found: Events, classes: Sequence[str]) -> tuple[Scores, int]:
+    """Score the frames; return also how many have several labels in the reference.
+
+    Between two successive times at which anything changes, all frames are alike: they are
+    counted, not made.
+    """
+    end = int(reference.ends.max())
+    block = max(_BLOCK, -(-end // _MOST_BLOCKS))
+    times = np.unique(
+        np.concatenate(
+            [
+                *(reference.starts, reference.ends, found.starts, found.ends),
+                np.arange(0, end + block, block),
+            ]
+        )
+    )
+    target, several = _single(reference, times, len(classes))
+    predicted, _ = _single(found, times, len(classes))
+    # A frame belongs where its middle is.
+    weight = np.diff((times + FRAME_NANOSECONDS // 2 - 1) // FRAME_NANOSECONDS)
+    ambiguous = int(weight[several & (predicted >= 0)].sum())
+    rows = (target >= 0) & (target < len(classes)) & ~several & (predicted >= 0) & (weight > 0)
+    group = times[:-1][rows] // block
+    return score(target[rows], predicted[rows], group, classes, weight[rows]), ambiguous
+
+
+def _single(events: Events, times: Int64, classes: int) -> tuple[Int64, NDArray[np.bool_]]:
+    """Return the label between each time and the next, and where there are several.
+
+    It is -1 for none, and the number of classes for any that is none of them.
+    """
+    events = replace(events, labels=np.minimum(events.labels, classes))
+    label = np.full(len(times) - 1, -1)
+    count = np.zeros(len(times) - 1, np.int64)
+    for value in np.unique(events.labels).tolist():
+        same = events.of(value)
+        change = np.bincount(np.searchsorted(times, same.starts), minlength=len(times))
+        change -= np.bincount(np.searchsorted(times, same.ends), minlength=len(times))
+        active = np.cumsum(change)[:-1] > 0
+        label[active] = value
+        count += active
+    return label, count > 1
+
+
+def _seconds(nanoseconds: int) -> float:
+    return nanoseconds / NANOSECONDS
+
+
+def _between(labelling: Labelling) -> str:
+    first, last = (
+        np.datetime64(int(t) // NANOSECONDS, "s")
+        for t in (labelling.starts.min(), labelling.ends.max())
+    )
+    return f"{first}Z to {last}Z"
+
+
+def read_reference(source: str, path: Path, microphone: str) -> Labelling:
+    """Read what a log is to be compared with.
+
+    Parameters
+    ----------
+    source : str
+        A label file, or `review` for the review layers.
+    path : Path
+        The log, or folder of logs.
+    microphone : str
+
+    Raises
+    ------
+    DataError
+        If there is no such file, it is no label file, or nobody has reviewed the logs.
+    LogError
+        If a log or a layer is damaged.
+    """
+    if source == REVIEW:
+        marks = [mark for log in find_logs(path) for mark in read_marks(log)]
+        where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
+    else:
+        found = read_lines(Path(source), find_heard(path), microphone)
+        marks = [mark for _, mark in found]
+        where = f"{source}: has no label of {microphone}"
+    marks = [mark for mark in marks if mark.microphone == microphone]
+    if not marks:
+        raise DataError(where)
+    if max(abs(time) for mark in marks for time in (mark.start, mark.end)) > _LATEST:
+        raise DataError(f"{source}: has a time that no log has")
+    starts, ends, labels = zip(*((m.start, m.end, m.label) for m in marks), strict=True)
+    return Labelling(np.array(starts), np.array(ends), np.array(labels, object))

@@ -1,0 +1,103 @@
+"""A way to learn, tried on segments that it has not learned from."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.method import (
+    Fold,
+    Method,
+    cross_validate,
+    inverse_temperature,
+    prepare,
+    softmax,
+)
+from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
+from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
+
+Kind = Literal["segment", "source", "collection"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """How good a way to learn is.
+
+    Attributes
+    ----------
+    folds : int
+    scores : Scores
+    expected_calibration_error : float
+    reliability : list of Bin
+    """
+
+    folds: int
+    scores: Scores
+    expected_calibration_error: float
+    reliability: list[Bin]
+
+
+def evaluate_method(
+    data: Dataset, method: Method, kind: Kind, progress: Progress
+) -> CrossValidation:
+    """Cross-validate a way to learn.
+
+    Parameters
+    ----------
+    data : Dataset
+    method : Method
+    kind : str
+        What is never on both sides of a fold: a `segment` (the paper's folds, which flatter,
+        since segments of one recording are alike), a `source`, or a `collection`, which is what
+        a new home is.
+    progress : callable
+        Told how many folds of how many are done.
+
+    Raises
+    ------
+    DataError
+        If there are too few sources or collections.
+    """
+    check_varied(data)
+    folds = divide(data, kind)
+    examples = prepare(method, data)
+    [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
+    probabilities = softmax(inverse_temperature(decisions, data.target) * decisions)
+    return CrossValidation(
+        len(folds),
+        score(data.target, probabilities.argmax(axis=1), data.group, data.classes),
+        calibration_error(probabilities, data.target),
+        reliability(probabilities, data.target),
+    )
+
+
+def divide(data: Dataset, kind: Kind) -> list[Fold]:
+    """Divide segments into folds, of which a `kind` is never on both sides.
+
+    Raises
+    ------
+    DataError
+        If there are too few sources or collections.
+    """
+    if kind == "source":
+        return group_folds(data)
+    if kind == "segment":
+        fewest = min(amount.segments for amount in data.amounts.values())
+        if fewest < MOST_FOLDS:
+            raise DataError(f"a class has {fewest} segments; {MOST_FOLDS} folds need one each")
+        divider = StratifiedKFold(MOST_FOLDS, shuffle=True, random_state=0)
+        return list(divider.split(data.target, data.target))
+    if len(data.collection_names) < 2:
+        raise DataError(
+            "all recordings are of one collection (column source of the manifest): there is none "
+            "to learn from when it is left out"
+        )
+    folds = list(LeaveOneGroupOut().split(data.target, data.target, data.collection))
+    for seen, unseen in folds:
+        if data.target[seen].min() == data.target[seen].max():
+            name = data.collection_names[data.collection[unseen[0]]]
+            raise DataError(f"without collection {name} there is one class left to learn from")
+    return folds

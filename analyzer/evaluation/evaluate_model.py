@@ -1,0 +1,169 @@
+"""A model on labelled clips: by segments as in training, and by events as in a log."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
+from hearthlog.analyzer.training.dataset import Progress, Recording, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.manifest import Clip
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.labels.segments import Segmenter
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.schemas.times import NANOSECONDS
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good a model is on labelled clips.
+
+    Attributes
+    ----------
+    scores : Scores
+        Of segments of a second; the groups are the source groups.
+    expected_calibration_error : float
+    reliability : list of Bin
+    detections : Detections
+        Each clip is a recording with one event, its label from the first frame that the model
+        labels to the last.
+    evaluated_seconds : float
+        Of what the detections are about.
+    skipped : dict of str to int
+        Why clips gave no segment, and how many.
+    learned_from : bool
+        Whether the model learned from just these segments.
+    """
+
+    scores: Scores
+    expected_calibration_error: float
+    reliability: list[Bin]
+    detections: Detections
+    evaluated_seconds: float
+    skipped: Mapping[str, int]
+    learned_from: bool
+
+
+def scenario_of(model: Model) -> Scenario:
+    """Return the scenario that a model was trained for."""
+    about = model.description
+    classes = {name: tuple(labels) for name, labels in about.scenario.items()}
+    return Scenario(about.scenario_name, classes)
+
+
+def evaluate_model(
+    model: Model, clips: Sequence[Clip], scenario: Scenario, progress: Progress
+) -> Evaluation:
+    """Run a model on clips, and compare what it says with their labels.
+
+    Parameters
+    ----------
+    model : Model
+    clips : sequence of Clip
+    scenario : Scenario
+        With the classes of the model.
+    progress : callable
+        Told how many clips of how many are done.
+
+    Raises
+    ------
+    DataError
+        If the classes of the model are not those of the scenario, or no clip has a segment.
+    SourceError
+        If a clip cannot be read.
+    """
+    check_classes(model, scenario)
+    # In the order of the model's probabilities.
+    scenario = Scenario(
+        scenario.name, {name: scenario.classes[name] for name in model.classes}, scenario.ignored
+    )
+    classifier = Classifier(model)
+    features, listener = classifier.feature_set, _Listener(classifier)
+    recordings = clip_recordings(clips, scenario, progress, features)
+    data = cut_recordings(listener.overhear(recordings, scenario), scenario, features)
+    if not len(data):
+        reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
+        raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
+    probabilities = classifier.probabilities(classifier.inputs.of_windows(data.windows))
+    scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
+    return Evaluation(
+        scores=scores,
+        expected_calibration_error=calibration_error(probabilities, data.target),
+        reliability=reliability(probabilities, data.target),
+        detections=listener.detections(),
+        evaluated_seconds=listener.duration / NANOSECONDS,
+        skipped=data.skipped,
+        learned_from=data.digest == model.description.training_data.sha256,
+    )
+
+
+def check_classes(model: Model, scenario: Scenario) -> None:
+    """Raise DataError unless a model has the classes of a scenario, in any order."""
+    lacking = [name for name in scenario.classes if name not in model.classes]
+    other = [name for name in model.classes if name not in scenario.classes]
+    if lacking or other:
+        said = [
+            f"{what} {', '.join(names)}"
+            for what, names in (("the model lacks", lacking), ("the scenario lacks", other))
+            if names
+        ]
+        raise DataError(
+            f"model {model.name or model.description.scenario_name} does not fit scenario "
+            f"{scenario.name}: {'; '.join(said)}; use the scenario it was trained for"
+        )
+
+
+class _Listener:
+    """Collects the events of recordings that are laid out one after the other.
+
+    Attributes
+    ----------
+    duration : int
+        Labelled time, in nanoseconds.
+    """
+
+    def __init__(self, classifier: Classifier) -> None:
+        self.duration = 0
+        self._classifier = classifier
+        self._place = 0
+        self._reference: list[tuple[int, int, int]] = []
+        self._found: list[tuple[int, int, int]] = []
+
+    def overhear(self, recordings: Iterable[Recording], scenario: Scenario) -> Iterator[Recording]:
+        """Add recordings that are on their way."""
+        for recording in recordings:
+            name = scenario.find(recording.label)
+            if name is not None:
+                self._listen(recording.features, name)
+            yield recording
+
+    def _listen(self, features: Float32, label: str) -> None:
+        """Add a recording of one label."""
+        inputs = self._classifier.inputs.stream()(features)
+        probabilities = self._classifier.probabilities(inputs)
+        if not len(probabilities):
+            return
+        length = len(probabilities) * FRAME_NANOSECONDS
+        stamps = self._place + np.arange(0, length, FRAME_NANOSECONDS)
+        smoothing, transitions = self._classifier.smoothing, self._classifier.transitions
+        segmenter = Segmenter(smoothing, transitions, FRAME_SECONDS)
+        segments = segmenter.push(probabilities, stamps) + segmenter.close(self._place + length)
+        self._found += [(one.start, one.end, one.label) for one in segments]
+        true = self._classifier.classes.index(label)
+        self._reference.append((self._place, self._place + length, true))
+        self.duration += length
+        self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
+
+    def detections(self) -> Detections:
+        """Score all of them."""
+        reference, found = (
+            Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._found)
+        )
+        return detect(reference, found, self._classifier.classes, self.duration)

@@ -1,0 +1,309 @@
+"""Labelled spans against those of a reference: by the second, by the event, and false alarms.
+
+The scores are those of sed_eval, on arrays: a day of labels has too many spans for a loop.
+
+References
+----------
+Mesaros et al., "Metrics for Polyphonic Sound Event Detection", 2016.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.times import NANOSECONDS
+
+COLLAR = NANOSECONDS // 5
+_PART_OF_LENGTH = 0.5
+_DAY = 24 * 3600 * NANOSECONDS
+_MOST_PAIRS = 20_000_000
+
+Int64 = NDArray[np.int64]
+Spans = tuple[Int64, Int64]
+
+
+@dataclass(frozen=True)
+class Events:
+    """Labelled spans; those of different labels may overlap.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Nanoseconds; every end is after its start.
+    labels : np.ndarray [shape=(n,)], int64
+        Indices of classes.
+    """
+
+    starts: Int64
+    ends: Int64
+    labels: Int64
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def of(self, label: int) -> "Events":
+        """Return those of one label."""
+        return self.taken(np.flatnonzero(self.labels == label))
+
+    def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
+        """Return some of them."""
+        return Events(self.starts[rows], self.ends[rows], self.labels[rows])
+
+
+@dataclass(frozen=True)
+class Detection:
+    """How well something was found; None where it has no meaning.
+
+    Attributes
+    ----------
+    precision, recall, f1 : float or None
+    reference, found : int
+        How many seconds, or events, there are.
+    """
+
+    precision: float | None
+    recall: float | None
+    f1: float | None
+    reference: int
+    found: int
+
+
+@dataclass(frozen=True)
+class DetectionScores:
+    """How well the classes were found.
+
+    Attributes
+    ----------
+    f1, precision, recall : float or None
+        Of all classes counted together.
+    macro_f1 : float or None
+        Mean over the classes of the reference.
+    per_class : dict of str to Detection
+    """
+
+    f1: float | None
+    precision: float | None
+    recall: float | None
+    macro_f1: float | None
+    per_class: dict[str, Detection]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """How well events were found in some time.
+
+    Attributes
+    ----------
+    segment_based, event_based : DetectionScores
+    false_alarms_per_day : dict of str to float
+        Events of a class that overlap none of that class in the reference, for 24 hours.
+    """
+
+    segment_based: DetectionScores
+    event_based: DetectionScores
+    false_alarms_per_day: dict[str, float]
+
+
+def detect(reference: Events, found: Events, classes: Sequence[str], duration: int) -> Detections:
+    """Score events by the second and by the event, and count false alarms.
+
+    Parameters
+    ----------
+    reference, found : Events
+        From 0 on, as `laid_out` makes them.
+    classes : sequence of str
+    duration : int
+        Evaluated time in nanoseconds.
+
+    Raises
+    ------
+    DataError
+        If so many events start together that this is no labelling.
+    """
+    return Detections(
+        segment_based(reference, found, classes),
+        event_based(reference, found, classes),
+        false_alarms_per_day(reference, found, classes, duration),
+    )
+
+
+def merged(starts: Int64, ends: Int64, tolerance: int = 0) -> Spans:
+    """Join spans that overlap, or are no further apart than `tolerance`.
+
+    Returns
+    -------
+    (starts, ends)
+        Ascending, disjoint.
+    """
+    order = np.argsort(starts, kind="stable")
+    starts, reach = starts[order], np.maximum.accumulate(ends[order])
+    first = np.concatenate([[True], starts[1:] > reach[:-1] + tolerance])[: len(starts)]
+    last = np.concatenate([first[1:], [True]])[: len(starts)]
+    return starts[first], reach[last]
+
+
+def common(first: Spans, second: Spans) -> Spans:
+    """Return the spans that are in both of two ascending, disjoint lists."""
+    events = Events(*first, np.zeros(len(first[0]), np.int64))
+    cut, _ = _cut(events, *second)
+    return cut.starts, cut.ends
+
+
+def laid_out(events: Events, spans: Spans) -> Events:
+    """Cut events to spans of time, and lay the spans out as recordings one after the other.
+
+    Every span begins on a whole second, and at least one second after the end of the last: no
+    event is compared with one of another span.
+
+    Parameters
+    ----------
+    events : Events
+    spans : (starts, ends)
+        Ascending, disjoint.
+    """
+    starts, ends = spans
+    seconds = -((starts - ends) // NANOSECONDS) + 1
+    places = (np.cumsum(seconds) - seconds) * NANOSECONDS
+    cut, span = _cut(events, starts, ends)
+    shift = (places - starts)[span]
+    return Events(cut.starts + shift, cut.ends + shift, cut.labels)
+
+
+def _cut(events: Events, starts: Int64, ends: Int64) -> tuple[Events, NDArray[np.intp]]:
+    """Cut events to disjoint spans; return the pieces and the span that each is in."""
+    first = np.searchsorted(ends, events.starts, "right")
+    count = np.maximum(np.searchsorted(starts, events.ends, "left") - first, 0)
+    event = np.repeat(np.arange(len(events)), count)
+    span = first[event] + _positions(count)
+    pieces = Events(
+        np.maximum(events.starts[event], starts[span]),
+        np.minimum(events.ends[event], ends[span]),
+        events.labels[event],
+    )
+    return pieces, span
+
+
+def _positions(counts: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Count 0, 1 … within runs of these lengths."""
+    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def segment_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
+    """Score second by second: a class is active in each second that one of its events touches.
+
+    Parameters
+    ----------
+    reference, found : Events
+        From 0 on, as `laid_out` makes them.
+    classes : sequence of str
+    """
+    counts = []
+    for label in range(len(classes)):
+        true, said = _seconds(reference.of(label)), _seconds(found.of(label))
+        counts.append((total(common(true, said)), total(true), total(said)))
+    return _scores(counts, classes)
+
+
+def _seconds(events: Events) -> Spans:
+    """Return the whole seconds that events touch."""
+    return merged(events.starts // NANOSECONDS, -(-events.ends // NANOSECONDS))
+
+
+def total(spans: Spans) -> int:
+    """Add up the lengths of spans."""
+    return int((spans[1] - spans[0]).sum())
+
+
+def event_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
+    """Score event by event, each matched with at most one.
+
+    Two events match if their onsets are at most 0.2 s apart, and their offsets at most 0.2 s or
+    half the length of the reference's, whichever is more. As many as possible are matched.
+
+    Parameters
+    ----------
+    reference, found : Events
+    classes : sequence of str
+
+    Raises
+    ------
+    DataError
+        If so many events start together that this is no labelling.
+    """
+    counts = []
+    for label in range(len(classes)):
+        true, said = reference.of(label), found.of(label)
+        counts.append((_matches(true, said), len(true), len(said)))
+    return _scores(counts, classes)
+
+
+def _matches(reference: Events, found: Events) -> int:
+    """Size of the largest matching."""
+    found = found.taken(np.argsort(found.starts, kind="stable"))
+    first = np.searchsorted(found.starts, reference.starts - COLLAR, "left")
+    count = np.searchsorted(found.starts, reference.starts + COLLAR, "right") - first
+    if count.sum() > _MOST_PAIRS:
+        raise DataError("too many events start within 0.2 s of each other; this is no labelling")
+    row = np.repeat(np.arange(len(reference)), count)
+    column = first[row] + _positions(count)
+    tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
+    near = np.abs(reference.ends[row] - found.ends[column]) <= tolerance[row]
+    if not near.any():
+        return 0
+    shape = len(reference), len(found)
+    hits = coo_array((np.ones(near.sum(), np.int8), (row[near], column[near])), shape)
+    return int((maximum_bipartite_matching(hits.tocsr()) >= 0).sum())
+
+
+def false_alarms_per_day(
+    reference: Events, found: Events, classes: Sequence[str], duration: int
+) -> dict[str, float]:
+    """Count events of a class that overlap none of that class in the reference.
+
+    Parameters
+    ----------
+    reference, found : Events
+    classes : sequence of str
+    duration : int
+        Evaluated time in nanoseconds.
+
+    Returns
+    -------
+    dict of str to float
+        For 24 hours of evaluated time.
+    """
+    alarms = (_false_alarms(reference.of(i), found.of(i)) for i in range(len(classes)))
+    return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}
+
+
+def _false_alarms(reference: Events, found: Events) -> int:
+    starts, ends = merged(reference.starts, reference.ends)
+    before = np.searchsorted(starts, found.ends, "left")
+    reached = np.concatenate([[np.iinfo(np.int64).min], ends])[before]
+    return int((reached <= found.starts).sum())
+
+
+def _scores(counts: list[tuple[int, int, int]], classes: Sequence[str]) -> DetectionScores:
+    """Make scores of (right, in the reference, found) for each class."""
+    right, reference, found = np.sum(counts, axis=0).tolist()
+    every = _detection(right, reference, found)
+    per_class = {name: _detection(*c) for name, c in zip(classes, counts, strict=True)}
+    known = [d.f1 for d in per_class.values() if d.f1 is not None]
+    return DetectionScores(
+        every.f1, every.precision, every.recall, float(np.mean(known)) if known else None, per_class
+    )
+
+
+def _detection(right: int, reference: int, found: int) -> Detection:
+    return Detection(
+        precision=right / found if found else None,
+        recall=right / reference if reference else None,
+        f1=2 * right / (reference + found) if reference else None,
+        reference=reference,
+        found=found,
+    )

@@ -1,0 +1,48 @@
+"""Which parameters of a method tell segments apart best."""
+
+from typing import NamedTuple
+
+from hearthlog.analyzer.evaluation.evaluate_method import Kind, divide
+from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.method import Method, cross_validate, prepare
+from hearthlog.analyzer.training.scores import Scores, score
+from hearthlog.analyzer.training.train import check_varied
+
+
+class Tried(NamedTuple):
+    """A method and how good it was on segments that it had not learned from."""
+
+    method: Method
+    scores: Scores
+
+
+def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -> list[Tried]:
+    """Cross-validate methods that differ in their parameters, all on the same folds.
+
+    Parameters
+    ----------
+    data : Dataset
+    methods : list of Method
+    by : str
+        What is never on both sides of a fold: see `analyzer.evaluation.folds.evaluate_method`.
+    progress : callable
+        Told how many fits of how many are done.
+
+    Returns
+    -------
+    list of Tried
+        The best macro F1 first. It is optimistic, since the same folds chose it.
+
+    Raises
+    ------
+    DataError
+        If there are too few sources or collections.
+    """
+    check_varied(data)
+    folds, examples = divide(data, by), prepare(methods[0], data)
+    decisions = cross_validate(methods, examples, len(data.classes), folds, progress)
+    tried = [
+        Tried(method, score(data.target, decided.argmax(axis=1), data.group, data.classes))
+        for method, decided in zip(methods, decisions, strict=True)
+    ]
+    return sorted(tried, key=lambda one: -one.scores.macro_f1)

@@ -1,6 +1,0 @@
-"""Marks in files of others: Audacity, CSV, Raven, ELAN, Label Studio, RTTM."""
-
-from hearthlog.analyzer.exchange.files import SUFFIXES, read_labels, read_lines, write_labels
-from hearthlog.analyzer.exchange.standing import new_marks
-
-__all__ = ["SUFFIXES", "new_marks", "read_labels", "read_lines", "write_labels"]

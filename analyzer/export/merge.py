@@ -1,0 +1,259 @@
+"""Logs put together, or a part of them cut out: messages are copied as they are."""
+
+import hashlib
+import json
+import sys
+from collections import Counter
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+
+from hearthlog.analyzer.logs.channel_names import unused
+from hearthlog.analyzer.logs.selection import Described, Progress, Selection, identity
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.files import new_file
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.logs.writer import ENCODING
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.logfile import LogFile
+
+_CHANNELS_LIMIT = (1 << 16) - 1
+_PROFILES_LIMIT = 64 << 10  # characters
+_FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
+
+
+def splice(
+    selection: Selection,
+    output: Path,
+    progress: Progress = lambda _: None,
+    *,
+    latched: bool = False,
+) -> None:
+    """Write the messages of a selection to one log, in the order of their log times.
+
+    Messages of one time keep the order of their log. Channels of the same topic, definition and
+    metadata become one. Metadata records and attachments of the logs are kept, the same ones
+    once; the `rosbag2` record is made anew.
+
+    Parameters
+    ----------
+    selection : Selection
+    output : Path
+        Must not exist.
+    progress : callable
+        Is told the share that is done.
+    latched : bool
+        Begin with what a late subscriber would still be given: the last message before the span
+        of every channel that is transient local without end, at the log time of the first one in
+        the span. Its publish time and its content stay as they were.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if there is no message, or if the output cannot be written.
+    """
+    with new_file(output) as temporary, temporary.open("xb") as stream:
+        write_log(selection, stream, output.name, progress, latched=latched)
+
+
+def write_log(
+    selection: Selection,
+    stream: BinaryIO,
+    name: str,
+    progress: Progress = lambda _: None,
+    *,
+    latched: bool = False,
+) -> Mapping[str, str] | None:
+    """Do what `splice` does, on a stream; return the `rosbag2` record.
+
+    There is none if a topic has channels that rosbag2 cannot tell apart, or no ROS 2 messages.
+    """
+    selection.verify()  # the copies get checksums of their own
+    batches = selection.messages(progress)
+    first = next(batches, None)
+    if first is None:
+        raise selection.nothing()
+    log = _Log(stream, selection)
+    if latched:
+        start = min(int(messages.log_times[0]) for messages in first)
+        spoken = {m.channel.topic for m in first if m.log_times[0] == start}
+        for topic, message in _latched(selection).items():
+            if topic not in spoken:
+                log.write([_at(start, message)])
+    log.write(first)
+    for batch in batches:
+        log.write(batch)
+    return log.finish(name)
+
+
+class _Log:
+    """The log being written."""
+
+    def __init__(self, stream: BinaryIO, selection: Selection) -> None:
+        self._writer = ChunkWriter(stream)
+        self._schemas: dict[Hashable, int] = {}
+        self._channels: dict[Hashable, int] = {}
+        self._described: dict[int, Described] = {}
+        self._counts: Counter[int] = Counter()
+        self._span = (sys.maxsize, 0)
+        self._writer.start(_profile(selection.logs), "hearthlog")
+        self._copy_records(selection.logs)
+        for same in selection.channels.values():
+            for described in same:
+                self._channel(described)
+
+    def write(self, batch: Sequence[RawMessages]) -> None:
+        """Append messages; those of one time in the order in which they were read."""
+        places: dict[int, int] = {}
+        end = 0
+        blocks: list[Block] = []
+        for messages in batch:
+            if id(messages.buffer) not in places:
+                places[id(messages.buffer)] = end
+                end += len(messages.buffer)
+            start = places[id(messages.buffer)]
+            channel = self._channel((messages.channel, messages.schema))
+            blocks += (
+                block._replace(rank=start + messages.offsets[block.rank])
+                for block in blocks_of(messages, channel)
+            )
+            times = messages.log_times
+            self._counts[channel] += len(messages)
+            self._span = min(self._span[0], int(times[0])), max(self._span[1], int(times[-1]))
+        self._writer.write(blocks)
+
+    def finish(self, name: str) -> Mapping[str, str] | None:
+        """Complete the log; return its `rosbag2` record, if it has one."""
+        topics = self._topics()
+        record = None if topics is None else rosbag2.file_metadata(name, topics, self._span)
+        if record is not None:
+            self._writer.add_metadata(rosbag2.METADATA, record)
+        self._writer.finish()
+        return record
+
+    def _copy_records(self, logs: Sequence[Path]) -> None:
+        seen: set[Hashable] = set()
+        names: set[str] = set()
+        for path in logs:
+            with LogFile(path) as file:
+                for place in sorted(file.places, key=lambda place: place.offset):
+                    record = file.record(place)
+                    key = _key(record)
+                    if key is None or key in seen:
+                        continue
+                    seen.add(key)
+                    if isinstance(record, Metadata):
+                        self._writer.add_metadata(record.name, record.metadata)
+                    elif isinstance(record, Attachment):
+                        own = unused(record.name, names)
+                        times = record.create_time, record.log_time
+                        self._writer.add_attachment(*times, own, record.media_type, record.data)
+
+    def _channel(self, described: Described) -> int:
+        key = identity(*described)
+        if key not in self._channels:
+            channel, schema = described
+            if len(self._channels) == _CHANNELS_LIMIT:
+                raise LogError("more channels than a log can have; choose some with --topics")
+            number = self._writer.register_channel(
+                channel.topic, channel.message_encoding, self._schema(schema), channel.metadata
+            )
+            self._channels[key] = number
+            self._described[number] = described
+        return self._channels[key]
+
+    def _schema(self, schema: Schema | None) -> int:
+        if schema is None:
+            return 0
+        key = schema.name, schema.encoding, schema.data
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(*key)
+        return self._schemas[key]
+
+    def _topics(self) -> dict[str, rosbag2.TopicCount] | None:
+        """Describe topics as rosbag2 does; None if it cannot."""
+        found: dict[str, rosbag2.TopicCount] = {}
+        for number, (channel, schema) in self._described.items():
+            about = {
+                "offered_qos_profiles": json.dumps(_profiles(channel)),
+                "topic_type_hash": channel.metadata.get("topic_type_hash", ""),
+            }
+            name = "" if schema is None else schema.name
+            topic = found.setdefault(channel.topic, rosbag2.TopicCount(name, about))
+            if channel.message_encoding != ENCODING or (topic.type, topic.channel_metadata) != (
+                name,
+                about,
+            ):
+                return None
+            topic.messages += self._counts[number]
+        return found
+
+
+def _profile(logs: Sequence[Path]) -> str:
+    profiles = set()
+    for path in logs:
+        with LogFile(path) as file:
+            profiles.add("" if file.header is None else file.header.profile)
+    return profiles.pop() if len(profiles) == 1 else ""
+
+
+def _key(record: McapRecord | None) -> Hashable:
+    """Return what equal records have in common; None for those that are not copied."""
+    if isinstance(record, Metadata) and record.name != rosbag2.METADATA:
+        return record.name, frozenset(record.metadata.items())
+    if isinstance(record, Attachment):
+        return record.name, record.media_type, hashlib.sha256(record.data).digest()
+    return None
+
+
+def _latched(selection: Selection) -> dict[str, RawMessages]:
+    """Find, by topic, the last message before the span, where it outlasts its writer."""
+    lasting = {
+        topic
+        for topic, same in selection.channels.items()
+        if any(lasts(channel) for channel, _ in same)
+    }
+    found: dict[str, RawMessages] = {}
+    for path in selection.earlier:
+        missing = lasting - found.keys()
+        if not missing:
+            break
+        last: dict[str, RawMessages] = {}
+        for batch in iterate_messages([path], missing, end=selection.start):
+            for messages in batch:
+                topic = messages.channel.topic
+                if topic not in last or messages.log_times[-1] >= last[topic].log_times[-1]:
+                    last[topic] = messages
+        found |= last
+    return found
+
+
+def _at(time: int, messages: RawMessages) -> RawMessages:
+    """Return the last of some messages, logged at another time."""
+    heads = messages.heads[-1:].copy()
+    heads["log_time"] = time
+    return replace(messages, offsets=messages.offsets[-1:], heads=heads)
+
+
+def lasts(channel: Channel) -> bool:
+    """Tell whether a late subscriber is still given the last message, however old it is."""
+    return any(
+        profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER
+        for profile in _profiles(channel)
+    )
+
+
+def _profiles(channel: Channel) -> list[Any]:
+    """Read the quality of service that a channel offers; nothing if it cannot be understood."""
+    text = channel.metadata.get("offered_qos_profiles", "")
+    try:
+        return list(dump_qos_v9(parse_qos(text if len(text) < _PROFILES_LIMIT else "")))
+    except (ReaderError, KeyError, TypeError, AttributeError, RecursionError):
+        return []

@@ -1,0 +1,296 @@
+"""The rows of a catalogue: made from the files, and asked for them."""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.catalog.contents import Contents, read_contents
+from hearthlog.analyzer.logs.catalog.file import (
+    SCHEMA,
+    read_table,
+    table_of,
+    without_times,
+    write_table,
+)
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
+from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
+from hearthlog.schemas.times import NANOSECONDS
+
+LOG, RELABEL, REVIEW = "log", "relabel", "review"
+FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"
+_SEGMENT_TOPICS = {
+    LOG: "/[^/]+/segment",
+    RELABEL: "/[^/]+/relabel/[^/]+/segment",
+    REVIEW: "/[^/]+/review/segment",
+}
+_HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
+_NODE = re.compile(r"(.+)_\d{8}T\d{6}Z")
+_LAYER = re.compile(rf"(.+)\.(?:({RELABEL})-.+|({REVIEW})){re.escape(SUFFIX)}", re.DOTALL)
+_BATCH = 1000  # rows
+_NEVER = -1
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a catalogue says of one file; docs/catalog.md explains the columns.
+
+    Times are nanoseconds of UTC. What a file does not say is None, or empty.
+    """
+
+    path: str
+    home: str
+    node: str | None
+    kind: str
+    log: str | None
+    size: int
+    mtime: int
+    state: str = DAMAGED
+    error: str | None = None
+    microphones: Sequence[str] = ()
+    start: int | None = None
+    end: int | None = None
+    frames: int = 0
+    first_frame: int | None = None
+    first_stamp: int | None = None
+    last_frame: int | None = None
+    last_stamp: int | None = None
+    feature_set: str | None = None
+    model: str | None = None
+    model_sha256: str | None = None
+    input_sha256: str | None = None
+    version: str | None = None
+    gaps: int = 0
+    gap_seconds: float = 0.0
+    labels: Sequence[Mapping[str, Any]] = ()
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time; None if there are no messages."""
+        return None if self.start is None or self.end is None else (self.start, self.end)
+
+
+class Catalog:
+    """The catalogue of a folder.
+
+    Parameters
+    ----------
+    folder : Path
+    table : pa.Table
+        Of `SCHEMA`.
+    """
+
+    def __init__(self, folder: Path, table: pa.Table) -> None:
+        self.folder = folder
+        self.table = table
+        self._plain = without_times(table)
+        self._numbers = {path: number for number, path in enumerate(table["path"].to_pylist())}
+        self._sizes, self._times = (self._plain[name].to_numpy() for name in ("size", "mtime"))
+        self._starts, self._ends = (
+            pc.fill_null(self._plain[name], _NEVER).to_numpy() for name in ("start", "end")
+        )
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def current(self, path: Path) -> Row | None:
+        """Return what is said of a file; None if nothing is, or the file was changed since."""
+        number = self.find(path)
+        return None if number is None else next(self.rows(number, 1))
+
+    def span(self, path: Path) -> tuple[int, int] | None:
+        """Return first and last log time of a file; None if only the file can tell."""
+        number = self.find(path)
+        if number is None or self._starts[number] == _NEVER:
+            return None
+        return int(self._starts[number]), int(self._ends[number])
+
+    def find(self, path: Path) -> int | None:
+        """Return which row is that of a file; None where `current` is None."""
+        try:
+            number = self._numbers.get(_relative(path, self.folder))
+            found = None if number is None else _size_and_time(path)
+        except (ValueError, LogError):
+            return None
+        if number is None or (self._sizes[number], self._times[number]) != found:
+            return None
+        return number
+
+    def rows(self, first: int = 0, count: int | None = None) -> Iterator[Row]:
+        """Go through rows, by default all."""
+        for batch in self._plain.slice(first, count).to_batches(_BATCH):
+            for values in batch.to_pylist():
+                yield Row(**values)
+
+    def of_state(self, state: str) -> list[Row]:
+        """Return the rows of files of one state."""
+        states = self.table["state"].to_pylist()
+        return [row for n, same in enumerate(states) if same == state for row in self.rows(n, 1)]
+
+
+def read_catalog(folder: Path) -> Catalog | None:
+    """Read the catalogue of a folder; None if there is none, or none that can be used."""
+    try:
+        return load_catalog(folder)
+    except DataError:
+        return None
+
+
+def load_catalog(folder: Path) -> Catalog | None:
+    """Read the catalogue of a folder; None if there is none.
+
+    Raises
+    ------
+    DataError
+        If it is damaged, or no catalogue as this version makes them.
+    """
+    path = folder / CATALOG
+    with store_errors(path):
+        exists = path.is_file()
+    if not exists:
+        return None
+    try:
+        with path.open("rb") as stream:
+            return Catalog(folder, read_table(stream))
+    except (pa.ArrowException, OSError, ValueError) as error:
+        what = str(error).partition("\n")[0]
+        raise DataError(f"{path}: cannot be used as a catalogue ({what})") from error
+
+
+def write_catalog(
+    folder: Path, known: Catalog | None = None, progress: Progress = lambda *_: None
+) -> Catalog:
+    """Make the catalogue of a folder; in one step it takes the place of the one that is there.
+
+    Parameters
+    ----------
+    folder : Path
+    known : Catalog, optional
+        Files that are as it says are not read again, damaged ones excepted.
+    progress : callable, optional
+        Is given how many of how many files are done.
+
+    Raises
+    ------
+    LogError
+        If there is no log, or the catalogue cannot be written.
+    KeyboardInterrupt
+        If interrupted; the catalogue then has what was read so far.
+    """
+    logs = find_logs(folder)
+    kept, new = _divided(logs, known)
+    tables = [SCHEMA.empty_table() if known is None else known.table.take(kept)]
+    rows: list[Row] = []
+    interrupt: KeyboardInterrupt | None = None
+    with replaced_file(folder / CATALOG) as temporary, temporary.open("wb") as stream:
+        try:
+            for done, found in enumerate(map_logs(partial(_read_row, folder), new), 1):
+                rows += found
+                if len(rows) == _BATCH:
+                    tables.append(table_of([vars(row) for row in rows]))
+                    rows = []
+                progress(len(kept) + done, len(logs))
+        except KeyboardInterrupt as error:
+            interrupt = error
+        table = pa.concat_tables([*tables, table_of([vars(row) for row in rows])]).sort_by("path")
+        write_table(table, stream)
+    if interrupt is not None:
+        raise interrupt
+    return Catalog(folder, table)
+
+
+def _divided(logs: Sequence[Path], known: Catalog | None) -> tuple[list[int], list[Path]]:
+    """Tell which rows are still true, and which files are to be read."""
+    if known is None:
+        return [], list(logs)
+    kept: list[int] = []
+    new: list[Path] = []
+    states = known.table["state"].to_pylist()
+    for path, number in zip(logs, map_logs(known.find, logs), strict=True):
+        # What could not be read then may be readable now, though the file is the same.
+        if number is None or states[number] == DAMAGED:
+            new.append(path)
+        else:
+            kept.append(number)
+    return kept, new
+
+
+def _read_row(folder: Path, path: Path) -> list[Row]:
+    """Make the row of a file; none if the file has gone."""
+    name = stem(path) + SUFFIX
+    layer = _LAYER.fullmatch(name)
+    kind = LOG if layer is None else layer[2] or layer[3]
+    node = _NODE.match(name)
+    home = _HOME.fullmatch(_relative(path, folder))
+    try:
+        size, mtime = _size_and_time(path)
+    except LogError:
+        return []
+    row = Row(
+        path=_relative(path, folder),
+        home="" if home is None else home[1] or "",
+        node=None if node is None else node[1],
+        kind=kind,
+        log=layer and _relative(path.with_name(layer[1] + SUFFIX), folder),
+        size=size,
+        mtime=mtime,
+    )
+    try:
+        return [_filled(row, read_contents(path, _SEGMENT_TOPICS[kind]))]
+    except LogError as error:
+        if not path.exists():  # a recorder has completed it, and given it another name
+            return []
+        return [replace(row, error=str(error).removeprefix(f"{path}: "))]
+
+
+def _filled(row: Row, contents: Contents) -> Row:
+    """Add what was found in a file to its row."""
+    about = {name: value for name, value in contents.about.items() if value}
+    start, end = contents.span or (None, None)
+    first, last = contents.first or (None, None), contents.last or (None, None)
+    return replace(
+        row,
+        node=about.get("node", row.node),
+        state=FINISHED if contents.complete else UNFINISHED,
+        microphones=contents.microphones,
+        start=start,
+        end=end,
+        frames=contents.frames,
+        first_frame=first[0],
+        first_stamp=first[1],
+        last_frame=last[0],
+        last_stamp=last[1],
+        feature_set=about.get("feature_set"),
+        model=about.get("model"),
+        model_sha256=about.get("model_sha256"),
+        input_sha256=about.get("input_sha256"),
+        version=about.get("version"),
+        gaps=contents.gaps,
+        gap_seconds=contents.gap_seconds,
+        labels=[
+            {"label": label, "minutes": contents.seconds[label] / 60, "segments": count}
+            for label, count in sorted(contents.segments.items())
+        ],
+    )
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Name a file as the catalogue does; raise ValueError if it is not in the folder."""
+    name = path.relative_to(folder).as_posix()
+    return name.encode(errors="surrogateescape").decode(errors="replace")  # names are bytes
+
+
+def _size_and_time(path: Path) -> tuple[int, int]:
+    """Return bytes and time of change (ns), by which a changed file is known."""
+    with store_errors(path):
+        about = path.stat()
+    made = getattr(about, "st_birthtime", 0)  # an object is not changed, but made anew
+    return about.st_size, about.st_mtime_ns or int(made * NANOSECONDS)

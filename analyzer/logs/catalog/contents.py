@@ -1,0 +1,182 @@
+"""What one log holds, found with as little reading as will do: features are not decoded."""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import microphone_of
+from hearthlog.schemas.times import NANOSECONDS
+
+_FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
+_EVENTS: dict[str, Sequence[str]] = {
+    message_types.SEGMENT: ("duration", "label"),
+    message_types.GAP: ("duration",),
+}
+_OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
+    (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
+)
+_BATCH = 2 << 20  # bytes, before compression, that are read at once
+_MOST_CLASSES = 100
+_LONGEST = 1000  # characters of what a log says of itself
+
+
+@dataclass
+class Contents:
+    """What a log holds.
+
+    Attributes
+    ----------
+    complete : bool
+        Whether it was finished.
+    span : (int, int) or None
+        First and last log time.
+    about : dict of str to str
+        What its `hearthlog` records say, so far as they agree.
+    microphones : list of str
+    frames : int
+        Messages of features.
+    first, last : (int, int) or None
+        Number and stamp of the first and of the last frame; None where there are no features, or
+        those of several microphones.
+    gaps, gap_seconds : int, float
+    seconds : Counter of str
+        By label, of its segments.
+    segments : Counter of str
+        Their number, by label.
+    """
+
+    complete: bool
+    span: tuple[int, int] | None
+    about: dict[str, str] = field(default_factory=dict)
+    microphones: list[str] = field(default_factory=list)
+    frames: int = 0
+    first: tuple[int, int] | None = None
+    last: tuple[int, int] | None = None
+    gaps: int = 0
+    gap_seconds: float = 0.0
+    seconds: Counter[str] = field(default_factory=Counter)
+    segments: Counter[str] = field(default_factory=Counter)
+
+
+def read_contents(path: Path, segment_topic: str) -> Contents:
+    """Find out what a log holds.
+
+    Parameters
+    ----------
+    path : Path
+    segment_topic : str
+        A pattern: segments of other topics are not counted.
+
+    Raises
+    ------
+    LogError
+        If what is read of it is damaged.
+    """
+    span = time_span(path)
+    with LogFile(path) as file:
+        found = Contents(file.complete, span, _about(file))
+        reading = _Reading(file, found, re.compile(segment_topic))
+        if file.statistics is None:  # nothing says how many messages there are, or where
+            reading.read(file.chunks, _EVENTS | _FEATURES)
+        else:
+            reading.read(reading.chunks_with(_EVENTS), _EVENTS)
+            reading.read(_ends(reading.chunks_with(_FEATURES)), _FEATURES)
+            counts = file.statistics.channel_message_counts
+            ids = reading.channels_of(_FEATURES)
+            found.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
+        ours = [file.channels[i].topic for i in reading.channels_of(_OTHERS | _FEATURES | _EVENTS)]
+        found.microphones = sorted({microphone_of(topic)[:_LONGEST] for topic in ours} - {""})
+        if len(reading.channels_of(_FEATURES)) > 1:
+            found.first = found.last = None
+    return found
+
+
+def _about(file: LogFile) -> dict[str, str]:
+    """Read what the file says of itself, so far as its records agree."""
+    said: dict[str, set[str]] = {}
+    for record in read_provenance(file):
+        for name, value in record.items():
+            said.setdefault(name, set()).add(value[:_LONGEST])
+    return {name: values.pop() for name, values in said.items() if len(values) == 1}
+
+
+def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the first and the last of some chunks."""
+    return chunks[np.unique([0, chunks["end"].argmax()])] if len(chunks) else chunks
+
+
+class _Reading:
+    """Reads messages of one log, and notes in its contents what they say."""
+
+    def __init__(self, file: LogFile, found: Contents, segment_topic: re.Pattern[str]) -> None:
+        self._file = file
+        self._found = found
+        self._segment_topic = segment_topic
+
+    def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
+        """Return the channels of some types, of which some fields are wanted."""
+        schemas = self._file.schemas
+        return {
+            number
+            for number, channel in self._file.channels.items()
+            if any(is_of_type(channel, schemas.get(channel.schema_id), *k) for k in kinds.items())
+        }
+
+    def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
+        """Return the chunks that hold messages of some types."""
+        channels = self.channels_of(kinds)
+        holds = [not ids or not ids.isdisjoint(channels) for ids in self._file.channel_sets]
+        return self._file.chunks[np.array(holds, bool)[self._file.chunks["channels"]]]
+
+    def read(self, chunks: NDArray[np.void], wanted: Mapping[str, Collection[str]]) -> None:
+        """Read some chunks, a few at a time, and note the messages of the wanted types."""
+        topics = None
+        if self._file.statistics is not None:
+            topics = {self._file.channels[i].topic for i in self.channels_of(wanted)}
+        batches = np.cumsum(chunks["size"]) // _BATCH
+        for part in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
+            batch = read_chunks(self._file, part, topics, check=True)
+            for columns in decode_known(self._file.path, batch, wanted):
+                self._note(columns)
+
+    def _note(self, columns: Columns) -> None:
+        if columns.type == message_types.FEATURES:
+            self._note_features(columns)
+        elif columns.type == message_types.GAP:
+            self._found.gaps += len(columns)
+            self._found.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
+        elif self._segment_topic.fullmatch(columns.topic):
+            self._note_segments(columns)
+
+    def _note_features(self, columns: Columns) -> None:
+        ends = columns.taken(np.array([0, len(columns) - 1]))
+        pairs = zip(ends["frame"].tolist(), ends["header.stamp"].tolist(), strict=True)
+        first, self._found.last = pairs
+        self._found.first = self._found.first or first
+        self._found.frames += len(columns)
+
+    def _note_segments(self, columns: Columns) -> None:
+        labels, numbers = np.unique(columns["label"], return_inverse=True)
+        seconds = np.bincount(numbers, columns["duration"] / NANOSECONDS)
+        for label, count, length in zip(
+            labels.tolist(), np.bincount(numbers).tolist(), seconds.tolist(), strict=True
+        ):
+            self._found.segments[label[:_LONGEST]] += count
+            self._found.seconds[label[:_LONGEST]] += length
+        if len(self._found.segments) > _MOST_CLASSES:
+            raise LogError(
+                f"{self._file.path}: has more than {_MOST_CLASSES} different labels; "
+                "no classifier has so many"
+            )

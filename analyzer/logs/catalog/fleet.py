@@ -1,0 +1,118 @@
+"""The homes of a catalogue at a glance: how much was heard in each, and what."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, LOG, UNFINISHED, Catalog
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
+
+_HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames
+_FUNCTIONS = {"start": "min", "end": "max"}
+_LABELLING = ("home", "kind", "model")
+
+
+@dataclass(frozen=True)
+class Home:
+    """The files of one home.
+
+    Attributes
+    ----------
+    home : str
+    logs, layers, unfinished, damaged : int
+    size : int
+        Bytes.
+    frames : int
+        Of the logs.
+    start, end : int or None
+        First and last log time of the logs.
+    gaps, gap_seconds : int, float
+    """
+
+    home: str
+    logs: int
+    layers: int
+    unfinished: int
+    damaged: int
+    size: int
+    frames: int
+    start: int | None
+    end: int | None
+    gaps: int
+    gap_seconds: float
+
+    @property
+    def hours(self) -> float:
+        """Hours that were heard."""
+        return self.frames / _HOUR
+
+
+@dataclass(frozen=True)
+class Heard:
+    """How long a label was heard in one home.
+
+    Attributes
+    ----------
+    home : str
+    kind : str
+        Of the files that say so: `log`, `relabel`, `review`.
+    model : str or None
+    label : str
+    minutes, segments : float, int
+    """
+
+    home: str
+    kind: str
+    model: str | None
+    label: str
+    minutes: float
+    segments: int
+
+
+def homes(catalog: Catalog) -> list[Home]:
+    """Sum up the files of each home."""
+    table = catalog.table
+    logs = pc.equal(table["kind"], LOG)
+    counted = pa.table(
+        {
+            "home": table["home"],
+            "logs": logs.cast(pa.int64()),
+            "layers": pc.invert(logs).cast(pa.int64()),
+            "unfinished": pc.equal(table["state"], UNFINISHED).cast(pa.int64()),
+            "damaged": pc.equal(table["state"], DAMAGED).cast(pa.int64()),
+            "size": table["size"],
+            "frames": pc.if_else(logs, table["frames"], 0),
+            "gaps": table["gaps"],
+            "gap_seconds": table["gap_seconds"],
+            "start": pc.if_else(logs, table["start"], None).cast(pa.int64()),
+            "end": pc.if_else(logs, table["end"], None).cast(pa.int64()),
+        }
+    )
+    functions = [(name, _FUNCTIONS.get(name, "sum")) for name in counted.column_names[1:]]
+    return [Home(**row) for row in _grouped(counted, ["home"], functions)]
+
+
+def heard(catalog: Catalog) -> list[Heard]:
+    """Sum up the labels of each home, the live ones, those of relabellings and of reviews."""
+    table = catalog.table
+    lists = table["labels"].combine_chunks()
+    labels = pa.Table.from_struct_array(lists.flatten())
+    for name in _LABELLING:
+        labels = labels.append_column(name, table[name].take(pc.list_parent_indices(lists)))
+    values = [("minutes", "sum"), ("segments", "sum")]
+    found = [Heard(**row) for row in _grouped(labels, [*_LABELLING, "label"], values)]
+    return sorted(found, key=lambda one: (one.home, one.kind, one.model or "", -one.minutes))
+
+
+def _grouped(
+    table: pa.Table, keys: Sequence[str], functions: Sequence[tuple[str, str]]
+) -> list[dict[str, Any]]:
+    """Aggregate the rows that agree in some columns, in the order of these."""
+    grouped = table.group_by(keys, use_threads=False).aggregate(functions)
+    names = [*keys, *(name for name, _ in functions)]
+    found = grouped.select([*keys, *map("_".join, functions)]).rename_columns(names)
+    return found.sort_by([(key, "ascending") for key in keys]).to_pylist()

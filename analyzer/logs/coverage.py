@@ -1,0 +1,117 @@
+"""When a microphone was heard, log by log."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
+
+_KIND = "features"
+_FIELDS = {"header.stamp"}
+ROUNDING = 1_000_000  # ns; times that passed through a label file are off by up to this
+_TAIL = 60 * NANOSECONDS
+
+
+@dataclass(frozen=True)
+class Heard:
+    """When a microphone was heard, by its frames.
+
+    Attributes
+    ----------
+    logs : list of Path
+        In the order of time.
+    starts, ends : list of int
+        Of what was heard in each, in nanoseconds of UTC; they ascend, and do not overlap.
+    """
+
+    logs: Sequence[Path]
+    starts: Sequence[int]
+    ends: Sequence[int]
+
+    def split(self, start: int, end: int) -> list[tuple[Path, int, int]]:
+        """Divide a span of time among the logs.
+
+        Returns
+        -------
+        list of (Path, int, int)
+            Empty if more of it than a frame is in none of them.
+        """
+        found = []
+        covered = start
+        for i in range(bisect_right(self.ends, start), bisect_left(self.starts, end)):
+            piece = max(start, self.starts[i]), min(end, self.ends[i])
+            if piece[0] - covered > FRAME_NANOSECONDS:
+                return []
+            if piece == (start, end) or piece[1] - piece[0] > ROUNDING:
+                found.append((self.logs[i], *piece))
+            covered = piece[1]
+        return [] if end - covered > FRAME_NANOSECONDS else found
+
+
+def find_heard(path: Path) -> dict[str, Heard]:
+    """Look when the microphones of a log, or of a folder of logs, were heard.
+
+    Returns
+    -------
+    dict of str to Heard
+        By microphone.
+
+    Raises
+    ------
+    DataError
+        If there are no features.
+    LogError
+        If there is no log, or one is damaged.
+    """
+    selection = select([path])
+    found: dict[str, Heard] = {}
+    for name, same in selection.channels.items():
+        microphone = name.removeprefix("/").removesuffix(f"/{_KIND}")
+        if name == topic(microphone, _KIND) and all(
+            is_of_type(*described, message_types.FEATURES, _FIELDS) for described in same
+        ):
+            spans = sorted(_spans(selection.logs, name))
+            if spans:
+                found[microphone] = heard_in(spans)
+    if not found:
+        raise DataError(f"{path}: no features of a microphone; name a log, or a folder of logs")
+    return found
+
+
+def heard_in(spans: Sequence[tuple[int, int, Path]]) -> Heard:
+    """Tell when a microphone was heard, by start, end and log, in the order of time."""
+    starts = [start for start, _, _ in spans]
+    ends = [end for _, end, _ in spans]
+    for i, following in enumerate(starts[1:]):
+        if following - ends[i] <= FRAME_NANOSECONDS:
+            ends[i] = following
+    return Heard([log for _, _, log in spans], starts, ends)
+
+
+def _spans(logs: Sequence[Path], name: str) -> Iterator[tuple[int, int, Path]]:
+    for log in logs:
+        span = time_span(log)
+        first = next(_stamps(log, name), None)
+        if span is None or first is None:
+            continue
+        tail = _stamps(log, name, span[1] - _TAIL)
+        last = max(tail, default=None)
+        if last is None:
+            last = max(_stamps(log, name))
+        yield first, last + FRAME_NANOSECONDS, log
+
+
+def _stamps(log: Path, name: str, start: int | None = None) -> Iterator[int]:
+    """Yield the first and the last stamp of every piece of a log."""
+    for batch in iterate_columns([log], {name}, start, fields=_FIELDS):
+        for columns in batch:
+            yield from columns["header.stamp"][[0, -1]].tolist()

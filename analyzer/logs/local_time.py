@@ -1,0 +1,62 @@
+"""The home's own time: its zone, its days, which begin at its midnight."""
+
+from collections.abc import Iterable, Mapping
+from datetime import UTC, date, datetime, timedelta, tzinfo
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.recorder.timezone import DEFAULT, time_zone
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.times import NANOSECONDS
+
+KEY = "timezone"  # in the `hearthlog` metadata record of a log
+Span = tuple[int, int]
+
+
+def home_zone(wanted: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
+    """Find the time zone of a home.
+
+    Parameters
+    ----------
+    wanted : str or None
+        Its IANA name, where the user says it.
+    records : iterable of mapping of str to str
+        The `hearthlog` records of logs; the first that names a zone counts. Without one it is UTC.
+
+    Raises
+    ------
+    DataError
+        If there is no such zone.
+    """
+    if wanted is not None:
+        return _zone(wanted, "use a name such as Europe/Vienna, or UTC")
+    said = next((record[KEY] for record in records if record.get(KEY)), DEFAULT)
+    return _zone(said, "the logs say so; name the right one with --timezone")
+
+
+def _zone(name: str, advice: str) -> tzinfo:
+    try:
+        return time_zone(name)
+    except LogError as error:
+        raise DataError(f"{name[:64]!r} is no time zone: {advice}") from error
+
+
+def midnight(day: date, zone: tzinfo) -> int:
+    """Return when a day begins, in nanoseconds of UTC."""
+    local = datetime(day.year, day.month, day.day, tzinfo=zone)
+    return int(local.timestamp()) * NANOSECONDS
+
+
+def day_span(day: date, zone: tzinfo) -> Span:
+    """Return when a day begins, and when the next one does; 23 to 25 hours later, in most zones."""
+    return midnight(day, zone), midnight(day + timedelta(days=1), zone)
+
+
+def at_hour(day: date, hour: int, zone: tzinfo) -> int:
+    """Return when the clock on the wall shows a full hour, in nanoseconds of UTC."""
+    local = datetime(day.year, day.month, day.day, hour, tzinfo=zone)
+    return int(local.timestamp()) * NANOSECONDS
+
+
+def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
+    """Return what clock and calendar on the wall show, down to the second."""
+    return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)

@@ -1,0 +1,200 @@
+"""What a log says of the recorder that wrote it."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mcap import records
+from mcap.opcode import Opcode
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hearthlog.analyzer.logs.clips import CLIP_FIELDS
+from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import check_node_name
+from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.logs.writer import Attachment
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import check_microphone_name, topic
+
+CONFIGURATION = "configuration.json"
+TYPES = {
+    "features": (message_types.FEATURES, ("frame", "header.stamp", "values")),
+    "audio": (message_types.RAW_AUDIO, CLIP_FIELDS),
+}
+_DIGEST = re.compile("[0-9a-f]{64}")
+_FRAME = ("frame", "header.stamp")
+_INFO = ("device", "feature_set", "model", "model_sha256")
+
+
+class Configuration(BaseModel):
+    """Of what the recorder was asked to do, that which shapes its log."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+    max_bag_duration: int = Field(default=3600, ge=1, le=86_400)
+    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)
+    sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)
+    statistics_every: int = Field(default=1, ge=1, le=1 << 32)
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """What a log says of the recorder that wrote it.
+
+    Attributes
+    ----------
+    path : Path
+    complete : bool
+        Whether the log is finished.
+    node, microphone : str
+    device, feature_set, model, model_sha256 : str
+        As in `AudioStreamInfo`; empty where the log does not say.
+    configuration : Configuration
+    metadata : mapping of str to str
+        The `hearthlog` record.
+    attachments : sequence of Attachment
+    first_frame : (int, int) or None
+        Number and time of the first frame of its features; None if they are not wanted, or it has
+        none.
+    """
+
+    path: Path
+    complete: bool
+    node: str
+    microphone: str
+    device: str
+    feature_set: str
+    model: str
+    model_sha256: str
+    configuration: Configuration
+    metadata: Mapping[str, str]
+    attachments: Sequence[Attachment]
+    first_frame: tuple[int, int] | None
+
+
+def read_origin(path: Path, kind: str) -> Origin | None:
+    """Read what a log says of its recorder.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        One of `TYPES`, the sort of topic by which the microphone is known.
+
+    Returns
+    -------
+    Origin or None
+        None if the log has no such topic, as layers have not.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, of more than one microphone, or says what cannot be.
+    """
+    with LogFile(path) as file:
+        if not file.channels:
+            read_chunks(file, file.chunks[:1])  # a log without an index says it there
+        microphones = _microphones(file, kind)
+        if not microphones:
+            return None
+        if len(microphones) > 1:
+            names = ", ".join(sorted(microphones))
+            raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
+        attached = [file.record(p) for p in file.places if p.opcode == Opcode.ATTACHMENT]
+        # What was merged is of the last of its recorders.
+        about = next(reversed(read_provenance(file)), {})
+        complete = file.complete
+        (microphone,) = microphones
+        info = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
+        heard = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
+    attachments = [
+        Attachment(r.name, r.media_type, r.data)
+        for r in attached
+        if isinstance(r, records.Attachment)
+    ]
+    info = {**about, **info}
+    digest = info.get("model_sha256", "")
+    first = None
+    if heard and kind == "features":
+        first = int(heard["frame"]), int(heard["header.stamp"])
+    try:
+        node = check_node_name(about.get("node", "home"))
+        check_microphone_name(microphone)
+    except LogError as error:
+        raise LogError(f"{path}: {error}") from error
+    return Origin(
+        path=path,
+        complete=complete,
+        node=node,
+        microphone=microphone,
+        device=info.get("device", ""),
+        feature_set=info.get("feature_set", ""),
+        model=info.get("model", ""),
+        model_sha256=digest if _DIGEST.fullmatch(digest) else "",
+        configuration=_configuration(path, attachments),
+        metadata=about,
+        attachments=attachments,
+        first_frame=first,
+    )
+
+
+def features_of(origin: Origin) -> FeatureSet:
+    """Return the feature set of a log, the default one where the log does not say which.
+
+    Raises
+    ------
+    LogError
+        If it is not installed, or another version of it is.
+    """
+    name = origin.feature_set or DEFAULT.name
+    try:
+        features = feature_set(name)
+    except ModelError as error:
+        raise LogError(f"{origin.path}: {error}") from error
+    version = origin.metadata.get("feature_set_version", "1")
+    if version != str(features.version):
+        raise LogError(
+            f"{origin.path}: has features of {name}, version {version[:20]!r}; here is version "
+            f"{features.version}, which gives other values"
+        )
+    return features
+
+
+def _microphones(file: LogFile, kind: str) -> set[str]:
+    found = set()
+    for channel in file.channels.values():
+        schema = file.schemas.get(channel.schema_id)
+        name = channel.topic.removeprefix("/").removesuffix("/" + kind)
+        if channel.topic == topic(name, kind) and is_of_type(channel, schema, *TYPES[kind]):
+            found.add(name)
+    return found
+
+
+def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict[str, Any]:
+    """Return the fields of the first message of a topic; nothing if it has none."""
+    ids = {i for i, channel in file.channels.items() if channel.topic == name}
+    for i, number in enumerate(file.chunks["channels"].tolist()):
+        if file.channel_sets[number] and not file.channel_sets[number] & ids:
+            continue
+        found = read_chunks(file, file.chunks[i : i + 1], [name])
+        for columns in decode_known(file.path, found, {kind: fields}):
+            return {field: values[0] for field, values in columns.fields.items()}
+    return {}
+
+
+def _configuration(path: Path, attachments: Sequence[Attachment]) -> Configuration:
+    text = next((item.data for item in attachments if item.name == CONFIGURATION), b"{}")
+    try:
+        return Configuration.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(["", *(str(part)[:64] for part in first["loc"])])
+        raise LogError(f"{path}: {CONFIGURATION}{where}: {first['msg']}") from error

@@ -1,0 +1,212 @@
+"""What is wanted of some logs: topics, by name or by pattern, and a span of time."""
+
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mcap.records import Channel, Schema
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import CATALOG, find_logs
+from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
+from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.logs.catalog import Catalog
+
+_LAST = (1 << 63) - 1  # log time
+_BATCH = 2 << 20  # bytes, stored and decompressed together, that are verified at once
+Progress = Callable[[float], None]
+Described = tuple[Channel, Schema | None]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Topics and a span of time of some logs.
+
+    Attributes
+    ----------
+    logs : list of Path
+        Those with messages in the span.
+    earlier : list of Path
+        Those with messages before it, the last first.
+    unfinished : list of Path
+        Those of `logs` that were not completed.
+    channels : dict of str to list of (Channel, Schema or None)
+        By topic, for the topics that are wanted; those that say the same are there once.
+    metadata : list of dict of str to str
+        The `hearthlog` records of the logs; equal ones are there once.
+    topics : frozenset of str or None
+        Those that are wanted; None for all.
+    start, end : int or None
+        Log times in nanoseconds: from `start` on, before `end`.
+    span : (int, int)
+        In which the messages are.
+    """
+
+    logs: Sequence[Path]
+    earlier: Sequence[Path]
+    unfinished: Sequence[Path]
+    channels: Mapping[str, Sequence[Described]]
+    metadata: Sequence[Mapping[str, str]]
+    topics: frozenset[str] | None
+    start: int | None
+    end: int | None
+    span: tuple[int, int]
+
+    def messages(self, progress: Progress = lambda _: None) -> Iterator[list[RawMessages]]:
+        """Read the messages as `iterate_messages` does, and report the share that is done."""
+        first, last = self.span
+        for batch in iterate_messages(self.logs, self.topics, self.start, self.end):
+            yield batch
+            now = max(int(messages.log_times[-1]) for messages in batch)
+            progress((now - first) / max(last - first, 1))
+
+    def verify(self) -> None:
+        """Compare the chunks with their checksums, which `messages` does not.
+
+        Raises
+        ------
+        LogError
+            If one is damaged.
+        """
+        for path in self.logs:
+            with LogFile(path) as file:
+                ends, starts = file.chunks["end"], file.chunks["start"]
+                wanted = (ends >= (self.start or 0)) & (starts < (self.end or _LAST))
+                chunks = file.chunks[wanted]
+                batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH
+                for part in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
+                    read_chunks(file, part, topics=(), check=True)
+
+    def only(self, topics: Collection[str]) -> "Selection":
+        """Leave out all other topics."""
+        left = {topic: same for topic, same in self.channels.items() if topic in topics}
+        return replace(self, topics=frozenset(topics), channels=left)
+
+    def nothing(self) -> LogError:
+        """Make the error that says that there is no message."""
+        topics = "" if self.topics is None else f" of {', '.join(sorted(self.topics))}"
+        return LogError(f"no message{topics} in this span of time; `hearthlog info` shows spans")
+
+
+def select(
+    paths: Iterable[Path],
+    patterns: Sequence[str] = (),
+    start: int | None = None,
+    end: int | None = None,
+) -> Selection:
+    """Find out which of some logs have messages of some topics in a span of time.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs.
+    patterns : sequence of str
+        Names of topics, in which `*` stands for anything; all topics by default.
+    start, end : int, optional
+        Log times in nanoseconds: from `start` on, before `end`.
+
+    Raises
+    ------
+    LogError
+        If there is no such log, if one is damaged, or if a pattern fits no topic.
+    """
+    catalogs: dict[Path, Catalog | None] = {}
+    for each in paths:
+        catalogs |= dict.fromkeys(find_logs(each), _catalog(each))
+    found = {path.resolve(): path for path in catalogs}
+    spans = time_spans(found.values(), lambda path: _span(path, catalogs[path]))
+    wanted = [
+        (first, last, path)
+        for first, last, path in spans
+        if (start is None or last >= start) and (end is None or first < end)
+    ]
+    contents = list(map_logs(_Content, [path for _, _, path in wanted]))
+    channels = _by_topic(channel for content in contents for channel in content.channels)
+    topics = _matching(patterns, channels) if patterns and contents else None
+    metadata: list[Mapping[str, str]] = []
+    for record in (record for content in contents for record in content.metadata):
+        if record not in metadata:
+            metadata.append(record)
+    return Selection(
+        logs=[path for _, _, path in wanted],
+        earlier=[p for first, _, p in reversed(spans) if start is not None and first < start],
+        unfinished=[content.path for content in contents if not content.complete],
+        channels={t: same for t, same in channels.items() if topics is None or t in topics},
+        metadata=metadata,
+        topics=topics,
+        start=start,
+        end=end,
+        span=(
+            max([start or 0, *(first for first, _, _ in wanted[:1])]),
+            max((last for _, last, _ in wanted), default=0),
+        ),
+    )
+
+
+def _catalog(folder: Path) -> "Catalog | None":
+    """Read the catalogue of a folder, if it has one and there is what reads it."""
+    with store_errors(folder):
+        exists = (folder / CATALOG).exists()
+    if not exists:
+        return None
+    try:
+        from hearthlog.analyzer.logs.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
+    except ModuleNotFoundError:
+        return None
+    return read_catalog(folder)
+
+
+def _span(path: Path, catalog: "Catalog | None") -> tuple[int, int] | None:
+    """Return the span of a log, from the catalogue if that speaks of the file as it is now."""
+    return (catalog and catalog.span(path)) or time_span(path)
+
+
+class _Content:
+    """What one log says of itself."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with LogFile(path) as file:
+            self.complete = file.complete
+            for i, number in enumerate(file.chunks["channels"].tolist()):
+                ids = file.channel_sets[number]
+                if not ids or not ids <= file.channels.keys():  # they are defined in the chunks
+                    read_chunks(file, file.chunks[i : i + 1], topics=())
+            self.channels = [(c, file.schemas.get(c.schema_id)) for c in file.channels.values()]
+            self.metadata = read_provenance(file)
+
+
+def identity(channel: Channel, schema: Schema | None) -> Hashable:
+    """Return what two channels, of two logs perhaps, have in common if they say the same."""
+    definition = None if schema is None else (schema.name, schema.encoding, schema.data)
+    about = frozenset(channel.metadata.items())
+    return channel.topic, channel.message_encoding, about, definition
+
+
+def _by_topic(channels: Iterable[Described]) -> dict[str, list[Described]]:
+    found: dict[Hashable, Described] = {}
+    for channel, schema in channels:
+        found.setdefault(identity(channel, schema), (channel, schema))
+    topics: dict[str, list[Described]] = {}
+    for channel, schema in found.values():
+        topics.setdefault(channel.topic, []).append((channel, schema))
+    return topics
+
+
+def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
+    known = sorted(topics)
+    wanted: set[str] = set()
+    for pattern in patterns:
+        fitting = [topic for topic in known if fnmatchcase(topic, pattern)]
+        if not fitting:
+            raise LogError(f"no topic {pattern}; there are {', '.join(known)}")
+        wanted.update(fitting)
+    return frozenset(wanted)

@@ -1,0 +1,1 @@
+"""Marks: a reviewer's corrections, their layers, and files of labels."""

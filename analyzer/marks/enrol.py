@@ -1,0 +1,257 @@
+"""Seconds of a sound, taken into the home's own training set: a log of features, and one mark."""
+
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.export.merge import splice
+from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.classes import SILENCE, class_name
+from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.recorder.config import Microphone, load_settings
+from hearthlog.recorder.events import Event, Frames
+from hearthlog.recorder.service import Source, record
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.sources.decoding import audio_seconds
+from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, log_path, new_file
+from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
+
+SECONDS = 5.0  # of a microphone, unless it is said
+LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
+_FLOOR = 10 ** (-60 / 10)  # -60 dBFS
+_PATIENCE = 10.0  # seconds for a microphone to wake
+_STAMP = "header.stamp"
+_ENERGY = "energy"
+
+
+@dataclass(frozen=True)
+class Enrolled:
+    """A log in the home's training set, and how many seconds of sound it holds."""
+
+    log: Path
+    seconds: float
+
+
+def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
+    """Enrol an audio file, or its first seconds.
+
+    Its frames get times that end now, or before what was enrolled of this class already: logs of
+    one class do not overlap.
+
+    Parameters
+    ----------
+    home : Path
+        Folder of the training set; the log comes into its folder `enrolled`.
+    label : str
+        Class of the sound.
+    audio : Path
+    seconds : float, optional
+        How much of it; all by default.
+
+    Returns
+    -------
+    list of Enrolled
+        One, or two where the times cross midnight.
+
+    Raises
+    ------
+    DataError
+        If the label cannot be a class, if there is less than a second of sound, or only silence.
+    SourceError
+        If the file is no audio.
+    LogError
+        If it cannot be written.
+    """
+    _check_label(label)
+    length = audio_seconds(audio)
+    if seconds is not None:
+        length = min(length, seconds)
+    source: Source = FileSource([audio], _free_start(home, label, length))
+    return _enrol(home, label, source, length, threading.Event())
+
+
+def enrol_microphone(
+    home: Path,
+    label: str,
+    device: str,
+    seconds: float = SECONDS,
+    listening: Callable[[], None] = lambda: None,
+) -> list[Enrolled]:
+    """Enrol what a microphone hears now; `listening` is called when it does.
+
+    The other parameters and the errors are those of `enrol_file`; `device` is a name as
+    `hearthlog devices` lists it, empty for the default one.
+    """
+    _check_label(label)
+    with closing(MicrophoneSource(device)) as source:
+        listening()
+        stop = threading.Event()
+        timer = threading.Timer(seconds + _PATIENCE, stop.set)
+        timer.start()
+        try:
+            return _enrol(home, label, source, seconds, stop)
+        finally:
+            timer.cancel()
+
+
+def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enrolled:
+    """Enrol a span of a log, or of a folder of logs: its features, message for message.
+
+    Parameters
+    ----------
+    home : Path
+    label : str
+        Both as of `enrol_file`.
+    log : Path
+    start, end : int
+        Nanoseconds of UTC: the frames from `start` on, before `end`.
+
+    Raises
+    ------
+    DataError
+        As `enrol_file`, and if the log is of several microphones.
+    LogError
+        If there is no such log, if one is damaged, or if nothing can be written.
+    """
+    _check_label(label)
+    heard = find_heard(log)
+    if len(heard) > 1:
+        names = ", ".join(sorted(heard))
+        raise DataError(
+            f"{log}: is of several microphones ({names}); make a log of one of them first, with "
+            "`hearthlog cut --topics '/NAME/*'`"
+        )
+    (microphone,) = heard
+    selection = select([log], start=start, end=end)
+    stamps, energies = _frames(selection.logs, microphone, start, end)
+    _check_sound(label, energies)
+    path = log_path(home / ENROLLED, label, int(stamps[0]))
+    # Not a name as of a recorder's log: this one has not all of its topics.
+    path = path.with_stem(f"{path.stem}_cut")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    topics = {topic(microphone, "features"), topic(microphone, "info")}
+    splice(selection.only(topics), path, latched=True)
+    return _marked(path, microphone, label, stamps)
+
+
+class _First:
+    """The first seconds of a source."""
+
+    def __init__(self, source: Source, seconds: float) -> None:
+        self.device = source.device
+        self._source = source
+        self._left = round(seconds * NANOSECONDS / FRAME_NANOSECONDS)
+
+    def events(self, stop: threading.Event) -> Iterator[Event]:
+        for event in self._source.events(stop):
+            if isinstance(event, Frames):
+                samples, stamps = event.samples[: self._left], event.stamps[: self._left]
+                self._left -= len(stamps)
+                yield Frames(event.first, samples, stamps)
+            else:
+                yield event
+            if not self._left:
+                return
+
+
+def _enrol(
+    home: Path, label: str, source: Source, seconds: float, stop: threading.Event
+) -> list[Enrolled]:
+    """Record elsewhere, and take what came of it into the training set if it is good."""
+    microphone = Microphone()
+    with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
+        asked = {
+            "node": label,
+            "output": Path(folder),
+            "model": None,
+            "max_bag_duration": 86_400,
+            "statistics_every": 1,
+        }
+        settings = load_settings(None, asked, microphone.model_dump())
+        logs = record(settings, microphone, _First(source, seconds), stop).logs
+        heard = {log: _frames([log], microphone.name) for log in logs}
+        _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in heard.values())]))
+        enrolled = []
+        for log, (stamps, _) in heard.items():
+            if not len(stamps):
+                continue
+            path = home / ENROLLED / log.relative_to(folder)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with new_file(path) as temporary:
+                shutil.copyfile(log, temporary)
+            enrolled.append(_marked(path, microphone.name, label, stamps))
+    return enrolled
+
+
+def _check_label(label: str) -> None:
+    if not CLASS_NAME.fullmatch(label):
+        raise DataError(
+            f"{label[:64]!r} cannot be the name of a class: use lower-case letters, digits and '_'"
+        )
+
+
+def _check_sound(label: str, energies: NDArray[np.floating[Any]]) -> None:
+    seconds = len(energies) * FRAME_NANOSECONDS / NANOSECONDS
+    if seconds < LEAST_SECONDS:
+        raise DataError(f"only {seconds:.2f} s of sound; enrol at least {LEAST_SECONDS:.0f} s")
+    if class_name(label) != SILENCE and (energies < _FLOOR).all():
+        raise DataError(
+            f"all of it is below -60 dBFS: this is silence, not {label}; is the microphone muted?"
+        )
+
+
+def _frames(
+    logs: Sequence[Path], microphone: str, start: int | None = None, end: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
+    """Read when the frames of some logs were heard, and their energies."""
+    name = topic(microphone, "features")
+    found = read_columns(logs, {name}, start, end, {_STAMP, "values"}).get(name)
+    if found is None:
+        return np.empty(0, np.int64), np.empty(0)
+    names = names_of(found.metadata, "values")
+    values = found["values"]
+    if _ENERGY not in names or values.shape[1:] != (len(names),):
+        raise DataError(f"{logs[0]}: {name} has no energy; it was not recorded by hearthlog")
+    return found[_STAMP], values[:, names.index(_ENERGY)]
+
+
+def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) -> Enrolled:
+    """Mark all of a log that was just made; there is no such log without its mark."""
+    start, end = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
+    try:
+        write_marks(path, [Mark(microphone, start, end, label)])
+    except HearthlogError:
+        path.unlink()
+        raise
+    return Enrolled(path, len(stamps) * FRAME_NANOSECONDS / NANOSECONDS)
+
+
+def _free_start(home: Path, label: str, seconds: float) -> int:
+    """Return the start of the last span of time that ends by now and is not taken."""
+    length = int(seconds * NANOSECONDS)
+    logs = filter(is_log, (home / ENROLLED).rglob(f"{label}_*{SUFFIX}"))
+    spans = [span for log in logs if (span := time_span(log)) is not None]
+    end = time.time_ns()
+    for first, last in sorted(spans, reverse=True):
+        if first < end and last > end - length:
+            end = first
+    return max(end - length, 0)

@@ -1,0 +1,33 @@
+"""Label tracks of Audacity: start, end and label with tabs between them, of one microphone."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.marks.formats.labels import Label, seconds_text
+from hearthlog.analyzer.marks.marks import Mark
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the labels of a track."""
+    for number, line in enumerate(text.split("\n"), 1):
+        if not line.strip() or line.startswith("\\"):  # the pitch of a spectral selection
+            continue
+        fields = [field.strip() for field in line.rstrip("\r").split("\t")]
+        if len(fields) != 3:
+            raise DataError(f"{path}:{number}: is not start, end and label with tabs between them")
+        yield Label(number, *fields)
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:
+    """Write a track, which has no place for microphones and reviewers."""
+    microphones = sorted({mark.microphone for mark in marks})
+    if len(microphones) > 1:
+        names = ", ".join(microphones)
+        raise DataError(f"{path}: is for one microphone: choose one with --microphone ({names})")
+    zero = heard[microphones[0]].starts[0]
+    return "".join(
+        f"{seconds_text(mark.start - zero)}\t{seconds_text(mark.end - zero)}\t{mark.label}\n"
+        for mark in marks
+    )

@@ -1,0 +1,54 @@
+"""CSV: a line for each label, with the names of the columns in the first."""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.text_files import csv_records
+from hearthlog.analyzer.marks.formats.labels import Label, made_text
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import time_text
+
+_REQUIRED = ("start", "end", "label")
+_COLUMNS = (*_REQUIRED, "microphone", "reviewer", "made", "corrects")
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the labels of a table."""
+    columns: list[str] = []
+    for number, record in csv_records(path, text):
+        values = [value.strip() for value in record]
+        if not columns:
+            columns = _checked_header(path, number, values)
+            continue
+        if len(values) != len(columns):
+            raise DataError(
+                f"{path}:{number}: has {len(values)} fields, the first line names {len(columns)}"
+            )
+        row = dict(zip(columns, values, strict=True))
+        yield Label(number, *(row.get(name, "") for name in _COLUMNS))
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+    """Write a table with all that marks say; its times are of UTC."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_COLUMNS)
+    for mark in marks:
+        start, end = time_text(mark.start), time_text(mark.end)
+        says = mark.reviewer, made_text(mark), mark.corrects
+        table.writerow([start, end, mark.label, mark.microphone, *says])
+    return text.getvalue()
+
+
+def _checked_header(path: Path, number: int, names: list[str]) -> list[str]:
+    fitting = set(_REQUIRED) <= set(names) <= set(_COLUMNS) and len(set(names)) == len(names)
+    if not fitting:
+        raise DataError(
+            f"{path}:{number}: the first line must name the columns: start,end,label and, where "
+            "known, microphone,reviewer,made,corrects"
+        )
+    return names

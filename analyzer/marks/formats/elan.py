@@ -1,0 +1,250 @@
+"""ELAN: a tier for each microphone and reviewer; what marks say besides in tiers that depend on it.
+
+Times in ELAN are whole milliseconds.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree as ET
+from xml.sax import SAXParseException
+from xml.sax.handler import ContentHandler
+from xml.sax.xmlreader import AttributesImpl, Locator
+
+from defusedxml.common import DefusedXmlException
+from defusedxml.sax import parseString
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import time_text
+
+_MILLISECOND = 1_000_000  # ns
+_START = "hearthlog:start"  # the property that says when the document begins
+_MARKS = "marks"  # a type of tiers, as these two:
+_SAYS = ("made", "corrects")
+_DEEPEST = 20  # elements within elements; ELAN has 5
+_ENDLESS = re.compile(r"<[^<>]{65536}")  # a tag that would take the parser minutes
+_SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
+_INSTANCE = "http://www.w3.org/2001/XMLSchema-instance"
+_NO_XML = dict.fromkeys((*range(0xD800, 0xE000), 0xFFFE, 0xFFFF), "\N{REPLACEMENT CHARACTER}")
+
+
+class _Annotation(NamedTuple):
+    line: int
+    tier: Mapping[str, str]
+    start: str  # a time slot
+    end: str
+    label: str
+
+
+class _Wrong(Exception):  # noqa: N818
+    """What is wrong in a line; for ELAN's XML is fine XML all the same."""
+
+
+class _Document(ContentHandler):
+    """Gathers what a document says of times and labels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.start = ""
+        self.annotations: dict[str, _Annotation] = {}
+        self.said: dict[str, dict[str, str]] = {kind: {} for kind in _SAYS}
+        self.slots: dict[str, str] = {}
+        self._locator: Locator | None = None
+        self._depth = 0
+        self._tier: dict[str, str] = {}
+        self._open: dict[str, str] = {}  # the annotation or the property that is being read
+        self._line = 0
+        self._text: list[str] = []
+
+    @property
+    def line(self) -> int:
+        """The line that is being read."""
+        return (self._locator.getLineNumber() if self._locator else None) or 1
+
+    def setDocumentLocator(self, locator: Locator) -> None:  # noqa: N802
+        """Take what knows the line."""
+        self._locator = locator
+
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:  # noqa: N802
+        """Take note of an element."""
+        self._depth += 1
+        given = dict(attrs.items())
+        if (self._depth == 1 and name != "ANNOTATION_DOCUMENT") or self._depth > _DEEPEST:
+            raise _Wrong("is no document of ELAN")
+        if name == "HEADER" and given.get("TIME_UNITS", "milliseconds") != "milliseconds":
+            raise _Wrong("has times that are no milliseconds; save it with a newer ELAN")
+        if name == "MEDIA_DESCRIPTOR" and given.get("TIME_ORIGIN", "0") != "0":
+            raise _Wrong("has an offset of the recording; set it to 0 in ELAN")
+        if name == "TIME_SLOT":
+            self.slots[given.get("TIME_SLOT_ID", "")] = given.get("TIME_VALUE", "")
+        elif name == "TIER":
+            self._tier = given
+        elif name in {"ALIGNABLE_ANNOTATION", "REF_ANNOTATION", "PROPERTY"}:
+            self._open, self._line = given, self.line
+            self._text.clear()
+
+    def characters(self, content: str) -> None:
+        """Take a piece of text."""
+        if self._open:
+            self._text.append(content)
+
+    def endElement(self, name: str) -> None:  # noqa: N802
+        """Take note of what is complete."""
+        self._depth -= 1
+        depends = "PARENT_REF" in self._tier
+        text = "".join(self._text).strip()
+        if name == "PROPERTY" and self._open.get("NAME") == _START:
+            self.start = text
+        elif name == "ALIGNABLE_ANNOTATION" and not depends:
+            start, end = (self._open.get(f"TIME_SLOT_REF{i}", "") for i in (1, 2))
+            identity = self._open.get("ANNOTATION_ID", f"line {self._line}")
+            self.annotations[identity] = _Annotation(self._line, self._tier, start, end, text)
+        elif name == "REF_ANNOTATION" and depends:
+            kind = self._tier.get("LINGUISTIC_TYPE_REF", "")
+            self.said.get(kind, {})[self._open.get("ANNOTATION_REF", "")] = text
+        if name in {"ALIGNABLE_ANNOTATION", "REF_ANNOTATION", "PROPERTY"}:
+            self._open = {}
+            self._text.clear()
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the annotations of the tiers that depend on no other."""
+    document = _Document()
+    endless = _ENDLESS.search(text)
+    if endless is not None:
+        line = text.count("\n", 0, endless.start()) + 1
+        raise DataError(f"{path}:{line}: is no document of ELAN")
+    try:
+        parseString(text.encode(), document, forbid_dtd=True)
+    except SAXParseException as error:
+        line = error.getLineNumber() or 1
+        raise DataError(f"{path}:{line}: is not XML ({error.getMessage()})") from error
+    except DefusedXmlException as error:
+        raise DataError(f"{path}:{document.line}: declares a DTD, as ELAN never does") from error
+    except _Wrong as error:
+        raise DataError(f"{path}:{document.line}: {error}") from error
+    for identity, found in document.annotations.items():
+        yield Label(
+            found.line,
+            _seconds(path, found, document.slots.get(found.start)),
+            _seconds(path, found, document.slots.get(found.end)),
+            found.label,
+            microphone=found.tier.get("PARTICIPANT", ""),
+            reviewer=found.tier.get("ANNOTATOR", ""),
+            made=document.said["made"].get(identity, ""),
+            corrects=document.said["corrects"].get(identity, ""),
+            zero=document.start,
+        )
+
+
+def _seconds(path: Path, found: _Annotation, milliseconds: str | None) -> str:
+    if not milliseconds:
+        raise DataError(f"{path}:{found.line}: {found.label[:64]!r} has no time; align it in ELAN")
+    if not (milliseconds.isascii() and milliseconds.isdecimal() and len(milliseconds) < 16):
+        raise DataError(f"{path}:{found.line}: {milliseconds[:64]!r} is no number of milliseconds")
+    return seconds_text(int(milliseconds) * _MILLISECOND)
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+    """Write a document whose times begin with the first frame of all its microphones."""
+    marks = [mark._replace(reviewer=mark.reviewer.translate(_NO_XML)) for mark in marks]
+    zero = min(heard[mark.microphone].starts[0] for mark in marks)
+    root = ET.Element(
+        "ANNOTATION_DOCUMENT",
+        {
+            "AUTHOR": "hearthlog",
+            "DATE": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+            "FORMAT": "3.0",
+            "VERSION": "3.0",
+            "xmlns:xsi": _INSTANCE,
+            "xsi:noNamespaceSchemaLocation": _SCHEMA,
+        },
+    )
+    header = ET.SubElement(root, "HEADER", MEDIA_FILE="", TIME_UNITS="milliseconds")
+    ET.SubElement(header, "PROPERTY", NAME=_START).text = time_text(zero)
+    spans = _in_milliseconds(marks, zero)
+    _add_slots(root, spans)
+    kinds = _add_tiers(root, marks)
+    _add_types(root, kinds)
+    ET.indent(root, "")
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, "unicode") + "\n"
+
+
+def _in_milliseconds(marks: Sequence[Mark], zero: int) -> list[tuple[int, int]]:
+    """Round spans such that none vanishes, and none overlaps the next of its microphone."""
+    spans = [(0, 0)] * len(marks)
+    last: dict[str, int] = {}
+    for i in sorted(range(len(marks)), key=marks.__getitem__):
+        mark = marks[i]
+        start, end = (
+            (time - zero + _MILLISECOND // 2) // _MILLISECOND for time in (mark.start, mark.end)
+        )
+        start = max(start, last.get(mark.microphone, 0))
+        last[mark.microphone] = end = max(end, start + 1)
+        spans[i] = start, end
+    return spans
+
+
+def _add_slots(root: ET.Element, spans: Sequence[tuple[int, int]]) -> None:
+    """Add the time slots, two for each annotation, in the order of time."""
+    order = ET.SubElement(root, "TIME_ORDER")
+    slots = [(start, f"ts{2 * i}") for i, (start, _) in enumerate(spans, 1)]
+    slots += [(end, f"ts{2 * i + 1}") for i, (_, end) in enumerate(spans, 1)]
+    for time, name in sorted(slots, key=lambda slot: slot[0]):
+        ET.SubElement(order, "TIME_SLOT", TIME_SLOT_ID=name, TIME_VALUE=str(time))
+
+
+def _add_tiers(root: ET.Element, marks: Sequence[Mark]) -> list[str]:
+    """Add the tiers; return the kinds of those that depend on others."""
+    kinds: list[str] = []
+    identity = len(marks)
+    for microphone, reviewer in sorted({(mark.microphone, mark.reviewer) for mark in marks}):
+        own = {
+            i: mark
+            for i, mark in enumerate(marks, 1)
+            if (mark.microphone, mark.reviewer) == (microphone, reviewer)
+        }
+        name = f"{microphone}@{reviewer}" if reviewer else microphone
+        about = {"PARTICIPANT": microphone, "ANNOTATOR": reviewer}
+        tier = ET.SubElement(root, "TIER", about, TIER_ID=name, LINGUISTIC_TYPE_REF=_MARKS)
+        for i, mark in own.items():
+            slots = {"TIME_SLOT_REF1": f"ts{2 * i}", "TIME_SLOT_REF2": f"ts{2 * i + 1}"}
+            _add(tier, "ALIGNABLE_ANNOTATION", slots | {"ANNOTATION_ID": f"a{i}"}, mark.label)
+        for kind in _SAYS:
+            texts = {i: made_text(m) if kind == "made" else m.corrects for i, m in own.items()}
+            if not any(texts.values()):
+                continue
+            kinds.append(kind)
+            below = {"TIER_ID": f"{kind}: {name}", "PARENT_REF": name, "LINGUISTIC_TYPE_REF": kind}
+            tier = ET.SubElement(root, "TIER", about | below)
+            for i, text in texts.items():
+                if text:
+                    identity += 1
+                    ids = {"ANNOTATION_ID": f"a{identity}", "ANNOTATION_REF": f"a{i}"}
+                    _add(tier, "REF_ANNOTATION", ids, text.translate(_NO_XML))
+    return sorted(set(kinds))
+
+
+def _add(tier: ET.Element, kind: str, attributes: dict[str, str], text: str) -> None:
+    annotation = ET.SubElement(ET.SubElement(tier, "ANNOTATION"), kind, attributes)
+    ET.SubElement(annotation, "ANNOTATION_VALUE").text = text
+
+
+def _add_types(root: ET.Element, kinds: Sequence[str]) -> None:
+    """Add the types of tiers, and what they must obey."""
+    about = {"LINGUISTIC_TYPE_ID": _MARKS, "TIME_ALIGNABLE": "true", "GRAPHIC_REFERENCES": "false"}
+    ET.SubElement(root, "LINGUISTIC_TYPE", about)
+    for kind in kinds:
+        own = {"LINGUISTIC_TYPE_ID": kind, "TIME_ALIGNABLE": "false"}
+        ET.SubElement(root, "LINGUISTIC_TYPE", about | own, CONSTRAINTS="Symbolic_Association")
+    ET.SubElement(
+        root,
+        "CONSTRAINT",
+        DESCRIPTION="1-1 association with a parent annotation",
+        STEREOTYPE="Symbolic_Association",
+    )

@@ -1,0 +1,126 @@
+"""Tasks of Label Studio: a task is a microphone, an item of its result a mark."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from json import dumps
+from pathlib import Path
+from typing import Any
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import time_text
+
+_TYPE = "labels"
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the items of a file that Label Studio exports as JSON, or that it would import."""
+    try:
+        # Numbers stay text: nothing is lost, and none is too long.
+        tasks = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: is not JSON ({error})") from error
+    for number, task in enumerate(tasks if isinstance(tasks, list) else [tasks], 1):
+        place = f"task {number}"
+        if not isinstance(task, dict) or not isinstance(task.get("data"), dict):
+            raise DataError(f"{path}: {place}: is no task of Label Studio; export them as JSON")
+        yield from _of_task(path, place, task)
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+    """Write a task for each microphone."""
+    microphones = sorted({mark.microphone for mark in marks})
+    tasks = [_task(name, [m for m in marks if m.microphone == name], heard) for name in microphones]
+    return "[\n" + ",\n".join(tasks) + "\n]\n"
+
+
+def _task(microphone: str, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:
+    zero = heard[microphone].starts[0]
+    length = seconds_text(heard[microphone].ends[-1] - zero)
+    data = {"audio": f"{microphone}.wav", "microphone": microphone, "start": time_text(zero)}
+    items = ",\n".join(_item(number, mark, zero, length) for number, mark in enumerate(marks, 1))
+    return f'{{"data": {dumps(data)}, "annotations": [{{"result": [\n{items}\n]}}]}}'
+
+
+def _item(number: int, mark: Mark, zero: int, length: str) -> str:
+    """Write an item; in pieces, for `json` has no decimals."""
+    says = {"reviewer": mark.reviewer, "made": made_text(mark), "corrects": mark.corrects}
+    about = {
+        "id": f"mark{number}",
+        "from_name": "label",
+        "to_name": "audio",
+        "type": _TYPE,
+        "origin": "manual",
+        "meta": {name: text for name, text in says.items() if text},
+    }
+    value = (
+        f'{{"start": {seconds_text(mark.start - zero)}, "end": {seconds_text(mark.end - zero)}, '
+        f'"channel": 0, "labels": [{dumps(mark.label)}]}}'
+    )
+    return f'{dumps(about)[:-1]}, "original_length": {length}, "value": {value}}}'
+
+
+def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[Label]:
+    """Yield the items of a task: what was annotated or, where it never could be, predicted."""
+    kind = next((kind for kind in ("annotations", "predictions") if kind in task), None)
+    if kind is None or not isinstance(task[kind], list):
+        raise DataError(f"{path}: {place}: has no annotations and no predictions")
+    microphone, start = (_text(task["data"].get(name)) for name in ("microphone", "start"))
+    for number, annotation in enumerate(task[kind], 1):
+        within = f"{place}, {kind[:-1]} {number}"
+        if not isinstance(annotation, dict) or not isinstance(annotation.get("result"), list):
+            raise DataError(f"{path}: {within}: has no result")
+        if annotation.get("was_cancelled") is True:
+            continue
+        reviewer, made = _completed(annotation) if kind == "annotations" else ("", "")
+        for i, item in enumerate(annotation["result"], 1):
+            label = _of_item(path, f"{within}, result {i}", item)
+            if label is not None:
+                yield label._replace(
+                    microphone=microphone,
+                    zero=start,
+                    reviewer=label.reviewer or reviewer,
+                    made=label.made or made,
+                )
+
+
+def _of_item(path: Path, place: str, item: Any) -> Label | None:
+    """Read an item, None if it is none that labels (a rating, a remark, a relation)."""
+    kind = item.get("type") if isinstance(item, dict) else None
+    if not isinstance(kind, str) or not kind.endswith(_TYPE):
+        return None
+    value = item.get("value")
+    names = value.get(_TYPE) if isinstance(value, dict) else None
+    if kind != _TYPE or not isinstance(names, list) or not {"start", "end"} <= value.keys():
+        raise DataError(f"{path}: {place}: {kind[:64]!r} is no label of a span of sound")
+    if len(names) != 1:
+        raise DataError(f"{path}: {place}: has {len(names)} labels; choose one")
+    meta = item.get("meta")
+    says = meta if isinstance(meta, dict) else {}
+    return Label(
+        place,
+        _text(value["start"]),
+        _text(value["end"]),
+        _text(names[0]),
+        reviewer=_text(says.get("reviewer")),
+        made=_text(says.get("made")),
+        corrects=_text(says.get("corrects")),
+        length=_text(item.get("original_length")),
+    )
+
+
+def _completed(annotation: Mapping[str, Any]) -> tuple[str, str]:
+    """Return who made an annotation, and when."""
+    by = annotation.get("completed_by")
+    if isinstance(by, dict):
+        reviewer = _text(by.get("email")) or _text(by.get("id"))
+    else:
+        reviewer = f"user {by}" if isinstance(by, str) else ""
+    return reviewer, _text(annotation.get("created_at"))
+
+
+def _text(value: Any) -> str:
+    """Return text, empty if there is none; what should be text, and is not, as it is written."""
+    return value if isinstance(value, str) else "" if value is None else dumps(value)

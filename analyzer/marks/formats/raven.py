@@ -1,0 +1,97 @@
+"""Selection tables of Raven: columns with tabs between them, and their names in the first line."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.marks import Mark
+
+SUFFIX = ".selections.txt"
+_BAND = ("0.000", "8000.000")  # Hz; of the sound that is listened to
+_COLUMNS = (
+    "Selection",
+    "View",
+    "Channel",
+    "Begin Time (s)",
+    "End Time (s)",
+    "Low Freq (Hz)",
+    "High Freq (Hz)",
+    "Annotation",
+    "Microphone",
+    "Reviewer",
+    "Made",
+    "Corrects",
+)
+_TIMES = [name.casefold() for name in _COLUMNS[3:5]]
+_ANNOTATION = _COLUMNS[7].casefold()
+_SAYS = [name.casefold() for name in _COLUMNS[8:]]
+
+
+def is_table(text: str) -> bool:
+    """Tell a selection table by its first line."""
+    return set(_TIMES) <= set(_names(text.lstrip().split("\n", 1)[0]))
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the selections of a table, each once: Raven may list it for every view and channel."""
+    columns: list[str] = []
+    seen: set[tuple[str, ...]] = set()
+    for number, line in enumerate(text.split("\n"), 1):
+        if not line.strip():
+            continue
+        if not columns:
+            columns = _checked_header(path, number, line)
+            continue
+        values = [value.strip() for value in line.rstrip("\r").split("\t")]
+        if len(values) > len(columns):
+            raise DataError(
+                f"{path}:{number}: has {len(values)} fields, the first line names {len(columns)}"
+            )
+        row = dict(zip(columns, values, strict=False))  # empty ones may be missing at the end
+        fields = [row.get(name, "") for name in (*_TIMES, _ANNOTATION, *_SAYS)]
+        selection = row.get("selection", "")
+        identity = (selection, *fields)
+        if not selection or identity not in seen:
+            seen.add(identity)
+            yield Label(number, *fields)
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+    """Write a table; what Raven has no column for is in columns of our own, which it keeps."""
+    channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
+    lines = ["\t".join(_COLUMNS)]
+    for number, mark in enumerate(marks, 1):
+        zero = heard[mark.microphone].starts[0]
+        fields = [
+            str(number),
+            "Spectrogram 1",
+            str(channels[mark.microphone]),
+            seconds_text(mark.start - zero),
+            seconds_text(mark.end - zero),
+            *_BAND,
+            mark.label,
+            mark.microphone,
+            mark.reviewer,
+            made_text(mark),
+            mark.corrects,
+        ]
+        lines.append("\t".join(fields))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _names(line: str) -> list[str]:
+    return [name.strip().casefold() for name in line.split("\t")]
+
+
+def _checked_header(path: Path, number: int, line: str) -> list[str]:
+    names = _names(line)
+    if _ANNOTATION not in names:
+        raise DataError(
+            f"{path}:{number}: this table of Raven has no column Annotation: name the column of "
+            "the labels so"
+        )
+    if len(set(names)) < len(names):
+        raise DataError(f"{path}:{number}: names a column twice")
+    return names

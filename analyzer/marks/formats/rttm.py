@@ -1,0 +1,40 @@
+"""RTTM: lines of SPEAKER, with the microphone as the file, and the label as the speaker."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.marks.formats.labels import Label, read_seconds, seconds_text
+from hearthlog.analyzer.marks.marks import Mark
+
+_TYPE = "SPEAKER"
+_FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
+
+
+def read(path: Path, text: str) -> Iterator[Label]:
+    """Yield the labels; lines of other types, and comments, are left out."""
+    for number, line in enumerate(text.split("\n"), 1):
+        fields = line.split()
+        if not fields or fields[0].startswith(";;"):
+            continue
+        if len(fields) not in _FIELDS:
+            raise DataError(f"{path}:{number}: is no line of RTTM, which has 9 or 10 fields")
+        if fields[0] != _TYPE:
+            continue
+        _, microphone, _, onset, duration, _, _, label, *_ = fields
+        where = f"{path}:{number}"
+        end = read_seconds(where, onset) + read_seconds(where, duration)
+        yield Label(number, onset, f"{end:f}", label, microphone)
+
+
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+    """Write a line for each mark."""
+    lines = []
+    for mark in marks:
+        onset = seconds_text(mark.start - heard[mark.microphone].starts[0])
+        duration = seconds_text(mark.end - mark.start)
+        lines.append(
+            f"{_TYPE} {mark.microphone} 1 {onset} {duration} <NA> <NA> {mark.label} <NA> <NA>\n"
+        )
+    return "".join(lines)

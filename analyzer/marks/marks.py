@@ -1,0 +1,250 @@
+"""Marks: what a reviewer says that was heard, in a layer beside the log it speaks about."""
+
+import fcntl
+import os
+import re
+import tempfile
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import ROUNDING
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.files import SUFFIX, replaced_file, stem
+from hearthlog.schemas.logs.provenance import provenance
+from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topic
+from hearthlog.schemas.times import NANOSECONDS
+
+LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
+NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
+_KINDS = {message_types.SEGMENT: "review/segment", message_types.MARK: "review/mark"}
+_SPAN = ("header.stamp", "duration", "label")
+_SAYS = ("reviewer", "made", "corrects")
+_FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_SAYS)}
+
+
+class Mark(NamedTuple):
+    """What was heard from `start` on, before `end`, in nanoseconds of UTC, and who says so.
+
+    Attributes
+    ----------
+    reviewer : str
+        Empty if nobody knows, as of what is below.
+    made : int
+        When the mark was made, in nanoseconds of UTC; 0 if nobody knows.
+    corrects : str
+        The labelling that it corrects: `live`, or the name of a model.
+    """
+
+    microphone: str
+    start: int
+    end: int
+    label: str
+    reviewer: str = ""
+    made: int = 0
+    corrects: str = ""
+
+
+class Span(NamedTuple):
+    """A span of time that a microphone heard, in nanoseconds of UTC."""
+
+    microphone: str
+    start: int
+    end: int
+
+
+def review_path(log: Path) -> Path:
+    """Name the review layer of a log, finished or not."""
+    return log.with_name(f"{stem(log)}.review{SUFFIX}")
+
+
+def read_marks(log: Path) -> list[Mark]:
+    """Read the marks of a log, those of each microphone in the order of time.
+
+    Returns
+    -------
+    list of Mark
+        Those of a microphone do not overlap. Empty if nobody has reviewed the log.
+
+    Raises
+    ------
+    LogError
+        If the layer is damaged, or its marks cannot be.
+    """
+    path = review_path(log)
+    if not path.exists():
+        return []
+    with LogFile(path) as file:
+        complete = file.complete
+    selection = select([path])
+    if not complete:
+        raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
+    for name, same in selection.channels.items():
+        kind = next((k for k in _KINDS if all(is_of_type(*d, k, _FIELDS[k]) for d in same)), "")
+        if not kind or not re.fullmatch(rf"/[^/]+/{_KINDS[kind]}", name):
+            raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
+    selection.verify()
+    spans: list[Mark] = []
+    said: dict[tuple[Any, ...], Mark] = {}
+    for batch in selection.messages():
+        for columns in decode_known(path, batch, _FIELDS):
+            if columns.type == message_types.SEGMENT:
+                spans += _marks(columns)
+            else:
+                said |= {mark[:4]: mark for mark in _marks(columns)}
+    try:
+        return _checked(said.get(mark[:4], mark) for mark in spans)
+    except (DataError, LogError) as error:
+        raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
+
+
+def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) -> Path:
+    """Add marks to the review layer of a log; where they overlap older marks, they win.
+
+    The layer is replaced in one step: whatever happens, the old or the new one is there. One
+    process waits for another that does the same.
+
+    Parameters
+    ----------
+    log : Path
+    marks : iterable of Mark
+    deleted : iterable of Span
+        Where older marks are deleted, or cut off.
+
+    Returns
+    -------
+    Path
+        The layer; with no marks left it is not there any more.
+
+    Raises
+    ------
+    DataError
+        If the new marks overlap each other, or cannot be.
+    LogError
+        If there is no such log, if its layer is damaged, or if it cannot be written.
+    """
+    new = _checked(marks)
+    path = review_path(log)
+    with _alone(path):
+        left = read_marks(log)
+        for span in deleted:
+            left = list(_left(left, [span]))
+        left = _checked([*_left(left, new), *new])
+        if not left:
+            path.unlink(missing_ok=True)
+            return path
+        node = next((record.get("node", "") for record in select([log]).metadata), "")
+        about = provenance(node, log=stem(log) + SUFFIX)
+        with replaced_file(path) as temporary:
+            temporary.write_bytes(_layer(path.name, left, about))
+    return path
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Keep other writers of review layers out of a folder."""
+    try:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror})") from error
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(folder)
+
+
+def _marks(columns: Columns) -> Iterator[Mark]:
+    microphone = columns.topic.split("/")[1]
+    starts = columns["header.stamp"]
+    ends = starts + columns["duration"]
+    says = [columns[name].tolist() for name in _SAYS if columns.type == message_types.MARK]
+    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *says, strict=True):
+        yield Mark(microphone, *row)
+
+
+def _checked(marks: Iterable[Mark]) -> list[Mark]:
+    """Sort marks, and raise DataError if one cannot be."""
+    ordered = sorted(marks)
+    for mark in ordered:
+        if not 0 <= mark.start < mark.end <= LATEST:
+            raise DataError(f"a mark from {mark.start} to {mark.end} ns is no span of time")
+        if not CLASS_NAME.fullmatch(mark.label):
+            raise DataError(f"{mark.label[:64]!r} cannot be the name of a class")
+        names = NAME.fullmatch(mark.reviewer) and NAME.fullmatch(mark.corrects)
+        if not (0 <= mark.made <= LATEST and names):
+            raise DataError(f"a mark cannot be made by {mark.reviewer[:64]!r} at {mark.made} ns")
+    for microphone in {mark.microphone for mark in ordered}:
+        check_microphone_name(microphone)
+    for one, other in pairwise(ordered):
+        if one.microphone == other.microphone and other.start < one.end:
+            raise DataError(f"{one.label} and {other.label} overlap at {other.start} ns")
+    return ordered
+
+
+def _left(old: Sequence[Mark], new: Sequence[Mark | Span]) -> Iterator[Mark]:
+    """Yield what new marks leave of the old ones."""
+    for microphone in {mark.microphone for mark in old}:
+        own = [mark for mark in new if mark.microphone == microphone]
+        starts, ends = [mark.start for mark in own], [mark.end for mark in own]
+        for mark in old:
+            if mark.microphone == microphone:
+                yield from _around(mark, starts, ends)
+
+
+def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]:
+    """Cut a mark around spans that are sorted and do not overlap."""
+    over = range(bisect_right(ends, old.start), bisect_left(starts, old.end))
+    if not over:
+        return [old]
+    begins = [old.start, *(ends[i] for i in over)]
+    stops = [*(starts[i] for i in over), old.end]
+    return [
+        old._replace(start=start, end=end)
+        for start, end in zip(begins, stops, strict=True)
+        if end - start > ROUNDING
+    ]
+
+
+def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
+    """Make the file; elsewhere, for there it must not be taken for a log being written."""
+    microphones = sorted({mark.microphone for mark in marks})
+    topics = [Topic(topic(m, kind), type_) for type_, kind in _KINDS.items() for m in microphones]
+    with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
+        writer = LogWriter(Path(folder) / name, topics, about)
+        writer.write_columns([_rows(t.name, t.type, marks) for t in topics])
+        return writer.finish().read_bytes()
+
+
+def _rows(name: str, kind: str, marks: Sequence[Mark]) -> Rows:
+    microphone = name.split("/")[1]
+    own = [mark for mark in marks if mark.microphone == microphone]
+    starts = np.array([mark.start for mark in own])
+    ends = np.array([mark.end for mark in own])
+    fields = {
+        "header.stamp": starts,
+        "header.frame_id": microphone,
+        "duration": ends - starts,
+        "label": [mark.label for mark in own],
+    }
+    if kind == message_types.SEGMENT:
+        return Rows(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
+    says = {
+        "reviewer": [mark.reviewer for mark in own],
+        "made": np.array([mark.made for mark in own]),
+        "corrects": [mark.corrects for mark in own],
+    }
+    return Rows(name, ends, fields | says)

@@ -1,0 +1,59 @@
+"""Plain words: for classes, days and times."""
+
+from datetime import date, tzinfo
+
+import numpy as np
+
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.spans import Int64
+from hearthlog.models.classes import find_class
+
+_WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
+_MONTHS = (
+    *("January", "February", "March", "April", "May", "June"),
+    *("July", "August", "September", "October", "November", "December"),
+)
+
+
+def in_words(label: str) -> str:
+    """Name a class as people would."""
+    row = find_class(label)
+    return label.replace("_", " ").capitalize() if row is None else row.words
+
+
+def several_in_words(label: str) -> str:
+    """Name events of a class as people would who count them."""
+    row = find_class(label)
+    return (row.several if row else "") or in_words(label)
+
+
+def day_in_words(day: date) -> str:
+    """Write a day: `Sunday, 1 March 2026`."""
+    return f"{_WEEKDAYS[day.weekday()]}, {date_in_words(day)}"
+
+
+def date_in_words(day: date) -> str:
+    """Write a date: `1 March 2026`."""
+    return f"{day.day} {_MONTHS[day.month - 1]} {day.year}"
+
+
+def short_day(day: date) -> str:
+    """Write a day: `Sun 1 Mar`."""
+    return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
+
+
+def clock_text(nanoseconds: int, zone: tzinfo) -> str:
+    """Write the time of day."""
+    return f"{local_time(nanoseconds, zone):%H:%M}"
+
+
+def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
+    """List times of day; where they are many, the first and how many more."""
+    shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
+    more = len(starts) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
+def listed(items: list[str]) -> str:
+    """Put items in a sentence: `a, b and c`."""
+    return " and ".join([*([", ".join(items[:-1])] if items[:-1] else []), *items[-1:]])

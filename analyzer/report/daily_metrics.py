@@ -1,0 +1,290 @@
+"""The figures of a day: what was heard, for how long, how often, when."""
+
+from dataclasses import dataclass
+from datetime import date, timedelta, tzinfo
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.logs.local_time import at_hour, day_span, local_time
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Int64,
+    Spans,
+    common,
+    cut,
+    first_of_groups,
+    joined,
+    lengths,
+    one,
+    without,
+)
+from hearthlog.analyzer.report.read_home import Heard, Segments
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.times import NANOSECONDS
+
+EVENING, MORNING = 22, 7  # of the clock: between them is the night
+_RISING = 4  # of the clock: what is heard before is of the night
+_MINUTE = 60 * NANOSECONDS
+HOUR = 60 * _MINUTE
+_EVENT_PAUSE = 10 * NANOSECONDS
+_STRETCH_PAUSE, _STRETCH = 10 * _MINUTE, 30 * NANOSECONDS
+MOST = 0.75  # of a day and of its night, for its figures to be compared
+_BIN, _BUSY = 10 * _MINUTE, _MINUTE
+
+
+class Events(NamedTuple):
+    """What happened, by when it began.
+
+    Attributes
+    ----------
+    starts : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC; they ascend.
+    chances : np.ndarray [shape=(n,)], float64
+        That it happened.
+    """
+
+    starts: Int64
+    chances: NDArray[np.float64]
+
+    def between(self, spans: Spans) -> "Events":
+        """Leave those that began in some spans of time."""
+        of = np.searchsorted(spans.starts, self.starts, side="right") - 1
+        inside = of >= 0
+        inside[inside] = self.starts[inside] < spans.ends[of[inside]]
+        return Events(self.starts[inside], self.chances[inside])
+
+    @property
+    def number(self) -> Count:
+        """How many there were."""
+        p = self.chances
+        variance = float((p * (1 - p)).sum())
+        return Count(float(p.sum()), variance, int((p == 1).sum()), len(p))
+
+
+@dataclass(frozen=True)
+class Home:
+    """What was heard in a home, by all its microphones together.
+
+    Attributes
+    ----------
+    classes : list of str
+    heard : Spans
+        When at least one of them heard.
+    listened : dict of str to Spans
+        By class: when at least one of them heard whose model knows it.
+    sound : Spans
+        When at least one of them heard something else than silence.
+    spans : dict of str to Spans
+        By class: when at least one of them heard it.
+    events : dict of str to Events
+        By class, but silence. Spans with no more than ten seconds between them are one event,
+        and so are those of two microphones at one time.
+    """
+
+    classes: list[str]
+    heard: Spans
+    listened: dict[str, Spans]
+    sound: Spans
+    spans: dict[str, Spans]
+    events: dict[str, Events]
+
+    def between(self, start: int, end: int) -> "Home":
+        """Leave what was heard in a span of time."""
+        return Home(
+            self.classes,
+            cut(self.heard, start, end),
+            {name: cut(spans, start, end) for name, spans in self.listened.items()},
+            cut(self.sound, start, end),
+            {name: cut(spans, start, end) for name, spans in self.spans.items()},
+            {name: events.between(one(start, end)) for name, events in self.events.items()},
+        )
+
+
+def whole_home(heard: Heard) -> Home:
+    """Put together what the microphones heard."""
+    parts = list(heard.segments.values())
+    starts, ends, labels, chances = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in Segments._fields
+    )
+    everything = joined(starts, ends)
+    loud = labels != SILENCE
+    sound = joined(starts[loud], ends[loud])
+    classes = list(dict.fromkeys(name for known in heard.known.values() for name in known))
+    listened, spans, events = {}, {}, {}
+    for name in classes:
+        own = labels == name
+        knowing = [
+            part.spans for source, part in heard.segments.items() if name in heard.known[source]
+        ]
+        begun, ended = (np.concatenate(edges) for edges in zip(*knowing, strict=True))
+        listened[name] = joined(begun, ended)
+        spans[name] = joined(starts[own], ends[own])
+        events[name] = _events(starts[own], ends[own], chances[own])
+    if SILENCE in spans:
+        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
+        del events[SILENCE]
+    return Home(classes, everything, listened, sound, spans, events)
+
+
+def _events(starts: Int64, ends: Int64, chances: NDArray[np.float64]) -> Events:
+    """Make events of segments; of each the surest segment counts."""
+    order = np.argsort(starts, kind="stable")
+    starts, ends, chances = starts[order], ends[order], chances[order]
+    firsts = first_of_groups(starts, ends, _EVENT_PAUSE)
+    best = np.maximum.reduceat(chances, firsts) if len(firsts) else chances
+    return Events(starts[firsts], best)
+
+
+@dataclass(frozen=True)
+class Day:
+    """The figures of one day, and of the night that ends on it.
+
+    Attributes
+    ----------
+    day : date
+    home : Home
+    zone : tzinfo
+    span, night : Spans
+        One span each, in nanoseconds of UTC.
+    heard : Spans
+        What of the day was heard.
+    """
+
+    day: date
+    home: Home
+    zone: tzinfo
+    span: Spans
+    night: Spans
+    heard: Spans
+
+    @property
+    def share(self) -> float:
+        """How much of the day was heard, 0 to 1."""
+        return self.heard.length / self.span.length
+
+    @property
+    def night_hours(self) -> float:
+        """How much of the night was heard."""
+        return common(self.home.heard, self.night).length / HOUR
+
+    def comparable(self, name: str = "") -> bool:
+        """Tell whether most of the day and of its night was heard; of all classes by default."""
+        spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
+        wholes = self.span, self.night
+        shares = [common(each, whole).length / whole.length for each in spans for whole in wholes]
+        return min(shares) >= MOST
+
+    def share_of(self, name: str) -> float:
+        """How much of the day a class would have been heard, 0 to 1."""
+        return common(self.home.listened.get(name, NONE), self.span).length / self.span.length
+
+    def minutes(self, name: str) -> Minutes | None:
+        """For how long a class was heard; None if it could not be."""
+        if not self.share_of(name):
+            return None
+        return _minutes(common(self.home.spans.get(name, NONE), self.span))
+
+    def events(self, name: str) -> Events:
+        """Events of a class that began on this day."""
+        return _of(self.home, name).between(self.span)
+
+    def night_events(self, name: str) -> Events:
+        """Events of a class that began in the night."""
+        return _of(self.home, name).between(self.night)
+
+    def count(self, name: str) -> Count | None:
+        """How often a class was heard; None if it could not be."""
+        return self.events(name).number if self.share_of(name) else None
+
+    def night_count(self, name: str) -> Count | None:
+        """How often it was heard in the night; None if it could not be."""
+        listened = common(self.home.listened.get(name, NONE), self.night).length > 0
+        return self.night_events(name).number if listened else None
+
+    @property
+    def sound(self) -> Minutes:
+        """For how long there was any sound."""
+        return _minutes(common(self.home.sound, self.span))
+
+    @property
+    def night_sound(self) -> Minutes:
+        """For how long there was any sound in the night."""
+        return _minutes(common(self.home.sound, self.night))
+
+    @property
+    def night_stretches(self) -> Count:
+        """How often there was sound in the night: stretches with ten quiet minutes between."""
+        sound = common(self.home.sound, self.night)
+        stretches = joined(*sound, _STRETCH_PAUSE)
+        if not len(stretches.starts):
+            return exactly(0)
+        edges = np.append(stretches.starts, stretches.ends[-1:])
+        return exactly(int((lengths(sound, edges) >= _STRETCH).sum()))
+
+    @property
+    def hours(self) -> Int64:
+        """Edges of the hours of the day, in nanoseconds of UTC: 24 to 26 of them."""
+        start, end = self.span.starts[0], self.span.ends[0]
+        return np.append(np.arange(start, end, HOUR), end)
+
+    @property
+    def sound_by_hour(self) -> NDArray[np.float64]:
+        """Minutes with sound in each of these hours."""
+        return lengths(self.home.sound, self.hours) / _MINUTE
+
+    @property
+    def longest_quiet(self) -> Spans:
+        """The longest span without sound in waking hours; none if nothing was heard then."""
+        waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
+        quiet = without(common(self.home.heard, waking), self.home.sound)
+        if not len(quiet.starts):
+            return NONE
+        longest = int((quiet.ends - quiet.starts).argmax())
+        return Spans(*(edge[longest : longest + 1] for edge in quiet))
+
+    @property
+    def quiet(self) -> Minutes | None:
+        """How long that was."""
+        return _minutes(self.longest_quiet) if self.heard.length else None
+
+    @property
+    def active(self) -> Int64:
+        """Starts of the ten minutes with a minute of sound, from four o'clock on."""
+        edges = np.arange(at_hour(self.day, _RISING, self.zone), self.span.ends[0] + 1, _BIN)
+        return edges[:-1][lengths(self.home.sound, edges) >= _BUSY]
+
+    @property
+    def first(self) -> Clock | None:
+        """When the day began to be lively."""
+        return self._clock(self.active[:1])
+
+    @property
+    def last(self) -> Clock | None:
+        """When it ended to be."""
+        return self._clock(self.active[-1:] + _BIN - _MINUTE)
+
+    def _clock(self, times: Int64) -> Clock | None:
+        if not len(times):
+            return None
+        local = local_time(int(times[0]), self.zone)
+        return Clock(60 * local.hour + local.minute)
+
+
+def day_of(home: Home, day: date, zone: tzinfo) -> Day:
+    """Look at one day of a home."""
+    start, end = day_span(day, zone)
+    night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
+    span = one(start, end)
+    near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
+    return Day(day, near, zone, span, night, common(near.heard, span))
+
+
+def _of(home: Home, name: str) -> Events:
+    return home.events.get(name, Events(NONE.starts, np.empty(0)))
+
+
+def _minutes(spans: Spans) -> Minutes:
+    return Minutes(spans.length / _MINUTE)

@@ -1,0 +1,103 @@
+"""What a report is about: some days, those they are compared with, and what was not well."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import tzinfo
+
+from hearthlog.analyzer.logs.health import Trouble
+from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
+from hearthlog.analyzer.report.class_words import listed
+from hearthlog.analyzer.report.daily_metrics import Day
+from hearthlog.analyzer.report.sections import Figure
+from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
+
+_CHANGES = {
+    (Clock, 1): "later",
+    (Clock, -1): "earlier",
+    (Minutes, 1): "longer",
+    (Minutes, -1): "shorter",
+    (Count, 1): "more often",
+    (Count, -1): "less often",
+}
+
+
+@dataclass(frozen=True)
+class Account:
+    """What a page tells.
+
+    Attributes
+    ----------
+    nodes, microphones : list of str
+    labelling : str
+        `live`, or the name of a model.
+    zone : tzinfo
+    days : list of Day
+        One, or seven.
+    before : list of Day
+        The days before them that belong to what is asked about three days.
+    earlier : list of Day
+        Those that they are compared with.
+    unheard : dict of str to float
+        By microphone: hours in which it heard nothing.
+    gaps, troubles : list of Trouble
+    precisions : mapping of str to float
+    unread : int
+        How many logs could not be read, or only in part.
+    """
+
+    nodes: Sequence[str]
+    microphones: Sequence[str]
+    labelling: str
+    zone: tzinfo
+    days: Sequence[Day]
+    before: Sequence[Day]
+    earlier: Sequence[Day]
+    unheard: Mapping[str, float]
+    gaps: Sequence[Trouble]
+    troubles: Sequence[Trouble]
+    precisions: Mapping[str, float]
+    unread: int
+
+    @property
+    def home(self) -> str:
+        """Name of the home."""
+        return listed(list(self.nodes)) or "Home"
+
+    @property
+    def classes(self) -> list[str]:
+        """The classes that can be heard."""
+        return self.days[0].home.classes
+
+    @property
+    def comparable(self) -> bool:
+        """Whether there are days to compare with."""
+        return len(self.earlier) >= FEWEST
+
+    def known(self, figure: Figure) -> tuple[Usual, Value] | None:
+        """Return what is usual, and a value that can write it; None if there are too few days."""
+        days = [day for day in self.earlier if day.comparable(figure.name)]
+        values = [value for day in days if (value := figure.value(day)) is not None]
+        found = usual(values)
+        return None if found is None else (found, values[0])
+
+    def usually(self, figure: Figure) -> str:
+        """Say what is usual: `4 (3 to 6)`; nothing if there are too few days."""
+        found = self.known(figure)
+        return "" if found is None else found[1].spread(*found[0])
+
+    def change(self, figure: Figure, day: Day) -> str:
+        """Say in a word or two what is not as on any earlier day; nothing if all is as usual."""
+        value, found = figure.value(day), self.known(figure)
+        if value is None or found is None or not day.comparable(figure.name):
+            return ""
+        return _CHANGES.get((type(value), compared(value, found[0])), "")
+
+    @property
+    def too_few(self) -> str:
+        """Say that there is too little to compare with."""
+        number = len(self.earlier)
+        there = {0: "no day", 1: "only 1 day"}.get(number, f"only {number} days")
+        return (
+            f"Not compared with other days: of the {DAYS} days before, {there} could be used; "
+            f"{FEWEST} are needed that were heard for the most part, with their night."
+        )

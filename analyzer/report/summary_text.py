@@ -1,0 +1,198 @@
+"""The gist of a report, and what was not heard, in sentences."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from hearthlog.analyzer.logs.health import Trouble
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.spans import joined, without
+from hearthlog.analyzer.report.class_words import (
+    clock_text,
+    in_words,
+    listed,
+    several_in_words,
+    short_day,
+)
+from hearthlog.analyzer.report.daily_metrics import HOUR, Day
+from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.sections import Figure, events_of, sections
+from hearthlog.analyzer.report.values import Minutes
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER
+
+_SHOWN = 4  # changes in one sentence
+_MOST = 6  # kinds of gaps, or of trouble
+_MINUTE = HOUR // 60
+
+
+def gist_of_day(account: Account, day: Day) -> Iterator[str]:
+    """Say in a few lines what matters."""
+    heard = Minutes(day.heard.length / _MINUTE).text
+    yield f"Heard: {heard} of the day ({percent(day.share)}). {_loudest(day)}"
+    yield _changes(account, day)
+    if day.night_hours:
+        yield _night(day)
+    if day.first is not None and day.last is not None:
+        yield f"Lively from {day.first.text} to {day.last.text}. {longest_quiet(day)}".strip()
+
+
+def gist_of_week(account: Account) -> Iterator[str]:
+    """Say in a few lines what matters."""
+    heard = [day for day in account.days if day.heard.length]
+    share = sum(day.heard.length for day in heard) / sum(day.span.length for day in account.days)
+    yield f"Heard: {len(heard)} of {len(account.days)} days, {percent(share)} of the time."
+    if not account.comparable:
+        yield account.too_few
+        return
+    changes = {day.day: list(_changed(account, day)) for day in heard}
+    if not any(changes.values()):
+        yield f"Nothing was outside of what was heard on the {len(account.earlier)} days before."
+        return
+    yield f"Not as on any of the {len(account.earlier)} days before this week:"
+    for day, found in changes.items():
+        if found:
+            yield f"{short_day(day)}: {_few(found)}."
+
+
+def not_heard(account: Account) -> Iterator[str]:
+    """State how much was not heard, and why; the first line says how much in all."""
+    length = sum(day.span.length for day in account.days)
+    missing = length - sum(day.heard.length for day in account.days)
+    if missing >= _MINUTE:
+        text = Minutes(missing / _MINUTE).text
+        yield f"Not heard: {text} ({percent(missing / length)}). The report knows nothing of it."
+    for microphone, hours in account.unheard.items():
+        if hours * HOUR > missing + _MINUTE:  # another one heard
+            text = Minutes(hours * 60).text
+            yield f"The microphone {plain(microphone)} heard nothing for {text}."
+    if (unsaid := _unexplained(account)) >= _MINUTE:
+        text = Minutes(unsaid / _MINUTE).text
+        yield f"Nothing was recorded for {text}: the recorder was off, or its logs are not here."
+    for reason, same in _by_lasting(account.gaps, lambda gap: gap.text):
+        yield f"{reason[:1].upper()}{reason[1:]}: {_when(account, same)}."
+    if account.unread:
+        logs = "1 log" if account.unread == 1 else f"{account.unread} logs"
+        yield f"{logs} could not be read, or only in part."
+
+
+def not_well(account: Account) -> Iterator[str]:
+    """State what the box said of itself, where gaps do not say it already."""
+    told = {gap.text for gap in account.gaps}
+    troubles = [trouble for trouble in account.troubles if trouble.text not in told]
+    if troubles:
+        yield "The box reported trouble; have it looked at if this goes on."
+    for name, same in _by_lasting(troubles, lambda t: f"{t.source.split(': ')[-1]}: {t.text}"):
+        yield f"{plain(name)}: {_when(account, same)}."
+
+
+def longest_quiet(day: Day) -> str:
+    """Say when the longest quiet stretch of the day was."""
+    quiet = day.longest_quiet
+    if day.quiet is None or day.quiet.minutes < 1:
+        return ""
+    start, end = (clock_text(int(edge[0]), day.zone) for edge in quiet)
+    return f"Longest quiet stretch by day: {day.quiet.text}, {start} to {end}."
+
+
+def percent(share: float) -> str:
+    """Write a share."""
+    if 0 < share < 0.005:
+        return "less than 1 %"
+    return "more than 99 %" if 0.995 <= share < 1 else f"{100 * share:.0f} %"
+
+
+def plain(name: str) -> str:
+    """Write a name as people do."""
+    return name.replace("_", " ")
+
+
+def _loudest(day: Day) -> str:
+    names = [name for name in day.home.classes if name != SILENCE]
+    lasting = ((minutes.minutes, name) for name in names if (minutes := day.minutes(name)))
+    most = [
+        in_words(name).lower() for minutes, name in sorted(lasting, reverse=True) if minutes >= 1
+    ]
+    return f"Most of the sound: {listed(most[:3])}." if most else "It was quiet."
+
+
+def _changes(account: Account, day: Day) -> str:
+    if not account.comparable:
+        return account.too_few
+    if not any(map(day.comparable, account.classes)):
+        return "Too little was heard to compare it with other days."
+    number = len(account.earlier)
+    changes = list(_changed(account, day))
+    if not changes:
+        return f"As usual: nothing was outside of what was heard on the last {number} days."
+    return f"Not as on any of the last {number} days: {_few(changes)}."
+
+
+def _few(changes: Sequence[str]) -> str:
+    more = len(changes) - _SHOWN
+    return "; ".join(changes[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+def _changed(account: Account, day: Day) -> Iterator[str]:
+    for figure, where in _figures(day):
+        change, value = account.change(figure, day), figure.value(day)
+        if change and value is not None:
+            usually = account.usually(figure)
+            yield f"{figure.title.lower()}{where} {change}, {value.text}, usually {usually}"
+
+
+def _figures(day: Day) -> Iterator[tuple[Figure, str]]:
+    """Go through the figures, what matters most first; a class is named once."""
+    about = sections(day.home.classes)
+    for section in sorted(about, key=lambda section: section.title != "Night"):
+        for figure in section.figures:
+            yield figure, " in the night" if section.title == "Night" else ""
+    for name in day.home.classes:
+        if name not in (SILENCE, FLUSHING_WATER, SHOWER, TAP_WATER):
+            yield events_of(name), ""
+
+
+def _night(day: Day) -> str:
+    parts = []
+    for name in (FLUSHING_WATER, COUGHING):
+        count = day.night_count(name)
+        if count is not None:
+            parts.append(f"{several_in_words(name).lower()} {count.text}")
+    parts.append(f"{day.night_sound.text} of sound in all")
+    partly = "" if day.night_hours > 8.5 else f" Only {day.night_hours:.1f} hours of it were heard."
+    return f"Night before, 22:00 to 07:00: {'; '.join(parts)}.{partly}"
+
+
+def _unexplained(account: Account) -> int:
+    """Return how long nothing was heard without a gap that says why, in nanoseconds."""
+    starts = np.array([gap.start for gap in account.gaps], np.int64)
+    ends = np.array([gap.end for gap in account.gaps], np.int64)
+    said = joined(starts, ends)
+    missing = (without(without(day.span, day.heard), said) for day in account.days)
+    return sum(spans.length for spans in missing)
+
+
+def _by_lasting(
+    troubles: Iterable[Trouble], name: Callable[[Trouble], str]
+) -> list[tuple[str, list[Trouble]]]:
+    """Put together what has one name; what lasted longest comes first."""
+    found: dict[str, list[Trouble]] = {}
+    for trouble in troubles:
+        found.setdefault(name(trouble), []).append(trouble)
+    return sorted(found.items(), key=lambda pair: (-_lasting(pair[1]), pair[0]))[:_MOST]
+
+
+def _lasting(troubles: Sequence[Trouble]) -> int:
+    return sum(trouble.end - trouble.start for trouble in troubles)
+
+
+def _when(account: Account, troubles: Sequence[Trouble]) -> str:
+    """Say when and for how long: `12 min, once (03:10 to 03:22)`."""
+    how_often = "once" if len(troubles) == 1 else f"{len(troubles)} times"
+    shown = []
+    for trouble in sorted(troubles, key=lambda trouble: trouble.start)[:3]:
+        times = dict.fromkeys(clock_text(t, account.zone) for t in (trouble.start, trouble.end))
+        day = local_time(trouble.start, account.zone).date()
+        shown.append((f"{short_day(day)} " if len(account.days) > 1 else "") + " to ".join(times))
+    more = " …" if len(troubles) > len(shown) else ""
+    length = Minutes(_lasting(troubles) / _MINUTE).text
+    return f"{length}, {how_often} ({', '.join(shown)}{more})"

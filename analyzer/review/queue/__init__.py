@@ -1,0 +1,1 @@
+"""What to review next: uncertain, novel, where two labellings differ."""

@@ -1,0 +1,163 @@
+"""Lists of spans to be reviewed, as CSV."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.evaluation.difference import Difference
+from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.analyzer.review.queue.ranking import Queue
+from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import new_file
+from hearthlog.schemas.messages.topics import check_microphone_name
+from hearthlog.schemas.times import read_time, time_text
+
+MOST_SPANS = 100_000
+REASONS = ("uncertainty", "disagreement", "novelty")
+_SIZE_LIMIT = 64 << 20
+_LATEST = 1 << 62  # nanoseconds
+_LABELLING = re.compile(r"live|review|relabel/\w{1,200}", re.ASCII)
+_NUMBER = re.compile(r"[0-9]{1,3}(\.[0-9]{1,20})?")
+
+
+class Span(NamedTuple):
+    """A span of time to be reviewed, and why.
+
+    Attributes
+    ----------
+    microphone : str
+    start, end : int
+        Nanoseconds of UTC.
+    a, label_a : str
+        A labelling (`live`, `review`, `relabel/<model>`), and what it says the longest.
+    b, label_b : str
+        Another one; both are empty if there is none, the label where it says nothing.
+    score : float or None
+        None where nothing was ranked.
+    reason : str
+        One of `REASONS`.
+    """
+
+    microphone: str
+    start: int
+    end: int
+    a: str
+    label_a: str
+    b: str
+    label_b: str
+    score: float | None
+    reason: str
+
+    def as_text(self) -> dict[str, str | float | None]:
+        """Return the fields, the times as text."""
+        return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
+
+
+def disagreements(difference: Difference, microphone: str) -> list[Span]:
+    """List where two labellings differ: the longest first, at most `MOST_SPANS`."""
+    a, b, classes = difference.a, difference.b, difference.classes
+    rows = zip(*(column[:MOST_SPANS].tolist() for column in difference.disagreements), strict=True)
+    return [
+        Span(microphone, start, end, a, classes[i], b, classes[j], None, "disagreement")
+        for start, end, i, j in rows
+    ]
+
+
+def queued(queue: Queue, microphone: str, a: str, b: str = "") -> list[Span]:
+    """List what is to be reviewed of labelling a, in that order; the reason is what weighs most."""
+    most = np.argmax(queue.weighted, axis=0).tolist()
+    columns = queue.windows.starts, queue.windows.ends, queue.scores.round(3)
+    rows = zip(
+        *(column.tolist() for column in columns), queue.labels, queue.others, most, strict=True
+    )
+    return [
+        Span(microphone, start, end, a, label, b, other, score, REASONS[reason])
+        for start, end, score, label, other, reason in rows
+    ]
+
+
+def write_list(path: Path, spans: Sequence[Span]) -> None:
+    """Write spans as CSV that `read_list` reads again, in the same order.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    spans : sequence of Span
+        At most `MOST_SPANS`.
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
+    assert len(spans) <= MOST_SPANS
+    lines = [",".join(Span._fields)]
+    for span in spans:
+        fields = span.as_text().values()
+        lines.append(",".join("" if value is None else str(value) for value in fields))
+    with new_file(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines), "utf-8", newline="\n")
+
+
+def read_list(path: Path) -> list[Span]:
+    """Read a list of spans.
+
+    Raises
+    ------
+    DataError
+        With file and line, if it is none.
+    """
+    header: list[str] = []
+    spans: list[Span] = []
+    for number, record in csv_records(path, read_text(path, "list of spans", _SIZE_LIMIT)):
+        where = f"{path}:{number}"
+        if not header:
+            header = [name.strip() for name in record]
+            if header != list(Span._fields):
+                names = ",".join(Span._fields)
+                raise DataError(f"{where}: the first line must name the columns: {names}")
+        elif len(record) != len(header):
+            raise DataError(f"{where}: has {len(record)} fields, not {len(header)}")
+        elif len(spans) == MOST_SPANS:
+            raise DataError(f"{where}: has more than {MOST_SPANS} spans; nobody can review them")
+        else:
+            spans.append(_span(where, [field.strip() for field in record]))
+    if not spans:
+        raise DataError(f"{path}: is no list of spans, or an empty one")
+    return spans
+
+
+def _span(where: str, fields: Sequence[str]) -> Span:
+    microphone, start, end, a, label_a, b, label_b, score, reason = fields
+    try:
+        check_microphone_name(microphone if len(microphone) <= 100 else f"{microphone[:64]}…")
+    except LogError as error:
+        raise DataError(f"{where}: {error}") from error
+    for labelling, label in ((a, label_a), *([(b, label_b)] if b or label_b else [])):
+        if not _LABELLING.fullmatch(labelling):
+            raise DataError(f"{where}: {labelling[:64]!r} is no labelling")
+        if not CLASS_NAME.fullmatch(label) and (labelling, label) != (b, ""):
+            raise DataError(f"{where}: {label[:64]!r} cannot be the name of a class")
+    if reason not in REASONS:
+        raise DataError(f"{where}: {reason[:64]!r} is no reason: use {', '.join(REASONS)}")
+    if score and not _NUMBER.fullmatch(score):
+        raise DataError(f"{where}: {score[:64]!r} is no score")
+    first, last = _time(where, start), _time(where, end)
+    if not 0 <= first < last <= _LATEST:
+        raise DataError(f"{where}: {start[:40]} to {end[:40]} is no span of time")
+    return Span(
+        microphone, first, last, a, label_a, b, label_b, float(score) if score else None, reason
+    )
+
+
+def _time(where: str, text: str) -> int:
+    try:
+        return read_time(text)
+    except (ValueError, OverflowError) as error:
+        raise DataError(f"{where}: {text[:64]!r} is no time such as 2026-03-01T07:00:00") from error

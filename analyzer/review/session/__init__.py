@@ -1,0 +1,1 @@
+"""A review: what keys do, and the marks they make."""

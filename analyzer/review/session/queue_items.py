@@ -1,0 +1,80 @@
+"""What is to be gone through: what a queue finds, or a list that `diff` made."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.labellings import REVIEW, Sources
+from hearthlog.analyzer.review.queue.ranking import RANKINGS, make_queue
+from hearthlog.analyzer.review.queue.review_list import Span, queued, read_list
+from hearthlog.analyzer.review.session.session import Item
+
+Limits = tuple[int | None, int | None]
+
+
+def queue_items(
+    wanted: str, sources: Sources, labelled: tuple[str, str], limits: Limits, count: int
+) -> list[Item]:
+    """Choose spans of a labelling that are to be reviewed.
+
+    Parameters
+    ----------
+    wanted : str
+        One of `analyzer.diff.queue.RANKINGS`, or the name of a list that `hearthlog diff` made.
+    sources : Sources
+    labelled : (str, str)
+        The microphone, and the labelling: `live`, or `relabel/` and a model.
+    limits : (int or None, int or None)
+        In nanoseconds of UTC.
+    count : int
+        How many, at most.
+
+    Raises
+    ------
+    DataError
+        If there is nothing to review, or no such list.
+    """
+    microphone, labelling = labelled
+    if wanted not in RANKINGS:
+        if not wanted.endswith(".csv"):
+            known = ", ".join(RANKINGS)
+            raise DataError(f"--queue {wanted[:64]}: use {known}, or a list *.csv of `diff --list`")
+        return _items(_listed(Path(wanted), microphone, limits)[:count])
+    side = sources.read(microphone, labelling, *limits)
+    others = [name for name in sources.names(microphone) if name not in {labelling, REVIEW}]
+    if wanted == "disagreeing" and not others:
+        raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
+    other = sources.read(microphone, others[0], *limits) if others else None
+    found = make_queue(
+        sources,
+        microphone,
+        side,
+        other=other,
+        marks=sources.marks(microphone, *limits),
+        count=count,
+        ranking=wanted,
+    )
+    return _items(queued(found, microphone, labelling, "" if other is None else other.name))
+
+
+def _listed(path: Path, microphone: str, limits: Limits) -> list[Span]:
+    start, end = limits
+    found = [
+        span
+        for span in read_list(path)
+        if span.microphone == microphone
+        and (start is None or span.end > start)
+        and (end is None or span.start < end)
+    ]
+    if not found:
+        raise DataError(f"{path}: lists nothing of {microphone} in these logs")
+    return found
+
+
+def _items(spans: Iterable[Span]) -> list[Item]:
+    return [Item(span.start, span.end, span.label_a, _text(span)) for span in spans]
+
+
+def _text(span: Span) -> str:
+    other = f", {span.b}: {span.label_b or 'nothing'}" if span.b else ""
+    return f"{span.a}: {span.label_a}{other} ({span.reason})"

@@ -1,0 +1,268 @@
+"""A reviewer at a viewer: keys in, marks out."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import tzinfo
+from queue import Empty, SimpleQueue
+from typing import NamedTuple, Protocol
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.analyzer.review.session.marking import Marking
+from hearthlog.analyzer.review.timeline.contents import Spans
+from hearthlog.models.classes import UNKNOWN
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.times import NANOSECONDS
+
+_POLL_SECONDS = 0.3
+_LEAST_MARGIN = 20 * NANOSECONDS
+_AROUND = 600 * NANOSECONDS
+_CLASS_KEYS = "1234567890eghijklmorstvwxy"
+_HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
+
+
+class Item(NamedTuple):
+    """A span that is to be reviewed.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    label : str
+        What it is labelled, the longest; this is what is accepted.
+    text : str
+        What else there is to say.
+    """
+
+    start: int
+    end: int
+    label: str
+    text: str
+
+
+class Screen(Protocol):
+    """What a session asks of a viewer; all may raise ConnectionError or TimeoutError."""
+
+    def is_open(self) -> bool:
+        """Tell whether it is still there."""
+
+    def selection(self) -> tuple[int, int] | None:
+        """Return the span that is marked with the mouse."""
+
+    def cursor(self) -> int | None:
+        """Return where the time cursor is."""
+
+    def show(self, start: int, end: int, margin: int) -> None:
+        """Mark a span, and show it with a margin."""
+
+    def play(self, start: int) -> None:
+        """Let the time cursor run from a time on."""
+
+    def redraw_marks(self, microphone: str, marks: Spans) -> None:
+        """Show marks as they are now."""
+
+
+@dataclass
+class Session:
+    """What keys do.
+
+    Parameters
+    ----------
+    screen : Screen
+    marking : Marking
+    classes : sequence of str
+        That get a key.
+    zone : tzinfo
+        Of the home, for what is said.
+    say : callable
+        Takes a line for the reviewer.
+    look_closely : callable
+        Draws a span (start, end) at the resolution of its frames.
+    listen : callable
+        Plays the sound of a span, if it was kept; returns what there is to say about it.
+    items : sequence of Item
+        What is to be gone through; empty where the reviewer chooses spans.
+    """
+
+    screen: Screen
+    marking: Marking
+    classes: Sequence[str]
+    zone: tzinfo
+    say: Callable[[str], None]
+    look_closely: Callable[[int, int], None]
+    listen: Callable[[int, int], str]
+    items: Sequence[Item] = ()
+    _at: int = -1
+    _marked: int = 0
+    _began: float = 0.0
+    _begin: int | None = None  # of a span whose end is not set yet
+
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """List the keys, and what they do."""
+        queued = bool(self.items)
+        keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
+        keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
+        keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
+        keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
+        return [*keys, ("q", "quit")]
+
+    def run(self, keys: "SimpleQueue[str]") -> int:
+        """Do what keys say until the reviewer quits, closes the viewer, or is through.
+
+        Returns
+        -------
+        int
+            How many spans were marked.
+        """
+        self._began = time.monotonic()
+        self._redraw()
+        self.say(f"{_HELP} press a key")
+        if self.items:
+            self._go(1)
+        while self.screen.is_open() and self._at < max(len(self.items), 1):
+            try:
+                key = keys.get(timeout=_POLL_SECONDS)
+            except Empty:
+                continue
+            if key == "q":
+                break
+            self.press(key)
+        self._conclude()
+        return self._marked
+
+    def press(self, key: str) -> None:
+        """Do what one key says; what cannot be done is said, and nothing is lost."""
+        try:
+            self._press(key)
+        except HearthlogError as error:
+            self.say(str(error))
+        except (ConnectionError, TimeoutError):
+            self.say("the viewer did not answer, and nothing was done; press the key again")
+
+    def _press(self, key: str) -> None:
+        labels = dict(zip(_CLASS_KEYS, self.classes, strict=False)) | {"u": UNKNOWN}
+        actions: dict[str, Callable[[], None]] = {
+            "d": lambda: self._mark(self.marking.delete),
+            "z": self._undo,
+            "p": self._play,
+            "[": self._begin_here,
+            "]": self._end_here,
+        }
+        if self.items:
+            actions |= {
+                "a": lambda: self._mark_as(self.items[self._at].label),
+                "n": lambda: self._go(1),
+                " ": lambda: self._go(1),
+                "b": lambda: self._go(-1),
+            }
+        else:
+            actions |= {"c": lambda: self._mark(self.marking.confirm), "f": self._look_around}
+        if key in labels:
+            self._mark_as(labels[key])
+        elif key in actions:
+            actions[key]()
+        elif key.strip():
+            self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
+
+    def _mark_as(self, label: str) -> None:
+        self._mark(lambda start, end: self.marking.mark(start, end, label))
+
+    def _mark(self, change: Callable[[int, int], list[Mark]]) -> None:
+        start, end = self._chosen()
+        made = change(start, end)
+        self._marked += 1
+        labels = ", ".join(dict.fromkeys(mark.label for mark in made)) or "no mark"
+        self.say(f"{self._text(start, end)}  {labels}")
+        self._redraw()
+        if self.items:
+            self._go(1)
+
+    def _undo(self) -> None:
+        span = self.marking.undo()
+        if span is None:
+            self.say("nothing to undo")
+            return
+        self._marked -= 1
+        self.say(f"{self._text(*span)}  undone")
+        self._redraw()
+
+    def _redraw(self) -> None:
+        marks = self.marking.marks()
+        with self._unless_silent():
+            self.screen.redraw_marks(self.marking.microphone, marks)
+
+    @contextmanager
+    def _unless_silent(self) -> Iterator[None]:
+        """Say that the viewer does not show what was done."""
+        try:
+            yield
+        except (ConnectionError, TimeoutError):
+            self.say("the viewer did not answer: what was done is done, but not shown")
+
+    def _play(self) -> None:
+        start, end = self._chosen()
+        self.say(self.listen(start, end))
+        self.screen.play(start)
+
+    def _look_around(self) -> None:
+        cursor = self._cursor()
+        self.look_closely(cursor - _AROUND, cursor + _AROUND)
+        self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
+
+    def _begin_here(self) -> None:
+        self._begin = self._cursor()
+        self.say(f"from {local_time(self._begin, self.zone):%H:%M:%S}; set the end with ]")
+
+    def _end_here(self) -> None:
+        selection = self.screen.selection()
+        start = self._begin if self._begin is not None else selection and selection[0]
+        end = self._cursor()
+        if start is None or start >= end:
+            raise DataError("a span ends after it begins: put the cursor where it begins, press [")
+        self._begin = None
+        self.screen.show(start, end, _margin(start, end))
+        self.say(self._text(start, end))
+
+    def _cursor(self) -> int:
+        cursor = self.screen.cursor()
+        if cursor is None:
+            raise DataError("there is no time cursor; click on the time axis first")
+        return cursor
+
+    def _chosen(self) -> tuple[int, int]:
+        item = self.items[self._at] if self.items else None
+        span = self.screen.selection() or (item and (item.start, item.end))
+        if span is None:
+            raise DataError(f"no span is marked: {_HELP} press a key")
+        return span
+
+    def _go(self, step: int) -> None:
+        """Show the next or the last span of the queue."""
+        self._at = max(self._at + step, 0)
+        if self._at >= len(self.items):
+            return
+        item = self.items[self._at]
+        self.say(
+            f"{self._at + 1}/{len(self.items)}  {self._text(item.start, item.end)}  {item.text}"
+        )
+        margin = _margin(item.start, item.end)
+        with self._unless_silent():
+            self.look_closely(item.start - margin, item.end + margin)
+            self.screen.show(item.start, item.end, margin)
+
+    def _text(self, start: int, end: int) -> str:
+        length = (end - start) / NANOSECONDS
+        return f"{local_time(start, self.zone):%a %d %b %H:%M:%S} + {length:.1f} s"
+
+    def _conclude(self) -> None:
+        minutes = (time.monotonic() - self._began) / 60
+        spans = "1 span" if self._marked == 1 else f"{self._marked} spans"
+        self.say(f"{spans} marked in {minutes:.1f} min, {self._marked / minutes:.1f} a minute")
+
+
+def _margin(start: int, end: int) -> int:
+    return max(_LEAST_MARGIN, (end - start) // 2)

@@ -1,0 +1,45 @@
+"""What was kept of a span of time, to be heard."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.review.timeline.contents import Clip
+from hearthlog.schemas.times import NANOSECONDS
+
+Float32 = NDArray[np.float32]
+
+
+def listen(clips: Sequence[Clip], start: int, end: int) -> str:
+    """Play what was kept of a span of time, without waiting for its end.
+
+    Returns
+    -------
+    str
+        What there is to say about it.
+    """
+    rate, samples = sound_of(clips, start, end)
+    if not len(samples):
+        return "no sound of this span was kept"
+    try:
+        import sounddevice  # noqa: PLC0415 - few reviews have sound, and PortAudio may be missing
+
+        sounddevice.play(samples, rate)
+    except (OSError, ValueError, RuntimeError) as error:
+        return f"the sound cannot be played here ({error})"
+    return f"playing {len(samples) / rate:.1f} s"
+
+
+def sound_of(clips: Sequence[Clip], start: int, end: int) -> tuple[int, Float32]:
+    """Return the rate and the samples of what was kept of a span of time, one after the other.
+
+    What is of another rate than the first is left out.
+    """
+    parts, rate = [np.empty(0, np.float32)], 0
+    for clip in clips:
+        if clip.start < end and clip.end > start and rate in {0, clip.rate}:
+            rate = clip.rate
+            first, last = ((t - clip.start) * rate // NANOSECONDS for t in (start, end))
+            parts.append(clip.samples[max(first, 0) : max(last, 0)])
+    return rate, np.concatenate(parts)

@@ -1,0 +1,104 @@
+"""What a timeline takes of logs: topics, fields, and what is made of them."""
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hearthlog.analyzer.review.timeline.contents import Clip, Frames, Spans, no_spans
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
+
+TOPIC = re.compile(
+    r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"
+    r"(?P<kind>features|label|segment|gap)",
+    re.ASCII,
+)
+FIELDS = {
+    message_types.FEATURES: ("header.stamp", "values"),
+    message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
+    message_types.SEGMENT: ("header.stamp", "duration", "label"),
+    message_types.GAP: ("header.stamp", "duration", "reason"),
+    message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
+    message_types.LOG: ("stamp", "level", "msg"),
+}
+_MOST_NAMES = 256
+_QUIETEST = 1e-10  # of a mean square: -100 dB
+
+
+def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
+    """Return the names behind an array, by the channel."""
+    where = f"{path}: {columns.topic}"
+    try:
+        names: Any = json.loads(columns.metadata.get(f"{field_}_names", ""))
+        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
+    except (ValueError, TypeError, RecursionError):
+        names = None
+    if not isinstance(names, list) or not names:
+        raise LogError(f"{where}: the channel does not name its values")
+    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
+        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
+    if columns[field_].shape[1:] != (len(names),):
+        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
+    return tuple(names)
+
+
+def decibel(energy: Any) -> Any:
+    """Return the level of a mean square, in dB relative to full scale."""
+    return 10 * np.log10(np.maximum(energy, _QUIETEST))
+
+
+def spans_of(columns: Columns, text: str) -> Spans:
+    """Return the spans that segments or gaps are about; `text` is the field that is shown."""
+    starts = columns["header.stamp"]
+    return Spans(starts, starts + columns["duration"], columns[text])
+
+
+def runs(parts: Sequence[Frames], after: int) -> Iterator[Spans]:
+    """Join successive frames whose most probable class is the same, from some time on."""
+    for names, all_times, all_values in parts:
+        later = all_times >= after
+        times, values = all_times[later], all_values[later]
+        if not len(times):
+            continue
+        best = values.argmax(axis=1)
+        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
+        first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
+        last = np.append(first[1:], len(times)) - 1
+        texts = np.array(names, object)[best[first]]
+        yield Spans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+
+
+def lasting(troubles: Sequence[tuple[int, str]], end: int) -> Spans:
+    """Let a trouble last until the next message says that it is over, or that it is another."""
+    changes = [
+        (stamp, text)
+        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
+        if text != before
+    ]
+    stops = [*(stamp for stamp, _ in changes[1:]), end]
+    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
+    if not spans:
+        return no_spans()
+    starts, ends, texts = zip(*spans, strict=True)
+    return Spans(np.array(starts), np.array(ends), np.array(texts, object))
+
+
+def chained(parts: Sequence[Clip]) -> list[Clip]:
+    """Join what follows each other."""
+    clips: list[list[Clip]] = []
+    for part in sorted(parts, key=lambda clip: clip.start):
+        last = clips[-1][-1] if clips else None
+        if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
+            clips[-1].append(part)
+        else:
+            clips.append([part])
+    return [
+        Clip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
+        for run in clips
+    ]

@@ -1,0 +1,64 @@
+"""A timeline in a file that Rerun's viewer opens."""
+
+from pathlib import Path
+
+import rerun as rr
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.timeline.contents import Timeline
+from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.analyzer.review.viewer.drawing import APPLICATION, Layout, draw, draw_frames
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import check_new, new_file
+from hearthlog.schemas.times import time_text
+
+SUFFIX = ".rrd"
+
+
+def check_output(output: Path) -> None:
+    """Raise DataError unless a recording can be saved under this name."""
+    if output.suffix != SUFFIX:
+        raise DataError(f"{output}: the name of a Rerun recording must end in {SUFFIX}")
+    try:
+        check_new(output)
+    except LogError as error:
+        raise DataError(str(error)) from error
+
+
+def save_timeline(timeline: Timeline, output: Path) -> None:
+    """Write a timeline into a Rerun recording (`.rrd`).
+
+    Nothing is sent: Rerun's usage statistics, and the port it opens, are its viewer's.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    output : Path
+        Must not exist.
+
+    Raises
+    ------
+    DataError
+        If it cannot be written.
+    """
+    check_output(output)
+    try:
+        with new_file(output) as temporary, temporary.open("wb") as file:
+            rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+            recording = rr.RecordingStream(APPLICATION)
+            stream = rr.binary_stream(recording)  # for `save` waits for ever where the disk is full
+            recording.send_blueprint(Layout(timeline))
+            canvas = Canvas(recording)
+            name_recording(recording, timeline)
+            draw(timeline, canvas)
+            draw_frames(timeline, canvas)
+            file.write(stream.read() or b"")
+    except LogError as error:
+        raise DataError(str(error)) from error
+
+
+def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
+    """Say when a recording begins, and call it by its span."""
+    start, end = timeline.grid.start, timeline.grid.end
+    recording.send_recording_start_time_nanos(start)
+    recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")

@@ -1,0 +1,245 @@
+"""A viewer that shows a timeline, and tells what its user has marked with the mouse."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+import rerun as rr
+
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.timeline.contents import Spans, Timeline
+from hearthlog.analyzer.review.timeline.lanes import changes
+from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.analyzer.review.viewer.drawing import (
+    APPLICATION,
+    SHARED_AXIS,
+    Layout,
+    draw,
+    draw_close_up,
+    draw_frames,
+    review_lanes,
+)
+from hearthlog.analyzer.review.viewer.file import name_recording
+from hearthlog.analyzer.review.viewer.process import Process
+
+_PANEL = "/time_panel"
+_WAIT_SECONDS = 60
+_FLUSH_SECONDS = 30.0
+
+Blueprint = dict[str, Any]
+
+
+class State(NamedTuple):
+    """What a viewer says of itself.
+
+    Attributes
+    ----------
+    version : str
+    views : int
+        That there are.
+    errors : list of str
+        That they report.
+    cursor : int or None
+        Where the time cursor is, in nanoseconds of UTC.
+    """
+
+    version: str
+    views: int
+    errors: list[str]
+    cursor: int | None
+
+
+class Control(Protocol):
+    """How to speak with one kind of viewer; all raise ConnectionError or TimeoutError."""
+
+    process: Process
+
+    def state(self) -> State:
+        """Ask what it shows."""
+
+    def blueprint(self) -> Blueprint:
+        """Ask for its blueprint, which has what the user marked."""
+
+    def set_blueprint(self, blueprint: Blueprint) -> None:
+        """Replace its blueprint."""
+
+    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+        """Put its cursor on a time."""
+
+    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+        """Offer buttons, where it can."""
+
+    def say(self, text: str) -> None:
+        """Show a line, where it can."""
+
+    def close(self) -> None:
+        """Stop it."""
+
+
+class Viewer:
+    """A viewer in a window or in a browser.
+
+    Parameters
+    ----------
+    control : Control
+    address : str
+        What is to be opened to see it; empty if it opens itself.
+    """
+
+    def __init__(self, control: Control, address: str = "") -> None:
+        self.address = address
+        self._control = control
+        self._recording = rr.RecordingStream(APPLICATION)
+        self._canvas = Canvas(self._recording)
+        self._times: dict[str, set[int]] = {}  # of changes in review lanes
+        self._sent = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._sent and self.is_open():
+            self._recording.disconnect()
+        self._control.close()
+
+    def is_open(self) -> bool:
+        """Tell whether it is still there; somebody may have closed it."""
+        return self._control.process.is_running()
+
+    def check(self) -> None:
+        """Raise DataError if it ended because it could not go on."""
+        self._control.process.check()
+
+    def draw(self, timeline: Timeline, *, close_up: bool) -> None:
+        """Show a timeline, whose spans can be marked.
+
+        Parameters
+        ----------
+        timeline : Timeline
+        close_up : bool
+            Whether its spans are to be looked at one by one.
+
+        Raises
+        ------
+        DataError
+            If the viewer has ended.
+        """
+        process = self._control.process
+        process.wait_until_it_listens()
+        rr.set_strict_mode(True)
+        self._sent = True
+        layout = Layout(timeline, marking=True, close_up=close_up)
+        self._recording.connect_grpc(process.url, default_blueprint=layout)
+        name_recording(self._recording, timeline)
+        draw(timeline, self._canvas)
+        self._flush()
+
+    def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
+        """Show every single frame of a span of it, to be zoomed into."""
+        draw_frames(timeline, self._canvas, start, end)
+        self._flush()
+
+    def draw_close_up(self, timeline: Timeline) -> None:
+        """Show a short span of it at the resolution of its frames."""
+        draw_close_up(timeline, self._canvas)
+        self._flush()
+
+    def redraw_marks(self, microphone: str, marks: Spans) -> None:
+        """Show marks as they are now."""
+        times, states = changes(marks)
+        known = self._times.setdefault(microphone, set())
+        known |= set(times.tolist())
+        if not known:
+            return
+        # A later row wins over an earlier one of the same time, and none can be taken away.
+        every = np.array(sorted(known))
+        places = np.searchsorted(times, every, side="right") - 1
+        now = [states[place] if place >= 0 else None for place in places.tolist()]
+        colours = {label: colour(label) for label in sorted(set(marks.texts))}
+        for entity in review_lanes(microphone):
+            self._canvas.configure_lane(entity, colours)
+            self._canvas.change_states(entity, every, now)
+        self._flush()
+
+    def wait_until_drawn(self) -> State:
+        """Wait until it shows what was sent to it; for a page, until somebody opens it.
+
+        Raises
+        ------
+        DataError
+            If it ends instead, takes too long, or is of another version than the package.
+        """
+        deadline = time.monotonic() + _WAIT_SECONDS
+        while self.address or time.monotonic() < deadline:
+            try:
+                state = self.state()
+            except (ConnectionError, TimeoutError):
+                if not self.is_open():
+                    raise self._control.process.failed() from None
+                time.sleep(0.05)
+                continue
+            check_version(state.version)
+            if state.views:
+                return state
+            time.sleep(0.05)
+        raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
+
+    def state(self) -> State:
+        """Ask what it shows; raises ConnectionError or TimeoutError."""
+        return self._control.state()
+
+    def selection(self) -> tuple[int, int] | None:
+        """Return the span that is marked on the time ruler, in nanoseconds of UTC."""
+        panel = self._control.blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
+        return _span(panel.get("time_selection"))
+
+    def cursor(self) -> int | None:
+        """Return where the time cursor is, in nanoseconds of UTC."""
+        return self.state().cursor
+
+    def show(self, start: int, end: int, margin: int) -> None:
+        """Mark a span, let the time axes show it and a margin, and put the cursor on its start."""
+        blueprint = self._control.blueprint()
+        panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
+        panel["time_selection"] = {"min": start, "max": end}
+        panel["play_state"] = "Paused"
+        bounds = {"start": {"Absolute": start - margin}, "end": {"Absolute": end + margin}}
+        blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
+        self._control.set_blueprint(blueprint)
+        self._control.set_time(start, play=False)
+
+    def play(self, start: int) -> None:
+        """Let the cursor run from a time on."""
+        self._control.set_time(start, play=True)
+
+    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+        """Offer buttons in its page, if it has one; each has a key and a text."""
+        self._control.offer(keys, press)
+
+    def say(self, text: str) -> None:
+        """Show a line in its page, if it has one."""
+        self._control.say(text)
+
+    def _flush(self) -> None:
+        if self.is_open():  # or it would wait for ever
+            self._recording.flush(timeout_sec=_FLUSH_SECONDS)
+
+
+def check_version(found: str) -> None:
+    """Raise DataError if a viewer is of another version than the package."""
+    if found != rr.__version__:
+        raise DataError(
+            f"the viewer is of Rerun {found or 'an unknown version'}, and hearthlog works with "
+            f"{rr.__version__}; `pip install rerun-sdk=={rr.__version__}`"
+        )
+
+
+def _span(found: Any) -> tuple[int, int] | None:
+    if not isinstance(found, Mapping):
+        return None
+    start, end = found.get("min"), found.get("max")
+    if not isinstance(start, int) or not isinstance(end, int) or start >= end:
+        return None
+    return start, end

@@ -1,0 +1,270 @@
+"""The viewer in a browser: a page of this machine that relays what is asked of it."""
+
+import json
+import queue
+import secrets
+import threading
+import urllib.request
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any, cast
+
+from hearthlog.analyzer.review.viewer import messages
+from hearthlog.analyzer.review.viewer.process import HOST, Process, free_port
+from hearthlog.analyzer.review.viewer.viewer import Blueprint, State, Viewer
+
+_POLL_SECONDS = 20.0
+_ANSWER_SECONDS = 15.0
+_LIMIT = 16 << 20  # bytes of an answer
+_VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
+
+
+@dataclass
+class Relay:
+    """What is asked of a page, and what it answered.
+
+    Attributes
+    ----------
+    keys : list of (str, str)
+        Buttons of the page: the key, and what it does.
+    press : callable
+        Takes the key that was pressed in the page.
+    """
+
+    keys: Sequence[tuple[str, str]] = ()
+    press: Callable[[str], None] = lambda _: None
+    said: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
+    asked: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
+    answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
+    _last: int = 0
+
+    def ask(self, request: bytes) -> bytes:
+        """Ask the page, and wait for its answer.
+
+        Raises
+        ------
+        TimeoutError
+            If there is none.
+        ConnectionError
+            If the viewer in the page refused.
+        """
+        self._last += 1
+        number, answer = self._last, Future[bytes]()
+        self.answers[number] = answer
+        self.asked.put((number, request))
+        try:
+            return answer.result(_ANSWER_SECONDS)
+        finally:
+            del self.answers[number]
+
+    def next(self) -> tuple[int, bytes]:
+        """Return the number and content of what is asked next; 0 if nothing is for a while."""
+        with suppress(queue.Empty):
+            while True:
+                number, request = self.asked.get(timeout=_POLL_SECONDS)
+                if number in self.answers:  # somebody still waits for it
+                    return number, request
+        return 0, b""
+
+    def answer(self, number: int, content: bytes | None) -> None:
+        """Take an answer; None if the viewer refused."""
+        waiting = self.answers.get(number)
+        if waiting is None or waiting.done():
+            return
+        if content is None:
+            waiting.set_exception(ConnectionError("the viewer in the page refused"))
+        else:
+            waiting.set_result(content)
+
+
+class _Server(ThreadingHTTPServer):
+    """Serves the page, to those who know its secret."""
+
+    daemon_threads = True
+
+    def __init__(self, port: int, relay: Relay, viewer_files: str, data: str) -> None:
+        super().__init__((HOST, port), _Handler)
+        self.relay = relay
+        self.secret = secrets.token_urlsafe(16)
+        self.viewer_files = viewer_files
+        self.data = data
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.server_port}/{self.secret}/"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers the page; every path begins with the secret."""
+
+    protocol_version = "HTTP/1.1"
+
+    @property
+    def _about(self) -> _Server:
+        return cast(_Server, self.server)
+
+    def log_message(self, *_: object) -> None:
+        """Keep quiet."""
+
+    def do_GET(self) -> None:
+        """Hand out the page, the viewer's files, and what is asked next."""
+        name = self._name()
+        if name == "":
+            page = files("hearthlog.analyzer.review.viewer").joinpath("page.html").read_bytes()
+            self._send(
+                page, "text/html; charset=utf-8", {"Content-Security-Policy": self._policy()}
+            )
+        elif name == "about":
+            relay = self._about.relay
+            about = {"data": self._about.data, "keys": list(relay.keys)}
+            self._send(json.dumps(about).encode(), "application/json")
+        elif name == "next":
+            self._send_next()
+        elif name == "text":
+            self._send_said()
+        elif name in _VIEWER_FILES:
+            self._send_viewer_file(name)
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        """Take an answer, or a key."""
+        name = self._name()
+        content = self._content()
+        relay = self._about.relay
+        if name is None or content is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        verb, _, rest = name.partition("/")
+        if verb in {"answer", "refused"} and rest.isdecimal():
+            relay.answer(int(rest[:9]), content if verb == "answer" else None)
+        elif verb == "key":
+            relay.press(content[:16].decode(errors="replace"))
+        self._send(b"", "text/plain")
+
+    def _policy(self) -> str:
+        """Let the page speak with this machine only: the viewer would send usage statistics."""
+        allowed = self._about.data.removeprefix("rerun+").removesuffix("/proxy")
+        return (
+            "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
+            f"style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' {allowed}"
+        )
+
+    def _name(self) -> str | None:
+        """Return what follows the secret; a name of another host is somebody else's page."""
+        secret, _, name = self.path.removeprefix("/").partition("/")
+        hosts = {f"{host}:{self._about.server_port}" for host in (HOST, "localhost")}
+        known = secrets.compare_digest(secret.encode(), self._about.secret.encode())
+        return name if known and self.headers.get("Host") in hosts else None
+
+    def _content(self) -> bytes | None:
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or len(length) > 9 or int(length) > _LIMIT:
+            self.close_connection = True
+            return None
+        return self.rfile.read(int(length))
+
+    def _send_next(self) -> None:
+        number, request = self._about.relay.next()
+        self._send(request, "application/octet-stream", {"Number": str(number)})
+
+    def _send_said(self) -> None:
+        try:
+            text = self._about.relay.said.get(timeout=_POLL_SECONDS)
+        except queue.Empty:
+            self._send(b"", "text/plain; charset=utf-8")
+        else:
+            self._send(text.encode(), "text/plain; charset=utf-8")
+
+    def _send_viewer_file(self, name: str) -> None:
+        kind = "text/javascript" if name.endswith(".js") else "application/wasm"
+        with urllib.request.urlopen(f"{self._about.viewer_files}/{name}") as found:  # noqa: S310
+            self._send(found.read(), kind)
+
+    def _send(self, content: bytes, kind: str, more: dict[str, str] | None = None) -> None:
+        self.send_response(HTTPStatus.OK)
+        headers = {
+            "Content-Type": kind,
+            "Content-Length": str(len(content)),
+            "Cache-Control": "no-store",
+            **(more or {}),
+        }
+        for key, value in headers.items():
+            self.send_header(key, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+
+class WebControl:
+    """Speaks with a viewer through the page that it is in.
+
+    Parameters
+    ----------
+    process : Process
+        Which hands out data and the files of the viewer.
+    server : _Server
+    """
+
+    def __init__(self, process: Process, server: _Server) -> None:
+        self.process = process
+        self.address = server.url
+        self._relay = server.relay
+        self._server = server
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+    def state(self) -> State:
+        """Ask what it shows."""
+        version, reports, cursor = messages.read_state(self._relay.ask(messages.get_state()))
+        return State(version, len(reports), [text for one in reports for text in one], cursor)
+
+    def blueprint(self) -> Blueprint:
+        """Ask for its blueprint."""
+        found: Any = json.loads(messages.read_blueprint(self._relay.ask(messages.get_blueprint())))
+        return found if isinstance(found, dict) else {}
+
+    def set_blueprint(self, blueprint: Blueprint) -> None:
+        """Replace its blueprint."""
+        self._relay.ask(messages.set_blueprint(json.dumps(blueprint)))
+
+    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+        """Put its cursor on a time."""
+        self._relay.ask(messages.set_time(nanoseconds, play=play))
+
+    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+        """Offer buttons in the page."""
+        self._relay.keys, self._relay.press = keys, press
+
+    def say(self, text: str) -> None:
+        """Show a line in the page."""
+        self._relay.said.put(text)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self.process.close()
+
+
+def open_page(port: int | None = None, data: str | None = None) -> Viewer:
+    """Serve the viewer as a page of this machine.
+
+    Parameters
+    ----------
+    port : int, optional
+    data : str, optional
+        URL of a server whose data it shows; by default it waits for what is sent to it.
+
+    Raises
+    ------
+    DataError
+        If the port is in use.
+    """
+    page, viewer_files = free_port(port), free_port()
+    process = Process(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())
+    server = _Server(page, Relay(), f"http://{HOST}:{viewer_files}", data or process.url)
+    return Viewer(WebControl(process, server), server.url)

@@ -1,0 +1,125 @@
+"""The viewer in a window of its own."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from rerun.experimental import ViewerClient
+
+from hearthlog.analyzer.review.viewer.canvas import TIMELINE
+from hearthlog.analyzer.review.viewer.process import Process, check_display, free_port
+from hearthlog.analyzer.review.viewer.viewer import Blueprint, State, Viewer
+
+_MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
+
+
+class WindowControl:
+    """Speaks with a viewer by Rerun's own client, over gRPC.
+
+    Parameters
+    ----------
+    process : Process
+    """
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self._client: ViewerClient | None = None
+
+    @property
+    def client(self) -> ViewerClient:
+        """Rerun's client, connected."""
+        if self._client is None:
+            self._client = ViewerClient.connect(self.process.url)
+        return self._client
+
+    def state(self) -> State:
+        """Ask what it shows."""
+        found = self.client.get_state()
+        errors = [
+            f"{view.name}: {report.summary}" for view in found.views for report in view.reports
+        ]
+        cursors = [
+            each.current_time
+            for each in found.recordings
+            if each.store_id == found.active_recording
+        ]
+        cursor = cursors[0] if cursors else None
+        return State(found.viewer_version or "", len(found.views), errors, cursor)
+
+    def blueprint(self) -> Blueprint:
+        """Ask for its blueprint."""
+        return self.client.get_blueprint().blueprint
+
+    def set_blueprint(self, blueprint: Blueprint) -> None:
+        """Replace its blueprint."""
+        self.client.set_blueprint(blueprint, of="recording")
+
+    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+        """Put its cursor on a time."""
+        self.client.set_time(
+            TIMELINE,
+            timestamp=np.datetime64(nanoseconds, "ns"),
+            play_state="playing" if play else "paused",
+        )
+
+    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+        """Offer nothing: keys are those of the terminal."""
+
+    def say(self, text: str) -> None:
+        """Say nothing: lines are those of the terminal."""
+
+    def close(self) -> None:
+        """Close the window."""
+        self.process.close()
+
+
+class Window(Viewer):
+    """A viewer in a window.
+
+    Parameters
+    ----------
+    process : Process
+    """
+
+    def __init__(self, process: Process) -> None:
+        self._window = WindowControl(process)
+        super().__init__(self._window)
+
+    def picture(self) -> bytes:
+        """Return what it shows, as PNG; raises ConnectionError or TimeoutError."""
+        return self._window.client.take_screenshot()
+
+
+def open_window(port: int | None = None, data: str | None = None) -> Window:
+    """Open Rerun's viewer in a window.
+
+    Parameters
+    ----------
+    port : int, optional
+    data : str, optional
+        URL of a server whose data it shows; by default it waits for what is sent to it.
+
+    Raises
+    ------
+    DataError
+        If there is no display, or the port is in use.
+    """
+    check_display(
+        "--save FILE.rrd to make a file that Rerun opens elsewhere"
+        if data is None
+        else "--serve to look from another machine"
+    )
+    return _opened(port, *(["--expect-data-soon"] if data is None else _source(data)))
+
+
+def _source(data: str) -> list[str]:
+    return ["--connect", data, "--memory-limit", _MEMORY]
+
+
+def open_hidden(port: int | None = None) -> Window:
+    """Run the same viewer without a window, for pictures of it; raises as `open_window`."""
+    return _opened(port, "--expect-data-soon", "--headless")
+
+
+def _opened(port: int | None, *more: str) -> Window:
+    limit = ["--server-memory-limit", "32MB"]  # nobody comes later to see what was sent
+    return Window(Process(["--hide-welcome-screen", *limit, *more], free_port(port)))

@@ -1,0 +1,1 @@
+"""Training: labelled sound, ways to learn, and what becomes of them."""

@@ -1,0 +1,278 @@
+"""From labelled sound to what a classifier learns from: windows of one second."""
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.manifest import Clip
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.models.classes import SILENCE, class_name
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+
+HOP_FRAMES = 10
+SEGMENTS_PER_GROUP = 24
+_FLOOR = 10 ** (-60 / 10)  # -60 dBFS
+_BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
+
+Float32 = NDArray[np.float32]
+Indices = NDArray[np.intp]
+Progress = Callable[[int, int], None]
+
+
+class Recording(NamedTuple):
+    """A stretch of sound of one label.
+
+    Attributes
+    ----------
+    label, group, collection, licence : str
+        As in a manifest: of one group, nothing is both learned from and tested on.
+    features : np.ndarray [shape=(n, d)], float32
+        Of successive frames.
+    weight : float
+        How much a segment of it counts.
+    """
+
+    label: str
+    group: str
+    collection: str
+    licence: str
+    features: Float32
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of a class there is."""
+
+    sources: int
+    segments: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Segments to learn from.
+
+    Attributes
+    ----------
+    windows : np.ndarray [shape=(n, window_frames, d)], float32
+        Features.
+    target : np.ndarray [shape=(n,)], intp
+        Index into `classes`.
+    group, collection : np.ndarray [shape=(n,)], intp
+        Numbers of the source group and of the collection.
+    weight : np.ndarray [shape=(n,)], float64
+        How much a segment counts.
+    classes : tuple of str
+    seconds : dict of str to float
+        Sound of each class that was used, before it was thinned out.
+    collection_names : tuple of str
+        The names behind `collection`.
+    collections : dict of (name, licence) to int
+        How many recordings were used.
+    skipped : dict of str to int
+        Why recordings gave no segment, and how many.
+    """
+
+    windows: Float32
+    target: Indices
+    group: Indices
+    collection: Indices
+    weight: NDArray[np.float64]
+    classes: tuple[str, ...]
+    seconds: Mapping[str, float]
+    collection_names: tuple[str, ...]
+    collections: Mapping[tuple[str, str], int]
+    skipped: Mapping[str, int]
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the segments, their classes and their groups."""
+        digest = hashlib.sha256("\n".join(self.classes).encode())
+        for array in (self.windows, self.target.astype("<i8"), self.group.astype("<i8")):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    @property
+    def amounts(self) -> dict[str, Amount]:
+        """How much there is of each class."""
+        return {
+            name: Amount(
+                sources=len(np.unique(self.group[self.target == i])),
+                segments=int((self.target == i).sum()),
+                seconds=round(self.seconds.get(name, 0.0), 3),
+            )
+            for i, name in enumerate(self.classes)
+        }
+
+
+def build_dataset(
+    clips: Sequence[Clip],
+    scenario: Scenario,
+    progress: Progress,
+    home: Iterable[Recording] = (),
+    features: FeatureSet = DEFAULT,
+) -> Dataset:
+    """Cut the clips of a scenario's labels into segments, as `cut_recordings` does.
+
+    Parameters
+    ----------
+    clips : sequence of Clip
+    scenario : Scenario
+    progress : callable
+        Told how many clips of how many are done.
+    home : iterable of Recording
+        More to learn from.
+    features : FeatureSet
+        What is computed from the clips.
+
+    Raises
+    ------
+    DataError
+        If a class is left without segments.
+    SourceError
+        If a clip cannot be read.
+    """
+    recordings = chain(clip_recordings(clips, scenario, progress, features), home)
+    data = cut_recordings(recordings, scenario, features)
+    for name, amount in data.amounts.items():
+        if not amount.segments:
+            labels = ", ".join(scenario.classes[name])
+            raise DataError(f"class {name} has no segments: no usable clip is labelled {labels}")
+    return data
+
+
+def clip_recordings(
+    clips: Sequence[Clip],
+    scenario: Scenario,
+    progress: Progress,
+    features: FeatureSet = DEFAULT,
+) -> Iterator[Recording]:
+    """Listen to the clips of a scenario's labels; of others the label is all that is told.
+
+    Raises
+    ------
+    SourceError
+        If a clip cannot be read.
+    """
+    for number, clip in enumerate(clips):
+        progress(number, len(clips))
+        values = np.empty((0, features.width), np.float32)
+        if scenario.find(clip.label) is not None:
+            values = clip_features(clip, features)
+        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, values)
+    progress(len(clips), len(clips))
+
+
+def cut_recordings(
+    recordings: Iterable[Recording], scenario: Scenario, features: FeatureSet = DEFAULT
+) -> Dataset:
+    """Cut recordings into segments of a window, half a second apart.
+
+    A segment is kept if it is no more than 12 dB below its recording's mean level and above
+    -60 dBFS; of silence all are. At most 24 segments, times their weight, evenly spaced, are kept
+    for each class and source group.
+    """
+    classes = tuple(scenario.classes)
+    groups: dict[str, int] = {}
+    collections: dict[str, int] = {}
+    used: Counter[tuple[str, str]] = Counter()
+    skipped: Counter[str] = Counter()
+    seconds: dict[str, float] = {}
+    windows = [np.empty((0, features.window_frames, features.width), np.float32)]
+    weights = [np.empty(0)]
+    rows = [np.empty((0, 3), np.intp)]
+    for item in recordings:
+        name = scenario.find(item.label, marked=True)
+        if name is None:
+            skipped[f"label {item.label} is not in the scenario"] += 1
+            continue
+        reason, found = _segments(item, features)
+        if reason:
+            skipped[reason] += 1
+            continue
+        used[item.collection, item.licence] += 1
+        seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
+        windows.append(found)
+        weights.append(np.full(len(found), item.weight))
+        group = groups.setdefault(item.group, len(groups))
+        collection = collections.setdefault(item.collection, len(collections))
+        rows.append(np.tile([classes.index(name), group, collection], (len(found), 1)))
+    target, group_of, collection_of = np.concatenate(rows).T
+    weight = np.concatenate(weights)
+    kept = _thinned(target * len(groups) + group_of, weight)
+    return Dataset(
+        np.concatenate(windows)[kept],
+        target[kept],
+        group_of[kept],
+        collection_of[kept],
+        weight[kept],
+        classes,
+        seconds,
+        tuple(collections),
+        dict(used),
+        dict(sorted(skipped.items())),
+    )
+
+
+def clip_features(clip: Clip, features: FeatureSet) -> Float32:
+    """Compute the features of a clip, shape (n, d).
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read.
+    """
+    extract = features.extractor()
+    values = [np.empty((0, features.width), np.float32)]
+    rest = np.empty(0, np.float32)
+    for block in read_audio(clip.path):
+        samples = np.concatenate([rest, block])
+        whole = len(samples) // FRAME_SAMPLES * FRAME_SAMPLES
+        values.append(extract(samples[:whole].reshape(-1, FRAME_SAMPLES)))
+        rest = samples[whole:]
+    return np.concatenate(values)
+
+
+def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]:
+    """Return why there are no segments, or those that are loud enough."""
+    values, window = recording.features, features.window_frames
+    nothing = np.empty((0, window, features.width), np.float32)
+    if values.shape[1] != features.width:
+        return f"its features are not {features.name}", nothing
+    if len(values) < window:  # the recorder labels whole windows only
+        return f"shorter than {features.window_seconds:g} s", nothing
+    every = np.lib.stride_tricks.sliding_window_view(values, window, axis=0)
+    windows = every[::HOP_FRAMES].transpose(0, 2, 1)
+    if class_name(recording.label) == SILENCE:
+        return "", windows
+    power = features.power(windows).mean(axis=1, dtype=np.float64)
+    level = features.power(values).mean(dtype=np.float64)
+    loud = windows[power > max(_FLOOR, level * _BELOW_CLIP)]
+    return ("" if len(loud) else "nowhere above -60 dBFS"), loud
+
+
+def _thinned(key: Indices, weight: NDArray[np.float64]) -> Indices:
+    """Choose evenly spaced rows of each key; return their indices in order.
+
+    At most 24 are chosen, and more of what weighs more.
+    """
+    kept = [np.empty(0, np.intp)]
+    for value in np.unique(key):
+        rows = np.flatnonzero(key == value)
+        count = min(len(rows), int(SEGMENTS_PER_GROUP * weight[rows[0]]))
+        kept.append(rows[np.linspace(0, len(rows) - 1, count).round().astype(np.intp)])
+    return np.sort(np.concatenate(kept))

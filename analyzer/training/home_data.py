@@ -1,0 +1,112 @@
+"""A home's own sound to learn from: what was marked in its logs, and what was enrolled."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.marks.marks import Mark, read_marks
+from hearthlog.analyzer.training.dataset import Recording
+from hearthlog.models.classes import translation
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
+
+HOME_WEIGHT = 5.0  # of a segment of the home, where others count 1
+HOME = "this home"
+
+Int64 = NDArray[np.int64]
+
+
+def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:
+    """Read the features of everything that is marked in the logs of a folder.
+
+    A mark shorter than a window is taken with what is around it. All marks of a day are of one
+    source.
+
+    Parameters
+    ----------
+    folder : Path
+        Of logs, with review layers beside them, and of enrolled sounds.
+    features : FeatureSet
+        Of other features a recording has none.
+
+    Raises
+    ------
+    LogError
+        If a log or a layer is damaged.
+    """
+    for log in find_logs(folder, enrolled=True):
+        marks = read_marks(log)
+        if not marks:
+            continue
+        topics = {topic(mark.microphone, "features") for mark in marks}
+        columns = read_columns([log], topics, fields={"header.stamp", "frame", "values"})
+        for mark in marks:
+            heard = columns.get(topic(mark.microphone, "features"))
+            if heard is not None and len(heard):
+                yield from _recordings(heard, mark, features)
+
+
+def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
+    """Read what follows what in a home, where its marks leave no time between them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of logs, with review layers beside them.
+    classes : sequence of str
+
+    Returns
+    -------
+    list of np.ndarray [shape=(n,)], int64
+        Classes of successive frames; a mark on its own tells nothing and is left out.
+    """
+    numbers = {name: number for number, name in enumerate(classes)}
+    found: list[Int64] = []
+    for log in find_logs(folder, enrolled=True):
+        runs: list[list[Mark]] = []
+        marks = read_marks(log)
+        names = translation({mark.label for mark in marks}, classes)
+        for mark in sorted(mark._replace(label=names[mark.label]) for mark in marks):
+            last = runs[-1][-1] if runs else None
+            follows = (
+                last is not None
+                and mark.microphone == last.microphone
+                and mark.start - last.end < FRAME_NANOSECONDS
+                and mark.label in numbers
+            )
+            if follows and last is not None and last.label in numbers:
+                runs[-1].append(mark)
+            else:
+                runs.append([mark])
+        found += [_frames_of(run, numbers) for run in runs if len(run) > 1]
+    return found
+
+
+def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
+    frames = [max((mark.end - mark.start) // FRAME_NANOSECONDS, 1) for mark in run]
+    return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
+
+
+def _recordings(heard: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
+    """Return what was heard during a mark; in pieces where there are gaps in it."""
+    window, values = features.window_frames, heard["values"]
+    names = names_of(heard.metadata, "values")
+    if names and tuple(names) != features.feature_names:
+        values = np.empty((len(values), 0), np.float32)
+    stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)
+    first, last = np.searchsorted(stamps, [mark.start, mark.end]).tolist()
+    missing = max(window - (last - first), 0)
+    first = max(first - missing // 2, 0)
+    last = min(max(last + missing - missing // 2, first + window), len(stamps))
+    day = np.datetime64(mark.start // NANOSECONDS, "s").astype("datetime64[D]")
+    breaks = np.flatnonzero(np.diff(frames[first:last]) != 1) + 1
+    for piece in np.split(values[first:last], breaks):
+        yield Recording(mark.label, f"{HOME} {day}", HOME, "", piece, HOME_WEIGHT)

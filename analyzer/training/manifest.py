@@ -1,0 +1,107 @@
+"""The manifest of labelled clips: a CSV file beside the audio."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.models.classes import meant_by
+from hearthlog.models.classifiers.description import TEXT
+
+REQUIRED = ("path", "label", "source_group")
+OPTIONAL = ("source", "licence")
+_SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One labelled recording.
+
+    Attributes
+    ----------
+    path : Path
+        The audio file; it existed when the manifest was read.
+    label : str
+    source_group : str
+        The original recording or speaker: clips of one group are never split between folds.
+    source, licence : str
+        Collection it came from and the licence it gives; empty where the manifest is silent.
+    """
+
+    path: Path
+    label: str
+    source_group: str
+    source: str
+    licence: str
+
+
+def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
+    """Read a manifest with the columns path, label, source_group and, optionally, source, licence.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, UTF-8; the paths in it are relative to its folder. Other columns are ignored.
+    labels : collection of str
+        Labels that mean something, as do other names of the same sounds (see
+        `hearthlog.models.classes`); any other is an error.
+
+    Raises
+    ------
+    DataError
+        With file and line, if a column, a value or an audio file is missing, a label is unknown,
+        a clip is listed twice, or the file is no CSV in UTF-8.
+    """
+    lines = csv_records(path, read_text(path, "manifest", _SIZE_LIMIT))
+    first = next(lines, None)
+    if first is None:
+        raise DataError(f"{path}: is empty; it needs a first line that names the columns")
+    number, header = first
+    column = {name.strip(): position for position, name in enumerate(header)}
+    missing = [name for name in REQUIRED if name not in column]
+    if missing:
+        raise DataError(f"{path}:{number}: no column {', '.join(missing)} in the first line")
+    clips: list[Clip] = []
+    seen: dict[Path, int] = {}
+    for number, record in lines:
+        where = f"{path}:{number}"
+        clip = _clip(where, path.parent, column, record, labels)
+        if clip.path in seen:
+            raise DataError(f"{where}: {clip.path.name!r} is listed in line {seen[clip.path]} too")
+        seen[clip.path] = number
+        clips.append(clip)
+    if not clips:
+        raise DataError(f"{path}: lists no clips")
+    return clips
+
+
+def _clip(
+    where: str, folder: Path, column: dict[str, int], record: list[str], labels: Collection[str]
+) -> Clip:
+    if len(record) <= max(column[name] for name in REQUIRED):
+        raise DataError(f"{where}: has {len(record)} fields, the first line names {len(column)}")
+    value = {
+        name: record[column[name]].strip() if column.get(name, len(record)) < len(record) else ""
+        for name in (*REQUIRED, *OPTIONAL)
+    }
+    for name in REQUIRED:
+        if not value[name]:
+            raise DataError(f"{where}: {name} is empty")
+    for name in OPTIONAL:
+        if not TEXT.fullmatch(value[name]):
+            raise DataError(f"{where}: {name} must be one line of at most 300 characters")
+    if not meant_by(value["label"], labels):
+        known = ", ".join(sorted(labels))
+        raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {known}")
+    audio = folder / value["path"]
+    if not _is_file(audio):
+        raise DataError(f"{where}: no such file: {value['path'][:256]!r}")
+    return Clip(audio, value["label"], value["source_group"], value["source"], value["licence"])
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name too long for any file
+        return False

@@ -1,0 +1,126 @@
+"""Scenarios: which labels of a manifest make up which class of a model."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.models import classes as sound
+from hearthlog.models.classifiers.description import CLASS_NAME, MOST_CLASSES, TEXT
+from hearthlog.schemas.storage.small_file import read_toml
+
+_GENERAL = (
+    *(sound.SILENCE, sound.SPEECH, sound.MUSIC, sound.PHONE_RING, sound.COUGHING, sound.CRYING),
+    *(sound.YELLING, sound.LAUGHING, sound.OBJECTS_ACTIVITY),
+)
+_WATER = (sound.FLUSHING_WATER, sound.SHOWER, sound.TAP_WATER)
+_BATHROOM_OTHER = (sound.BATHROOM_OTHER, *_GENERAL[1:])
+LABELS = frozenset(row.name for row in sound.CLASSES) - {sound.OTHER, sound.UNKNOWN}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What a model is to tell apart.
+
+    Attributes
+    ----------
+    name : str
+    classes : mapping of str to tuple of str
+        Each class and the labels that belong to it, in the order of the model's classes.
+    ignored : frozenset of str
+        Labels that may stand in a manifest and are left out.
+    """
+
+    name: str
+    classes: Mapping[str, tuple[str, ...]]
+    ignored: frozenset[str] = frozenset()
+
+    @property
+    def class_of(self) -> dict[str, str]:
+        """Class of each label that has one."""
+        return {label: name for name, labels in self.classes.items() for label in labels}
+
+    def find(self, label: str, *, marked: bool = False) -> str | None:
+        """Return the class that a label belongs to; None if it is ignored, or in no class.
+
+        It is the class that lists this very label. If none does, it is the one that lists another
+        name of the same sound (see `hearthlog.models.classes`), unless two classes do.
+
+        Parameters
+        ----------
+        label : str
+        marked : bool
+            Whether a reviewer says it: then the names of the classes are labels, too.
+        """
+        classes: dict[str, str | None] = dict.fromkeys(self.ignored)
+        classes |= {name: name for name in self.classes} if marked else {}
+        classes |= self.class_of
+        meant = {classes[name] for name in sound.meant_by(label, classes)}
+        return meant.pop() if len(meant) == 1 else None
+
+    @property
+    def labels(self) -> frozenset[str]:
+        """Labels a manifest may use, besides other names of them: built in, in a class, ignored."""
+        return LABELS | self.class_of.keys() | self.ignored
+
+
+BUILTIN = {
+    "bathroom": Scenario(
+        "bathroom",
+        {name: (name,) for name in (sound.SILENCE, *_WATER)} | {sound.OTHER: _BATHROOM_OTHER},
+    ),
+    "general": Scenario("general", {label: (label,) for label in _GENERAL}),
+}
+
+
+def load_scenario(name: str) -> Scenario:
+    """Return a built-in scenario, or read one from a TOML file.
+
+    The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
+    ...]` above it.
+
+    Raises
+    ------
+    DataError
+        If there is no such scenario, or the file does not say what it must.
+    """
+    if name in BUILTIN:
+        return BUILTIN[name]
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise DataError(f"unknown scenario {name!r}: use {', '.join(BUILTIN)} or a .toml file")
+    if not path.stem.isprintable():
+        raise DataError(f"{name!a}: give the scenario a name that can be printed")
+    content = read_toml(path, "scenario file", DataError)
+    unknown = content.keys() - {"classes", "ignore"}
+    if unknown:
+        raise DataError(f"{path}: unknown key {min(unknown)[:64]!r}; known are classes, ignore")
+    classes = content.get("classes")
+    if not isinstance(classes, dict) or not 2 <= len(classes) <= MOST_CLASSES:
+        raise DataError(f"{path}: needs a table [classes] with 2 to {MOST_CLASSES} classes")
+    table = {_class_name(path, key): _labels(path, key, value) for key, value in classes.items()}
+    ignored = frozenset(_labels(path, "ignore", content["ignore"])) if "ignore" in content else ()
+    every = [label for labels in (*table.values(), ignored) for label in labels]
+    twice = sorted({label for label in every if every.count(label) > 1})
+    if twice:
+        raise DataError(f"{path}: label {twice[0][:64]!r} is in two places")
+    return Scenario(path.stem, table, frozenset(ignored))
+
+
+def _class_name(path: Path, name: str) -> str:
+    if not CLASS_NAME.fullmatch(name):
+        raise DataError(
+            f"{path}: class name {name[:64]!r} must be at most 64 lower-case letters, digits and "
+            "'_', starting with a letter"
+        )
+    return name
+
+
+def _labels(path: Path, key: str, value: object) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value or not all(map(_is_label, value)):
+        raise DataError(f'{path}: {key} must be a list of labels, such as ["speech"]')
+    return tuple(value)
+
+
+def _is_label(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and bool(TEXT.fullmatch(value))

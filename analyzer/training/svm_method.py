@@ -1,0 +1,151 @@
+"""Learning support vector machines, through scikit-learn."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics.pairwise import rbf_kernel
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.method import NO_HOME, Examples, Float64, Indices, Method
+from hearthlog.models.classifiers.description import Description
+from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
+
+_COST_TIMES = (0.25, 1.0, 4.0)
+_GAMMA_TIMES = (0.5, 1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class SvmMethod(Method):
+    """A support vector machine with RBF kernel, classes weighted against their number.
+
+    Attributes
+    ----------
+    cost : float
+        Of a segment on the wrong side.
+    gamma : float
+        Of the kernel, times the number of inputs.
+    """
+
+    cost: float
+    gamma: float
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose versions are part of what comes out."""
+        return ("scikit-learn",)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Cost and gamma."""
+        return {"cost": self.cost, "gamma": self.gamma}
+
+    def fit(
+        self, examples: Examples, seen: Indices | slice = slice(None), home: Indices = NO_HOME
+    ) -> "LearnedSvm":
+        """Learn from some segments; see `Method.fit`."""
+        copies, _, width = examples.inputs.shape
+        inputs = examples.inputs[:, seen].reshape(-1, width).astype(np.float64)
+        machine = SVC(
+            C=self.cost,
+            gamma=self.gamma / width,
+            class_weight="balanced",
+            decision_function_shape="ovo",
+        )
+        fitted = make_pipeline(StandardScaler(), machine).fit(
+            inputs,
+            np.tile(examples.target[seen], copies),
+            svc__sample_weight=np.tile(examples.weight[seen], copies),
+        )
+        return LearnedSvm(fitted, examples.inputs[0, home], examples.target[home])
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """Return this method with another cost or gamma; raises DataError for anything else."""
+        if unknown := values.keys() - {"cost", "gamma"}:
+            raise DataError(f"method {self.name} has no {min(unknown)} to choose")
+        cost, gamma = values.get("cost", self.cost), values.get("gamma", self.gamma)
+        return replace(self, cost=cost, gamma=gamma)
+
+    def variations(self) -> list[Self]:
+        """Return methods with less, as much and more cost and gamma."""
+        return [
+            replace(self, cost=self.cost * cost, gamma=self.gamma * gamma)
+            for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
+        ]
+
+    def as_of(self, about: Description) -> Self:
+        """Return the method with the parameters that a model was learned with."""
+        width = self.features.inputs[about.inputs].width
+        cost, gamma = about.parameters["cost"], about.parameters["gamma"]
+        return replace(self, cost=cost, gamma=gamma * width, copies=about.copies)
+
+
+class LearnedSvm:
+    """A fitted machine.
+
+    Parameters
+    ----------
+    machine : sklearn.pipeline.Pipeline
+        A scaler and an `SVC`.
+    home : np.ndarray [shape=(h, width)], float32
+        Inputs of the home's segments.
+    home_target : np.ndarray [shape=(h,)], intp
+        Their classes.
+    """
+
+    def __init__(self, machine: Pipeline, home: NDArray[np.float32], home_target: Indices) -> None:
+        self.machine = machine
+        self._home = home
+        self._home_target = home_target
+
+    def decide(self, inputs: NDArray[np.float32], classes: int) -> Float64:
+        """Decide as `SvmMachine` of `svm_rbf` does; see `Learned.decide`."""
+        values = self.machine.decision_function(inputs.astype(np.float64))
+        pairs = -values[:, np.newaxis] if values.ndim == 1 else values
+        decision = np.full((len(inputs), classes), -np.inf)
+        learned = self.machine.classes_
+        decision[:, learned] = weakest_pairs(pairs, len(learned))
+        return decision + self._votes(inputs, classes) if len(self._home) else decision
+
+    def _votes(self, inputs: NDArray[np.float32], classes: int) -> Float64:
+        scaler, svc = self.machine
+        gamma, here = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
+        home = scaler.transform(self._home.astype(np.float64))
+        near = rbf_kernel(here, home, gamma=gamma)
+        others = rbf_kernel(here, svc.support_vectors_, gamma=gamma).sum(axis=1, keepdims=True)
+        return home_votes(near @ np.eye(classes)[self._home_target], others)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of `hearthlog.models.classifiers.svm_rbf.SvmKind`."""
+        scaler, svc = self.machine
+        # scikit-learn turns the sign of two classes round; in the file all pairs are alike.
+        sign = -1.0 if len(svc.classes_) == 2 else 1.0
+        # The file keeps support vectors as they were before scaling, in float32.
+        support = svc.support_vectors_ * scaler.scale_ + scaler.mean_
+        arrays = {
+            "scaler_mean": scaler.mean_,
+            "scaler_scale": scaler.scale_,
+            "support_vectors": support.astype(np.float32),
+            "support_counts": svc.n_support_.astype(np.int64),
+            "dual_coefficients": sign * svc.dual_coef_,
+            "intercepts": sign * svc.intercept_,
+        }
+        if len(self._home):
+            arrays["home_vectors"] = self._home
+            arrays["home_target"] = self._home_target.astype(np.int64)
+        return arrays
+
+    def parameters(self) -> dict[str, Any]:
+        """Return cost and gamma, that of the kernel itself."""
+        svc = self.machine[-1]
+        return {"cost": float(svc.C), "gamma": float(svc.gamma)}
+
+
+BANDS = SvmMethod("bands", "auros21", "bands", SVM_RBF.name, copies=1, cost=4.0, gamma=1.25)
+PAPER = SvmMethod("paper", "auros21", "statistics", SVM_RBF.name, copies=0, cost=4.0, gamma=0.5)

@@ -1,0 +1,248 @@
+"""Learn a model from segments, and measure it on sources that it has not heard."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
+from sklearn.model_selection import StratifiedGroupKFold
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.method import (
+    Fold,
+    Method,
+    cross_validate,
+    inverse_temperature,
+    prepare,
+    softmax,
+)
+from hearthlog.analyzer.training.methods import DEFAULT, method_named
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.scores import calibration_error
+from hearthlog.analyzer.training.transitions import (
+    LAG_SECONDS,
+    default_transitions,
+    expected_durations,
+    transitions_from_sequences,
+)
+from hearthlog.models.classifiers.description import (
+    FORMAT,
+    Amount,
+    ClassMetrics,
+    Collection,
+    Description,
+    Metrics,
+    Smoothing,
+    TrainingData,
+)
+from hearthlog.models.classifiers.model import Model
+
+MOST_FOLDS = 5
+SMOOTHINGS = ("hmm", "merge")
+_SHUFFLES = 20
+
+Float64 = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+def train_model(
+    data: Dataset,
+    scenario: Scenario,
+    progress: Progress,
+    method: Method = DEFAULT,
+    smoothing: str = "hmm",
+) -> Model:
+    """Learn from segments; calibrate and measure on folds that never split a source group.
+
+    Parameters
+    ----------
+    data : Dataset
+    scenario : Scenario
+        The one the data was built for.
+    progress : callable
+        Told how many fits of how many are done.
+    method : Method
+    smoothing : str
+        How labels become segments: see `hearthlog.models.modelfile.modelfile.Smoothing`.
+
+    Raises
+    ------
+    DataError
+        If a class has too few source groups to be cross-validated, or all segments are alike.
+    """
+    check_varied(data)
+    folds = group_folds(data)
+    examples = prepare(method, data)
+
+    def report(done: int, _total: int) -> None:
+        progress(done, len(folds) + 1)
+
+    [decisions] = cross_validate([method], examples, len(data.classes), folds, report)
+    inverse = inverse_temperature(decisions, data.target)
+    learned = method.fit(examples)
+    progress(len(folds) + 1, len(folds) + 1)
+    features, hidden = method.features, smoothing == "hmm"
+    about = Description(
+        format=FORMAT,
+        kind=method.kind,
+        parameters=learned.parameters(),
+        method=method.name,
+        classes=list(data.classes),
+        feature_set=features.name,
+        feature_set_version=features.version,
+        feature_names=list(features.feature_names),
+        inputs=method.inputs,
+        window_seconds=features.window_seconds,
+        scenario_name=scenario.name,
+        scenario={name: list(labels) for name, labels in scenario.classes.items()},
+        copies=method.copies,
+        calibration="temperature",
+        inverse_temperature=inverse,
+        smoothing=Smoothing(
+            method="hmm" if hidden else "merge", lag_seconds=LAG_SECONDS if hidden else 0.0
+        ),
+        training_data=_training_data(data),
+        metrics=_metrics(data, decisions, inverse, len(folds)),
+        versions={name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
+    )
+    return Model(
+        about,
+        learned.arrays(),
+        transitions=default_transitions(data.classes) if hidden else np.empty((0, 0)),
+        training_windows=data.windows,
+        training_target=data.target.astype(np.int64),
+        training_group=data.group.astype(np.int64),
+    )
+
+
+def adapt_model(base: Model, home: Dataset, sequences: Sequence[NDArray[np.int64]] = ()) -> Model:
+    """Learn once more what a model has learned, and a home's own segments with it.
+
+    Parameters
+    ----------
+    base : Model
+        With its training windows.
+    home : Dataset
+        Of the same classes; it need not have segments of all of them.
+    sequences : sequence of np.ndarray [shape=(n,)], int64
+        Classes of successive frames in the home, from which the transitions of its sounds are
+        learned.
+
+    Returns
+    -------
+    Model
+        With the parameters, calibration and metrics of `base`, which are those of other homes; it
+        keeps the windows of `base` alone, so that it can be adapted again to more of the home.
+
+    Raises
+    ------
+    DataError
+        If the base model has not kept what it was learned from, the home has no segments, or the
+        way in which the base model was learned is not installed.
+    """
+    about = base.description
+    if not len(base.training_windows):
+        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
+    if not len(home):
+        reasons = "; ".join(f"{count} recordings: {why}" for why, count in home.skipped.items())
+        raise DataError(
+            f"the home has no segments of a class of the model ({reasons or 'nothing is marked'})"
+        )
+    joined = replace(
+        home,
+        windows=np.concatenate([base.training_windows, home.windows]),
+        target=np.concatenate([base.training_target, home.target]),
+        group=np.concatenate([base.training_group, home.group]),
+        weight=np.concatenate([np.ones(len(base.training_windows)), home.weight]),
+    )
+    method = method_named(about.method).as_of(about)
+    examples = prepare(method, joined)
+    learned = method.fit(examples, home=np.arange(len(base.training_windows), len(joined)))
+    found = {name: Amount(**asdict(amount)) for name, amount in home.amounts.items()}
+    training = about.training_data.model_copy(update={"home": found, "base_sha256": base.sha256})
+    return Model(
+        about.model_copy(update={"training_data": training}),
+        learned.arrays(),
+        transitions=(
+            transitions_from_sequences(sequences, expected_durations(base.classes))
+            if len(base.transitions) and len(sequences)
+            else base.transitions
+        ),
+        training_windows=base.training_windows,
+        training_target=base.training_target,
+        training_group=base.training_group,
+    )
+
+
+def check_varied(data: Dataset) -> None:
+    """Raise DataError if there is nothing to tell the segments apart by."""
+    if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
+        raise DataError("all segments are alike: their features never change; is this sound?")
+
+
+def group_folds(data: Dataset) -> list[Fold]:
+    """Divide the segments into up to five folds that never split a source group.
+
+    Returns
+    -------
+    list of (seen, unseen)
+        Indices; every class is among the seen of every fold.
+
+    Raises
+    ------
+    DataError
+        If a class comes from fewer than two groups, or no division leaves every class something
+        to learn from.
+    """
+    sources = [amount.sources for amount in data.amounts.values()]
+    fewest = int(np.argmin(sources))
+    if sources[fewest] < 2:
+        raise DataError(
+            f"class {data.classes[fewest]} has {sources[fewest]} source group; it needs at least "
+            f"2, better {MOST_FOLDS}, to be tested on recordings that were not learned from"
+        )
+    count = min(MOST_FOLDS, sources[fewest])
+    everything = np.arange(len(data.classes))
+    for seed in range(_SHUFFLES):
+        divider = StratifiedGroupKFold(count, shuffle=True, random_state=seed)
+        folds = list(divider.split(data.target, data.target, data.group))
+        if all(np.array_equal(np.unique(data.target[seen]), everything) for seen, _ in folds):
+            return folds
+    raise DataError(
+        f"class {data.classes[fewest]} has {sources[fewest]} source groups, shared with other "
+        "classes: no division into folds leaves every class something to learn from; add sources"
+    )
+
+
+def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Metrics:
+    predicted = decision.argmax(axis=1)
+    precision, recall, f1, _ = precision_recall_fscore_support(
+        data.target, predicted, labels=range(len(data.classes)), zero_division=0.0
+    )
+    confusion = confusion_matrix(data.target, predicted, labels=range(len(data.classes)))
+    return Metrics(
+        folds=folds,
+        macro_f1=float(f1.mean()),
+        expected_calibration_error=calibration_error(softmax(inverse * decision), data.target),
+        classes={
+            name: ClassMetrics(
+                precision=float(precision[i]), recall=float(recall[i]), f1=float(f1[i])
+            )
+            for i, name in enumerate(data.classes)
+        },
+        confusion=confusion.tolist(),
+    )
+
+
+def _training_data(data: Dataset) -> TrainingData:
+    return TrainingData(
+        sha256=data.digest,
+        classes={name: Amount(**asdict(amount)) for name, amount in data.amounts.items()},
+        collections=[
+            Collection(name=name, licence=licence, clips=clips)
+            for (name, licence), clips in sorted(data.collections.items())
+        ],
+    )

@@ -1,0 +1,89 @@
+"""Probabilities of a model's classes, whatever kind of classifier it is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.errors import ModelError
+from hearthlog.models.extensions import Extensions
+from hearthlog.models.features.installed import feature_set
+
+CLASSIFIERS = Extensions("hearthlog.classifiers", ClassifierKind, [SVM_RBF])  # type: ignore[type-abstract]
+_ROWS_AT_ONCE = 256
+
+Float32 = NDArray[np.float32]
+
+
+def classifier_kind(name: str) -> ClassifierKind:
+    """Return a kind of classifier by its name.
+
+    Raises
+    ------
+    ModelError
+        If there is none of this name, or it cannot be imported.
+    """
+    kind = CLASSIFIERS.get(name)
+    if kind is None:
+        installed = ", ".join(CLASSIFIERS.names())
+        raise ModelError(f"classifier kind {name[:64]!r} is not installed; there is {installed}")
+    return kind
+
+
+class Classifier:
+    """Inference of one model.
+
+    A row's probabilities do not depend on the rows computed together with it, nor on threads.
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names behind the columns of the probabilities.
+    feature_set : FeatureSet
+    inputs : Inputs
+        Of that set: what `classify` takes.
+    smoothing : Smoothing
+    transitions : np.ndarray [shape=(C, C)], float64
+        How probabilities become segments.
+    """
+
+    def __init__(self, model: Model) -> None:
+        about = model.description
+        self.classes = model.classes
+        self.feature_set = feature_set(about.feature_set)
+        self.inputs = self.feature_set.inputs[about.inputs]
+        self.smoothing = about.smoothing
+        self.transitions = model.transitions
+        self._inverse_temperature = about.inverse_temperature
+        self._machine = classifier_kind(about.kind).machine(model)
+
+    def probabilities(self, inputs: Float32) -> Float32:
+        """Compute the probability of each class; the first of what `classify` returns."""
+        return self.classify(inputs)[0]
+
+    def classify(self, inputs: Float32) -> tuple[Float32, Float32]:
+        """Compute the probability of each class, and how unlike anything learned a window is.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        probabilities : np.ndarray [shape=(n, C)], float32
+            In the order of the model's classes; every row sums to 1.
+        novelty : np.ndarray [shape=(n,)], float32
+            From 0 to 1; NaN where the kind of classifier does not know it.
+        """
+        result = np.empty((len(inputs), len(self.classes)), np.float32)
+        novelty = np.empty(len(inputs), np.float32)
+        for start in range(0, len(inputs), _ROWS_AT_ONCE):
+            rows = slice(start, start + _ROWS_AT_ONCE)
+            decision, novelty[rows] = self._machine.decide(inputs[rows])
+            decision *= self._inverse_temperature
+            decision -= decision.max(axis=1, keepdims=True)
+            np.exp(decision, out=decision)
+            result[rows] = decision / decision.sum(axis=1, keepdims=True)
+        return result, novelty

@@ -1,0 +1,73 @@
+"""What a log says of the model behind its labels: a card for people, a description for programs."""
+
+import json
+
+from hearthlog.models.classifiers.classifier import classifier_kind
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.logs.writer import Attachment
+
+CARD = "model_card.md"
+DESCRIPTION = "model.json"
+
+
+def model_attachments(model: Model) -> list[Attachment]:
+    """Return what goes into a log with the labels of a model."""
+    about = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
+    text = json.dumps(about, ensure_ascii=False)
+    return [
+        Attachment(CARD, "text/markdown", model_card(model).encode()),
+        Attachment(DESCRIPTION, "application/json", text.encode()),
+    ]
+
+
+def model_card(model: Model) -> str:
+    """Describe a model, as Markdown.
+
+    Programs read its description instead.
+    """
+    about, metrics = model.description, model.description.metrics
+    amounts = about.training_data.classes
+    purpose = (
+        f"Tells apart {len(about.classes)} classes of sound in windows of "
+        f"{about.window_seconds:g} s, from feature set {about.feature_set} "
+        f"({about.kind}, {classifier_kind(about.kind).summary(model)})."
+    )
+    lines = [
+        f"# Model {model.name or about.scenario_name}",
+        "",
+        purpose,
+        "",
+        f"- sha256: {model.sha256 or 'not saved'}",
+        f"- scenario: {about.scenario_name}",
+        f"- macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, no source in two of them)",
+        f"- expected calibration error: {metrics.expected_calibration_error:.3f}",
+        f"- training data sha256: {about.training_data.sha256}",
+        f"- made with: {', '.join(f'{k} {v}' for k, v in sorted(about.versions.items()))}",
+        "",
+        "| class | labels | sources | seconds | precision | recall | F1 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name in about.classes:
+        amount, result = amounts[name], metrics.classes[name]
+        lines.append(
+            f"| {name} | {', '.join(about.scenario[name])} | {amount.sources} | "
+            f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
+            f"{result.f1:.3f} |"
+        )
+    if about.training_data.home:
+        lines += [
+            "",
+            "Adapted to a home (the figures above are those before); learned besides:",
+        ]
+        lines += [""] + [
+            f"- {name}: {amount.segments} segments from {amount.sources} sources"
+            for name, amount in about.training_data.home.items()
+        ]
+    if about.training_data.simulated:
+        lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
+    lines += ["", "Learned from recordings of:", ""]
+    lines += [
+        f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
+        for item in about.training_data.collections
+    ]
+    return "\n".join(lines) + "\n"

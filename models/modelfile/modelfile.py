@@ -1,0 +1,216 @@
+"""The model file: one `.safetensors` file, arrays and a JSON description, checked when loaded."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from safetensors.numpy import load, save
+
+from hearthlog.models.classifiers.classifier import classifier_kind
+from hearthlog.models.classifiers.description import (
+    Description,
+    first_problem,
+    one_line,
+    read_description,
+)
+from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import check_new, new_file
+from hearthlog.schemas.storage.small_file import read_whole
+
+SUFFIX = ".safetensors"
+_KEY = "hearthlog"
+_SIZE_LIMIT = 64 << 20  # a hundred times what a home needs
+_HEADER_LIMIT = 4 << 20  # parsed, it takes many times its size
+_LARGEST = 1e9  # no product of finite inputs overflows
+_ROUNDING = 1e-9
+_COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; none of them must be there
+    "transitions": np.dtype(np.float64),
+    "training_windows": np.dtype(np.float32),
+    "training_target": np.dtype(np.int64),
+    "training_group": np.dtype(np.int64),
+}
+
+
+def check_output(path: Path) -> None:
+    """Raise ModelError unless a model can be saved under this name."""
+    if path.suffix != SUFFIX:
+        raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
+    if not path.stem.isprintable():
+        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+    try:
+        check_new(path)
+    except LogError as error:
+        raise ModelError(str(error)) from error
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model file; the same model gives the same bytes.
+
+    Raises
+    ------
+    ModelError
+        If the file exists, the folder does not or cannot be written, or the model is inconsistent.
+    """
+    check_output(path)
+    common = {name: getattr(model, name) for name in _COMMON if getattr(model, name).size}
+    arrays = {name: np.ascontiguousarray(a) for name, a in {**model.arrays, **common}.items()}
+    _check(path, model.description, arrays)
+    text = json.dumps(model.description.model_dump(), ensure_ascii=False)
+    data = save(arrays, {_KEY: text})
+    _check_header(path, data)
+    try:
+        with new_file(path) as temporary:
+            temporary.write_bytes(data)
+    except LogError as error:
+        raise ModelError(str(error)) from error
+
+
+def load_model(path: Path) -> Model:
+    """Read a model file and check everything in it; nothing of it is executed.
+
+    Raises
+    ------
+    ModelError
+        If it is missing, too large, damaged, inconsistent, or made for another feature set.
+    """
+    path = _pointed_to(path)
+    if not path.stem.isprintable():
+        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+    data = read_whole(path, "model file", _SIZE_LIMIT, ModelError)
+    _check_header(path, data)
+    try:
+        arrays = load(data)
+    except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
+        raise ModelError(f"{path}: is no model file ({one_line(error)})") from error
+    description = _description(path, data)
+    _check(path, description, arrays)
+    for array in arrays.values():
+        array.flags.writeable = False
+    common = {name: arrays.pop(name) for name in _COMMON if name in arrays}
+    name, digest = path.stem, hashlib.sha256(data).hexdigest()
+    return Model(description, arrays, **common, name=name, sha256=digest)
+
+
+def _pointed_to(path: Path) -> Path:
+    """Follow a link such as `champion`: its name does not say which model it is."""
+    try:
+        return Path(os.path.realpath(path)) if path.is_symlink() else path
+    except OSError:
+        return path  # why, reading it will say
+
+
+def _check_header(path: Path, data: bytes) -> None:
+    if int.from_bytes(data[:8], "little") > _HEADER_LIMIT:
+        raise ModelError(f"{path}: is no model file (its header is too large)")
+
+
+def _description(path: Path, data: bytes) -> Description:
+    length = int.from_bytes(data[:8], "little")
+    text = json.loads(data[8 : 8 + length]).get("__metadata__", {}).get(_KEY)
+    if text is None:
+        raise ModelError(f"{path}: is no model of hearthlog: it does not describe itself")
+    try:
+        return read_description(text)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _check(path: Path, about: Description, arrays: Mapping[str, Array]) -> None:
+    try:
+        problem = _problem(about) or _problem_of(about, arrays)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    if problem:
+        raise ModelError(f"{path}: {problem}")
+
+
+def _problem(about: Description) -> str | None:
+    """Say what in a description contradicts the rest of it, or what is installed here."""
+    features = feature_set(about.feature_set)
+    if about.feature_set_version != features.version:
+        return (
+            f"is for version {about.feature_set_version} of feature set {features.name}; "
+            f"here is version {features.version}: train it anew"
+        )
+    if len(about.feature_names) != features.width:
+        return f"names {len(about.feature_names)} features, which {about.feature_set} has not"
+    if about.inputs not in features.inputs:
+        return f"inputs: {features.name} has no {one_line(about.inputs)[:64]!r}"
+    try:
+        classifier_kind(about.kind).parameters.model_validate(about.parameters)
+    except ValidationError as error:
+        return first_problem(error)
+    return _problem_of_classes(about)
+
+
+def _problem_of_classes(about: Description) -> str | None:
+    classes = set(about.classes)
+    tables = (about.scenario, about.training_data.classes, about.metrics.classes)
+    confusion = about.metrics.confusion
+    if len(classes) != len(about.classes):
+        return "names a class twice"
+    if any(table.keys() != classes for table in tables):
+        return "its scenario, training data and metrics are not all of its classes"
+    if {len(confusion), *map(len, confusion)} != {len(classes)}:
+        return "its confusion matrix does not fit its classes"
+    return None
+
+
+def _problem_of(about: Description, arrays: Mapping[str, Array]) -> str | None:
+    """Say what is wrong with the arrays of a model."""
+    kind, classes = classifier_kind(about.kind), len(about.classes)
+    dtypes = {**kind.arrays, **kind.optional, **_COMMON}
+    if not kind.arrays.keys() <= arrays.keys() <= dtypes.keys():
+        return f"has other arrays than a model of kind {kind.name}"
+    shapes = _shapes(about, arrays)
+    if shapes.keys() != arrays.keys():
+        name = min(shapes.keys() ^ arrays.keys())
+        return f"{name} {'is missing' if name in shapes else 'is out of place'}"
+    for name, shape in shapes.items():
+        if problem := _problem_of_array(arrays[name], dtypes[name], shape):
+            return f"{name} {problem}"
+    target = arrays.get("training_target", np.empty(0))
+    if ((target < 0) | (target >= classes)).any():
+        return "training_target has classes that the model has not"
+    transitions = arrays.get("transitions", np.ones((1, 1)))
+    if (transitions < 0).any() or (np.abs(transitions.sum(axis=1) - 1.0) > _ROUNDING).any():
+        return "the rows of transitions are no probabilities"
+    return kind.problem(classes, arrays)
+
+
+def _problem_of_array(
+    array: NDArray[Any], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> str | None:
+    if array.dtype != dtype:
+        return f"is of type {array.dtype}, not {dtype}"
+    if array.shape != shape:
+        return f"has shape {array.shape}, not {shape}"
+    if not np.isfinite(array).all():
+        return "has values that are not finite"
+    if array.dtype == np.float64 and not (np.abs(array) <= _LARGEST).all():
+        return "has values that make no sense"
+    return None
+
+
+def _shapes(about: Description, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
+    """Return the shape that each array must have."""
+    features, classes = feature_set(about.feature_set), len(about.classes)
+    width = features.inputs[about.inputs].width
+    shapes = classifier_kind(about.kind).shapes(classes, width, arrays)
+    if about.smoothing.method == "hmm":
+        shapes["transitions"] = (classes, classes)
+    kept = arrays.get("training_windows", np.empty(0))
+    if kept.ndim and len(kept):
+        shapes["training_windows"] = (len(kept), features.window_frames, features.width)
+        shapes["training_target"] = shapes["training_group"] = (len(kept),)
+    return shapes

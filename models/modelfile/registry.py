@@ -1,0 +1,235 @@
+"""A folder of model files, of which one is the champion: the one that speaks.
+
+`champion` and `candidate` are symbolic links in the folder, so that any program can open them; a
+link is replaced in one step, so that there is a champion at every moment. Earlier champions are
+lines of the plain file `history`, the last one at the end. It is written before the link: killed
+between the two, it ends with the champion that still is, which is passed over.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+from hearthlog.schemas.logs.files import sync_folder
+
+CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
+_HISTORY = "history"
+_KEPT = 100  # earlier champions
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One file of the folder.
+
+    Attributes
+    ----------
+    name : str
+    aliases : tuple of str
+        Those that point to it.
+    size : int
+        Bytes.
+    model : Model or None
+        None if it cannot be used.
+    problem : str
+        Why not.
+    """
+
+    name: str
+    aliases: tuple[str, ...]
+    size: int
+    model: Model | None
+    problem: str = ""
+
+
+def list_models(folder: Path) -> list[Entry]:
+    """Load every model of a folder, in the order of their names; aliases that lead nowhere too.
+
+    Raises
+    ------
+    ModelError
+        If there is no such folder.
+    """
+    _check_folder(folder)
+    named = {alias: target(folder, alias) for alias in ALIASES}
+    names = {path.stem for path in folder.glob("[!.]*" + SUFFIX)} - set(ALIASES)
+    names |= {name for name in named.values() if name is not None}
+    return [
+        _entry(folder, name, tuple(alias for alias in ALIASES if named[alias] == name))
+        for name in sorted(names)
+    ]
+
+
+def target(folder: Path, alias: str) -> str | None:
+    """Return the name of the model that an alias points to; None if there is no such alias.
+
+    Raises
+    ------
+    ModelError
+        If its name is taken by something else than a link to a file of the folder.
+    """
+    link = _path(folder, alias)
+    if not os.path.lexists(link):
+        return None
+    text = str(link.readlink()) if link.is_symlink() else ""
+    if Path(text).name != text or Path(text).suffix != SUFFIX or Path(text).stem in ALIASES:
+        raise ModelError(
+            f"{link}: is no link to a model file of this folder; give it another name, and promote "
+            "a model"
+        )
+    return Path(text).stem
+
+
+def resolve(folder: Path, name: str) -> str:
+    """Return the name of a model, which may be given as an alias or as the name of its file.
+
+    Raises
+    ------
+    ModelError
+        If it is an alias that is not there, or no name of a file of the folder.
+    """
+    name = name.removesuffix(SUFFIX)
+    if name in ALIASES:
+        found = target(folder, name)
+        if found is None:
+            raise ModelError(f"{folder}: there is no {name}; name a model, or promote one")
+        return found
+    if Path(name).name != name:
+        raise ModelError(f"{name!a}: name a model of {folder}, without its folder")
+    return name
+
+
+def load(folder: Path, name: str) -> Model:
+    """Load a model of a folder, by its name or an alias; raises ModelError."""
+    _check_folder(folder)
+    return load_model(_path(folder, resolve(folder, name)))
+
+
+def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
+    """Point an alias to a model, if that can be used.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        Of the model, or another alias.
+    alias : str
+        `champion` or `candidate`.
+
+    Returns
+    -------
+    model : Model
+    before : str or None
+        What the alias pointed to: the same name if nothing had to be done.
+
+    Raises
+    ------
+    ModelError
+        If the model cannot be used, or the folder cannot be written.
+    """
+    with _locked(folder):
+        before = target(folder, alias)
+        model = load(folder, name)
+        if model.name != before:
+            if alias == CHAMPION and before is not None:
+                _write_history(folder, [*_earlier(folder), before])
+            _point(folder, alias, model.name)
+        return model, before
+
+
+def rollback(folder: Path) -> tuple[Model, str]:
+    """Make the champion before, or the last one that can still be used, the champion again.
+
+    Returns
+    -------
+    model : Model
+        The champion now.
+    before : str
+        The champion until now.
+
+    Raises
+    ------
+    ModelError
+        If there is none, or the folder cannot be written.
+    """
+    with _locked(folder):
+        before = resolve(folder, CHAMPION)
+        earlier = _earlier(folder)
+        while earlier:
+            with suppress(ModelError):
+                model = load(folder, earlier.pop())
+                _point(folder, CHAMPION, model.name)
+                _write_history(folder, earlier)
+                return model, before
+        raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
+
+
+def _entry(folder: Path, name: str, aliases: tuple[str, ...]) -> Entry:
+    path = _path(folder, name)
+    try:
+        model = load_model(path)
+        return Entry(name, aliases, path.stat().st_size, model)
+    except (ModelError, OSError) as error:
+        size = path.stat().st_size if path.is_file() else 0
+        return Entry(name, aliases, size, None, str(error))
+
+
+def _path(folder: Path, name: str) -> Path:
+    return folder / (name + SUFFIX)
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise ModelError(
+            f"{folder}: no such folder of models; create it, and put model files there"
+        )
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep others from changing the aliases of a folder at the same time."""
+    _check_folder(folder)
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise ModelError(f"{folder}: cannot be written ({error.strerror or error})") from error
+
+
+def _point(folder: Path, alias: str, name: str) -> None:
+    """Replace a link in one step."""
+    link = _path(folder, alias)
+    temporary = folder / f".{link.name}.tmp"
+    temporary.unlink(missing_ok=True)  # left by a command that was killed
+    temporary.symlink_to(name + SUFFIX)
+    temporary.replace(link)
+    sync_folder(folder)
+
+
+def _earlier(folder: Path) -> list[str]:
+    """Read the earlier champions, without the one that still is."""
+    path = folder / _HISTORY
+    names = path.read_text(errors="replace").splitlines() if path.is_file() else []
+    champion = target(folder, CHAMPION)
+    while names and names[-1] == champion:
+        names.pop()
+    return names
+
+
+def _write_history(folder: Path, names: list[str]) -> None:
+    temporary = folder / f".{_HISTORY}.tmp"
+    with temporary.open("w") as stream:
+        stream.writelines(f"{name}\n" for name in names[-_KEPT:])
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(folder / _HISTORY)
+    sync_folder(folder)

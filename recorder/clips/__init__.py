@@ -1,0 +1,1 @@
+"""Clips: which sound may be kept, keeping it, forgetting it."""

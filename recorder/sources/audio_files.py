@@ -1,0 +1,108 @@
+"""Audio files in the place of a microphone."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from threading import Event as Flag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.events import Event, Frames, Health
+from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.times import NANOSECONDS
+
+_REALTIME_FRAMES = 10
+_HEALTH_FRAMES = 200  # every 10 s
+
+Float32 = NDArray[np.float32]
+
+
+class FileSource:
+    """Several audio files in a row, as one stream of frames.
+
+    What is left at the very end and fills no frame is not heard.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    start : int
+        Time of the first sample in nanoseconds of UTC.
+    realtime : bool
+        Hand on each frame only when its time has come since the first one.
+    progress : callable
+        Told the share of the sound that was handed on.
+
+    Raises
+    ------
+    SourceError
+        If one of the files is missing, or is no audio.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        start: int,
+        *,
+        realtime: bool = False,
+        progress: Callable[[float], None] = lambda _: None,
+    ) -> None:
+        self._seconds = sum(audio_seconds(path) for path in paths)
+        self.device = _name(paths)
+        self._paths = paths
+        self._start = start
+        self._realtime = realtime
+        self._progress = progress
+
+    def events(self, stop: Flag) -> Iterator[Event]:
+        """Hand on the frames until the files end or `stop` is set.
+
+        Raises
+        ------
+        SourceError
+            If a file turns out to be damaged, or if all together are shorter than a frame.
+        """
+        began = time.monotonic()
+        first = 0
+        for samples in self._frames():
+            frames = Frames(first, samples, self._stamps(first, len(samples)))
+            if self._realtime:
+                heard_at = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
+                stop.wait(max(heard_at - time.monotonic(), 0.0))
+            if stop.is_set():
+                return
+            if first % _HEALTH_FRAMES == 0:
+                yield Health(int(frames.stamps[0]), 0, "reading", {"device": self.device})
+            yield frames
+            first += len(samples)
+            self._progress(first * FRAME_NANOSECONDS / NANOSECONDS / self._seconds)
+        if first == 0:
+            files = ", ".join(str(path) for path in self._paths)
+            raise SourceError(f"{files}: shorter than one frame of 50 ms")
+
+    def _stamps(self, first: int, count: int) -> NDArray[np.int64]:
+        return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS
+
+    def _frames(self) -> Iterator[Float32]:
+        """Cut the sound into blocks of frames that divide the interval of the health reports."""
+        size = (_REALTIME_FRAMES if self._realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
+        held = np.empty(0, np.float32)
+        for path in self._paths:
+            for block in read_audio(path):
+                held = np.concatenate([held, block])
+                whole = len(held) - len(held) % size
+                for start in range(0, whole, size):
+                    yield held[start : start + size].reshape(-1, FRAME_SAMPLES)
+                held = held[whole:]
+        rest = len(held) - len(held) % FRAME_SAMPLES
+        if rest:
+            yield held[:rest].reshape(-1, FRAME_SAMPLES)
+
+
+def _name(paths: Sequence[Path]) -> str:
+    """Name the files in a few words: every diagnostic message repeats them."""
+    if len(paths) == 1:
+        return paths[0].name
+    return f"{paths[0].name} … {paths[-1].name} ({len(paths)} files)"

@@ -1,0 +1,21 @@
+"""Arrays: names of their types, and pieces of buffers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Int64 = NDArray[np.int64]
+
+
+def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
+    """Copy pieces of `size` bytes, at any offsets, out of a buffer.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], of dtype V`size`
+    """
+    # A view whose elements overlap: one for every offset at which a piece may begin.
+    view: NDArray[np.void] = np.ndarray(
+        (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
+    )
+    return view[offsets]

@@ -1,0 +1,267 @@
+"""Read topics of logs as columns, in the order of time and within bounded memory."""
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.merged_reading import iterate_pieces
+from hearthlog.schemas.mcap.chunks import RawMessages, bounds
+from hearthlog.schemas.mcap.logfile import topic_counts
+from hearthlog.schemas.messages.cdr_codec import Fields, decode_rows, ragged
+from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.storage.byte_ranges import map_logs
+
+_HEADS = ("log_times", "publish_times", "sequences")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Messages of one topic as arrays, one row each.
+
+    `columns["values"]` is the column of a field, by its path ("header.stamp" for one of a message
+    in the message): numbers as they are; stamps and durations as int64 nanoseconds; strings as
+    `str` objects; arrays as one row each, or as objects where their lengths differ; arrays of
+    messages as lists of dicts. Of our types these are the fields that this version has: what a log
+    of an older one lacks has its default, and what a newer one appended is not there.
+
+    Attributes
+    ----------
+    topic, type : str
+    metadata : mapping of str to str
+        Of the channel.
+    log_times, publish_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds; log times ascend.
+    sequences : np.ndarray [shape=(n,)], uint32
+    fields : dict of str to np.ndarray [shape=(n, ...)]
+    """
+
+    topic: str
+    type: str
+    metadata: Mapping[str, str]
+    log_times: Int64
+    publish_times: Int64
+    sequences: NDArray[np.uint32]
+    fields: Fields
+
+    def __len__(self) -> int:
+        return len(self.log_times)
+
+    def __getitem__(self, path: str) -> NDArray[Any]:
+        """Return the column of a field; raise LogError if the messages have no such field."""
+        try:
+            return self.fields[path]
+        except KeyError:
+            raise LogError(f"{self.topic}: {self.type} has no field {path!r}") from None
+
+    def between(self, start: int | None, end: int | None) -> "Columns":
+        """Return the messages with start <= log time < end."""
+        rows = slice(*bounds(self.log_times, start, end))
+        if rows == slice(0, len(self)):
+            return self
+        return self.taken(rows)
+
+    def taken(self, rows: slice | NDArray[np.intp]) -> "Columns":
+        """Return some of the messages."""
+        return replace(
+            self,
+            log_times=self.log_times[rows],
+            publish_times=self.publish_times[rows],
+            sequences=self.sequences[rows],
+            fields={path: values[rows] for path, values in self.fields.items()},
+        )
+
+
+def read_columns(
+    logs: Iterable[Path],
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    end: int | None = None,
+    fields: Collection[str] | None = None,
+) -> dict[str, Columns]:
+    """Read topics of some logs as one series each.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    topics : collection of str, optional
+        All by default.
+    start, end : int, optional
+        Log times, in nanoseconds: from `start` on, before `end`.
+    fields : collection of str, optional
+        Paths of the fields that are wanted; all by default.
+
+    Returns
+    -------
+    dict of str to Columns
+        By topic; a topic without a message is not there. Where the files of a topic do not agree
+        on its metadata, or on its fields, only what they agree on is kept.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if its messages are not of the type that it says, or if two logs
+        have different types on one topic.
+    """
+    logs = list(logs)
+    whole = start is None and end is None
+    expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
+    found: dict[str, _Pile] = {}
+    for batch in iterate_columns(logs, topics, start, end, fields):
+        for columns in batch:
+            found.setdefault(columns.topic, _Pile(expected[columns.topic])).add(columns)
+    return {topic: found.pop(topic).columns() for topic in list(found)}
+
+
+def iterate_columns(
+    logs: Iterable[Path],
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    end: int | None = None,
+    fields: Collection[str] | None = None,
+) -> Iterator[list[Columns]]:
+    """Read topics of some logs piece by piece; parameters and errors as of `read_columns`.
+
+    Yields
+    ------
+    list of Columns
+        The next span of time: one for each topic that speaks in it, or more where its channels
+        differ in type, fields or metadata. Nothing is older than what was yielded before.
+    """
+    pieces = iterate_pieces(logs, topics, start, end, partial(decode, fields=fields))
+    return map(_joined, pieces)
+
+
+def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
+    """Decode messages, those of one topic, type, fields and metadata together.
+
+    Raises
+    ------
+    LogError
+        If they are not of the type that their channel says, or not encoded as CDR.
+    """
+    return _joined([_decode(raw, fields) for raw in messages])
+
+
+def _joined(pieces: Iterable[Columns]) -> list[Columns]:
+    """Join pieces of one topic, type, fields and metadata, in the order of time."""
+    parts: dict[Any, list[Columns]] = {}
+    for columns in pieces:
+        about = tuple(sorted(columns.metadata.items()))
+        key = columns.topic, columns.type, tuple(columns.fields), about
+        parts.setdefault(key, []).append(columns)
+    return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
+
+
+def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
+    topic, schema = raw.channel.topic, raw.schema
+    if schema is None or raw.channel.message_encoding != "cdr":
+        raise LogError(f"{topic}: holds no ROS 2 messages ({raw.channel.message_encoding!r})")
+    try:
+        kind = message_type(schema.name, schema.encoding, schema.data)
+        values = decode_rows(kind, raw.buffer, raw.offsets, raw.sizes, fields)
+    except LogError as error:
+        raise LogError(f"{topic}: {error}") from error
+    return Columns(
+        topic,
+        schema.name,
+        raw.channel.metadata,
+        np.ascontiguousarray(raw.heads["log_time"]),
+        np.ascontiguousarray(raw.heads["publish_time"]),
+        np.ascontiguousarray(raw.heads["sequence"]),
+        values,
+    )
+
+
+def join(parts: Sequence[Columns]) -> Columns:
+    """Put pieces of one topic one after the other; fields that not all of them have are left out.
+
+    Raises
+    ------
+    LogError
+        If they are of different types.
+    """
+    pile = _Pile()
+    for part in parts:
+        pile.add(part)
+    return pile.columns()
+
+
+class _Pile:
+    """Pieces of one topic, until they are joined."""
+
+    def __init__(self, expected: int = 0) -> None:
+        self._expected = expected
+        self._first: Columns | None = None
+        self._metadata: dict[str, str] = {}
+        self._heads = {name: _Growing(expected) for name in _HEADS}
+        self._fields: dict[str, _Growing] = {}
+
+    def add(self, part: Columns) -> None:
+        """Append a piece; it must be of the type of the others."""
+        if self._first is None:
+            self._first, self._metadata = part, dict(part.metadata)
+            self._fields = {path: _Growing(self._expected) for path in part.fields}
+        if part.type != self._first.type:
+            raise LogError(f"{part.topic}: is of type {self._first.type} and of type {part.type}")
+        self._metadata = dict(self._metadata.items() & part.metadata.items())
+        for name, growing in self._heads.items():
+            growing.append(getattr(part, name))
+        for path in self._fields.keys() - part.fields.keys():
+            del self._fields[path]
+        for path, growing in self._fields.items():
+            growing.append(part.fields[path])
+
+    def columns(self) -> Columns:
+        """Return all pieces as one; they are gone then."""
+        assert self._first is not None
+        heads: Any = {name: growing.joined() for name, growing in self._heads.items()}
+        fields = {path: growing.joined() for path, growing in self._fields.items()}
+        return replace(self._first, metadata=self._metadata, fields=fields, **heads)
+
+
+class _Growing:
+    """An array that grows.
+
+    Fresh memory is what takes the time, and numpy asks for large pages where it makes a large
+    array: one of the right size at once is written twice as fast as one that is put together.
+    """
+
+    def __init__(self, expected: int) -> None:
+        self._expected = expected
+        self._values: NDArray[Any] | None = None
+        self._count = 0
+
+    def append(self, values: NDArray[Any]) -> None:
+        """Append rows; where their dtype or shape is another, rows become objects."""
+        kept = self._values
+        if kept is not None and (kept.dtype, kept.shape[1:]) != (values.dtype, values.shape[1:]):
+            kept, values = ragged(kept[: self._count]), ragged(values)
+        end = self._count + len(values)
+        if kept is None or end > len(kept):
+            rows = end if kept is None and end >= self._expected else max(2 * end, self._expected)
+            try:
+                grown = np.empty((rows, *values.shape[1:]), values.dtype)
+            except MemoryError:  # what a file says of itself need not be true
+                grown = np.empty((end, *values.shape[1:]), values.dtype)
+            if kept is not None:
+                grown[: self._count] = kept[: self._count]
+            kept = grown
+        kept[self._count : end] = values
+        self._values, self._count = kept, end
+
+    def joined(self) -> NDArray[Any]:
+        """Return all rows."""
+        assert self._values is not None
+        return self._values[: self._count]
+
+
+def _in_order(columns: Columns) -> Columns:
+    return columns.taken(np.argsort(columns.log_times, kind="stable"))

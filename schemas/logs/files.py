@@ -1,0 +1,236 @@
+"""Names of logs: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`, in UTC."""
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
+from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
+from hearthlog.schemas.storage.regular_file import may_be_regular
+from hearthlog.schemas.times import NANOSECONDS
+
+SUFFIX = ".mcap"
+AUDIO_SUFFIX = ".audio" + SUFFIX
+_LAYER = re.compile(r"\.(relabel-.+|review|audio)\.mcap(\.active)?")
+CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
+ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
+
+
+def check_node_name(name: str) -> str:
+    """Return the name if it can begin a file name everywhere."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise LogError(
+            f"node name {name!r} cannot be part of a file name: use at most 64 letters, digits, "
+            "'-' and '_'"
+        )
+    return name
+
+
+def log_path(root: Path, node: str, start: int) -> Path:
+    """Name the log that starts at `start` (nanoseconds, UTC)."""
+    moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
+    return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
+
+
+def active_path(path: Path) -> Path:
+    """Name a log while it is being written."""
+    return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
+
+
+def audio_path(log: Path) -> Path:
+    """Name the layer of a log that has its clips of sound."""
+    return log.with_name(stem(log) + AUDIO_SUFFIX)
+
+
+def stem(log: Path) -> str:
+    """Name a log without its suffix, finished or not."""
+    return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+
+
+def is_layer(path: Path) -> bool:
+    """Tell by its name whether a log is a layer, which speaks of another log."""
+    return _LAYER.search(path.name) is not None
+
+
+def is_log(path: Path) -> bool:
+    """Tell whether this is a log by its name, and a file; in a store there is nothing else."""
+    named = path.name.endswith((SUFFIX, ACTIVE_SUFFIX))
+    return named and (not is_local(path) or may_be_regular(path))
+
+
+def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
+    """List the logs in a folder, or the log itself; those still being written come too.
+
+    Parameters
+    ----------
+    path : Path
+    enrolled : bool
+        Whether the sounds in folders `enrolled` of it come too, which are no time of the home.
+
+    Raises
+    ------
+    LogError
+        If there is none, or the path is that of a pipe, a socket or a device.
+    """
+    logs = _find_local(path) if is_local(path) else _find_stored(path)
+    depth = len(path.parts)
+    found = [log for log in logs if enrolled or ENROLLED not in log.parts[depth:-1]]
+    if logs and not found:
+        raise LogError(
+            f"{path}: no log (*{SUFFIX}) in this folder but enrolled sounds; name their folder "
+            f"{ENROLLED!r} to read those"
+        )
+    return found
+
+
+def _find_local(path: Path) -> list[Path]:
+    if path.is_dir():
+        found = sorted(filter(is_log, path.rglob("*")))
+        if not found:
+            raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
+        return found
+    if not path.exists():
+        raise LogError(f"{path}: no such log")
+    if not may_be_regular(path):
+        raise LogError(f"{path}: cannot be read (Not a regular file)")
+    return [path]
+
+
+def _find_stored(path: Any) -> list[Path]:
+    """List the logs under a name in a store, in which folders are parts of names."""
+    with store_errors(path):
+        names = path.fs.find(path.path)
+    if names == [path.path]:
+        return [path]
+    found = [name for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX))]
+    if not found:
+        raise LogError(f"{path}: no log (*{SUFFIX}) under this name")
+    return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(found)]
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a file's creation or renaming in this folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def check_new(path: Path) -> None:
+    """Raise LogError unless a file or folder can be made under this name.
+
+    Whether a store lets us write is known only when we do.
+    """
+    if not is_local(path):
+        _check_new_stored(path)
+        return
+    if os.path.lexists(path):
+        raise _exists(path)
+    if not path.parent.is_dir():
+        raise LogError(f"{path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise LogError(f"{path}: the folder cannot be written to")
+
+
+def _check_new_stored(path: Any) -> None:
+    with store_errors(path):
+        exists = path.fs.exists(path.path)
+    if exists:
+        raise _exists(path)
+
+
+def _exists(path: Path) -> LogError:
+    return LogError(f"{path}: exists already; choose another name, or delete it first")
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Make a file: yield a temporary name to write to, and give it its own when that went well.
+
+    For a path in a store the temporary file is one of this machine, and is put there at the end.
+    S3 shows it whole or not at all, and refuses to put it over another one. That is not sure of
+    every store: between a last look and the end of putting, another file of this name may be
+    replaced, and a store that has real folders may keep a part of a file when it is cut off.
+
+    Raises
+    ------
+    LogError
+        If there is such a file already, or if it cannot be written.
+    """
+    check_new(path)
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=True) as temporary:
+        yield temporary
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
+
+    Raises
+    ------
+    LogError
+        If it cannot be written.
+    """
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=False) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
+    temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        if new:
+            _name(temporary, path)
+        else:
+            temporary.replace(path)
+        sync_folder(path.parent)
+    except FileExistsError as error:
+        raise _exists(path) from error
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _name(temporary: Path, path: Path) -> None:
+    """Give a file its name, which unlike a rename never takes it from another file."""
+    try:
+        path.hardlink_to(temporary)
+    except FileExistsError:
+        raise
+    except OSError:  # an SD card without links
+        path.open("xb").close()
+        temporary.replace(path)
+
+
+@contextmanager
+def _put_in_store(path: Any, *, new: bool) -> Iterator[Path]:
+    try:
+        with tempfile.TemporaryDirectory(prefix="hearthlog-") as folder:
+            temporary = Path(folder) / path.name
+            yield temporary
+            with store_errors(path):
+                _put(temporary, path, new=new)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _put(file: Path, path: Any, *, new: bool) -> None:
+    if new:
+        check_new(path)  # again: not every store minds `create`
+    try:
+        path.fs.put_file(str(file), path.path, mode="create" if new else "overwrite")
+    except FileExistsError as error:
+        raise _exists(path) from error

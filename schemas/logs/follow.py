@@ -1,0 +1,229 @@
+"""Follow logs while they are written, from file to file."""
+
+import os
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, stem
+from hearthlog.schemas.logs.merged_reading import iterate_messages
+from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+
+_POLL_SECONDS = 0.2
+_SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change
+_BATCH = 2 << 20  # bytes, uncompressed, that are read at once
+
+
+def follow(
+    folder: Path,
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    fields: Collection[str] | None = None,
+    stop: Event | None = None,
+) -> Iterator[list[Columns]]:
+    """Read the logs of a folder as they are written, across files and restarts of the recorder.
+
+    What a recorder hands to the operating system is read within a fraction of a second.
+
+    Parameters
+    ----------
+    folder : Path
+        Logs may lie at any depth. Files that are there but not being written are read first, if
+        `start` asks for them.
+    topics : collection of str, optional
+        All by default.
+    start : int, optional
+        Log time, in nanoseconds, from which on messages are wanted; by default those that are
+        written from now on.
+    fields : collection of str, optional
+        Paths of the fields that are wanted; all by default.
+    stop : threading.Event, optional
+        Ends it.
+
+    Yields
+    ------
+    list of Columns
+        What was written since the last one. Of one log, in the order of time.
+
+    Raises
+    ------
+    LogError
+        If there is no such folder, or a log is damaged.
+    """
+    for _, messages in follow_messages(folder, topics, start, stop):
+        yield decode(messages, fields)
+
+
+Damaged = Callable[[LogError], None]
+
+
+def _refuse(error: LogError) -> None:
+    raise error
+
+
+def follow_messages(
+    folder: Path,
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    stop: Event | None = None,
+    damaged: Damaged = _refuse,
+) -> Iterator[tuple[Path, list[RawMessages]]]:
+    """Read the messages of logs, still encoded, as they are written; as `follow` does.
+
+    Parameters
+    ----------
+    folder, topics, start, stop
+        Those of `follow`.
+    damaged : callable
+        Takes the error of a log that is damaged, of which no more is read then; by default it is
+        raised.
+
+    Yields
+    ------
+    Path, list of RawMessages
+        A log, and what was written to it since the last time.
+    """
+    stop = stop or Event()
+    if not folder.is_dir():
+        raise LogError(f"{folder}: no such folder")
+    watch = _Folder(folder)
+    present = watch.new_logs()
+    if start is not None:
+        finished = [path for path in present if not path.name.endswith(ACTIVE_SUFFIX)]
+        yield from _read_finished(finished, topics, start, damaged)
+    growing = [g for path in present if path.name.endswith(ACTIVE_SUFFIX) for g in _open(path)]
+    if start is None:
+        for log in growing:
+            log.file.walk()  # and forget what was written before
+    try:
+        while not stop.is_set():
+            found = False
+            for log in growing:
+                for messages in log.read(topics, start, damaged):
+                    found = True
+                    yield log.file.path, messages
+            growing = [log for log in growing if log.is_open()]
+            growing += [log for path in watch.new_logs() for log in _open(path)]
+            if not found:
+                stop.wait(_POLL_SECONDS)
+    finally:
+        for log in growing:
+            log.file.close()
+
+
+def _read_finished(
+    paths: list[Path], topics: Collection[str] | None, start: int, damaged: Damaged
+) -> Iterator[tuple[Path, list[RawMessages]]]:
+    for path in paths:
+        try:
+            for messages in iterate_messages([path], topics, start):
+                yield path, messages
+        except LogError as error:
+            damaged(error)
+
+
+class _Growing:
+    """A log that is being written."""
+
+    def __init__(self, file: LogFile) -> None:
+        self.file = file
+        self._is_damaged = False
+        self._replaced = False
+
+    def read(
+        self, topics: Collection[str] | None, start: int | None, damaged: Damaged
+    ) -> Iterator[list[RawMessages]]:
+        """Read what was written since the last time."""
+        try:
+            yield from self._read(topics, start)
+        except LogError as error:
+            self._is_damaged = True
+            damaged(error)
+
+    def _read(
+        self, topics: Collection[str] | None, start: int | None
+    ) -> Iterator[list[RawMessages]]:
+        self._replaced = self._is_replaced()  # asked first, so that nothing comes in between
+        chunks = self.file.walk()
+        for part in _batches(chunks):
+            messages = [m.between(start, None) for m in read_chunks(self.file, part, topics)]
+            if any(map(len, messages)):
+                yield [m for m in messages if len(m)]
+
+    def is_open(self) -> bool:
+        """Tell whether more may come; if not, close the log."""
+        if self.file.ended or self._replaced or self._is_damaged:
+            self.file.close()
+            return False
+        return True
+
+    def _is_replaced(self) -> bool:
+        """Tell whether a recorder that was started again completed this log in its place."""
+        return not any(self.file.is_at(name) for name in _names(self.file.path))
+
+
+def _names(path: Path) -> tuple[Path, Path]:
+    """Return the name of a log while it is written, and when it is finished."""
+    return path.with_name(stem(path) + ACTIVE_SUFFIX), path.with_name(stem(path) + SUFFIX)
+
+
+def _open(path: Path) -> Iterator[_Growing]:
+    """Open a log that may get its final name at any moment."""
+    for name in _names(path):
+        with suppress(LogError):
+            yield _Growing(LogFile(name, indexed=False))
+            return
+
+
+def _batches(chunks: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+    if len(chunks):
+        sizes = np.cumsum(chunks["size"]) // _BATCH
+        yield from np.split(chunks, np.flatnonzero(np.diff(sizes)) + 1)
+
+
+class _Folder:
+    """A folder of logs, looked through again and again.
+
+    Only the folders that changed are listed: a recorder leaves ten thousand files a year.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._listed: dict[Path, int] = {root: -1}
+        self._known: set[str] = set()
+
+    def new_logs(self) -> list[Path]:
+        """Return the logs that were not there the last time, by name."""
+        found: dict[str, Path] = {}
+        todo = list(self._listed)
+        while todo:
+            folder = todo.pop()
+            try:
+                changed = folder.stat().st_mtime_ns
+                if changed == self._listed[folder]:
+                    continue
+                settled = time.time_ns() - changed > _SETTLED
+                self._listed[folder] = changed if settled else -1
+                entries = list(os.scandir(folder))
+            except OSError:
+                del self._listed[folder]  # it was removed
+                continue
+            for entry in entries:
+                path = Path(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    if path not in self._listed and entry.name != ENROLLED:
+                        self._listed[path] = -1
+                        todo.append(path)
+                elif is_log(path):
+                    name = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
+                    if name not in self._known:
+                        found[name] = path
+        self._known |= found.keys()
+        return [found[stem] for stem in sorted(found)]

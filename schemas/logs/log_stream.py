@@ -1,0 +1,136 @@
+"""What is in a log, written to a stream: MCAP of profile `ros2`."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter
+from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
+from hearthlog.schemas.messages.message_types import definition, type_hash
+from hearthlog.schemas.messages.topics import Topic
+
+PROFILE = "ros2"
+ENCODING = "cdr"
+SCHEMA_ENCODING = "ros2msg"
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """A file carried inside a log."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+class Rows(NamedTuple):
+    """Messages of one topic as columns.
+
+    Attributes
+    ----------
+    topic : str
+    log_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds; the publish times are the same.
+    fields : mapping of str to column
+        As `hearthlog.schemas.messages.cdr_codec.encode_groups` takes them.
+    """
+
+    topic: str
+    log_times: Int64
+    fields: Mapping[str, Column]
+
+
+class LogContent:
+    """A log on a stream.
+
+    What is pickled goes on elsewhere: `continue_on` a stream that has what was flushed.
+
+    Parameters
+    ----------
+    stream : BinaryIO
+        At its start; stays open.
+    topics : sequence of Topic
+    """
+
+    def __init__(self, stream: BinaryIO, topics: Sequence[Topic]) -> None:
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, rosbag2.TopicCount] = {}
+        self._span: tuple[int, int] | None = None
+        self._writer = ChunkWriter(stream)
+        self._writer.start(profile=PROFILE, library="hearthlog")
+        schemas: dict[str, int] = {}
+        for topic in topics:
+            if topic.type not in schemas:
+                schemas[topic.type] = self._writer.register_schema(
+                    topic.type, SCHEMA_ENCODING, definition(topic.type).encode()
+                )
+            about = _channel_metadata(topic)
+            self._counts[topic.name] = rosbag2.TopicCount(topic.type, about)
+            self._channels[topic.name] = self._writer.register_channel(
+                topic.name, ENCODING, schemas[topic.type], about
+            )
+
+    def continue_on(self, stream: BinaryIO) -> None:
+        """Go on with a stream that has, and is behind, all that was flushed."""
+        self._writer.continue_on(stream)
+
+    def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
+        """Append a metadata record."""
+        self._writer.add_metadata(name, dict(metadata))
+
+    def add_attachment(self, attachment: Attachment, created: int) -> None:
+        """Append a file; `created` is its time, in nanoseconds of UTC."""
+        item = attachment
+        self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
+
+    def write(self, topic: str, log_time: int, data: bytes) -> None:
+        """Append one encoded message; its publish time is its log time."""
+        self._writer.add_message(self._channels[topic], log_time, data, log_time)
+        self._count(topic, 1, log_time, log_time)
+
+    def write_columns(self, batch: Sequence[Rows]) -> None:
+        """Append messages of several topics, in the order of their log times.
+
+        Messages of one time are written in the order of the batch. The file is the same as if
+        they had been encoded and written one by one.
+        """
+        blocks = []
+        first = 0
+        for part in batch:
+            count = len(part.log_times)
+            for rows, payloads in encode_groups(self._counts[part.topic].type, part.fields, count):
+                times = part.log_times[rows]
+                sequences = np.zeros(len(rows), np.uint32)
+                channel = self._channels[part.topic]
+                blocks.append(Block(channel, times, times, sequences, payloads, first + rows))
+            first += count
+            if count:
+                span = int(part.log_times.min()), int(part.log_times.max())
+                self._count(part.topic, count, *span)
+        self._writer.write(blocks)
+
+    def flush(self) -> None:
+        """End the chunk in progress."""
+        self._writer.flush()
+
+    def finish(self, name: str) -> None:
+        """Complete the log, whose file will have this name."""
+        about = rosbag2.file_metadata(name, self._counts, self._span or (0, 0))
+        self._writer.add_metadata(rosbag2.METADATA, about)
+        self._writer.finish()
+
+    def _count(self, topic: str, messages: int, first: int, last: int) -> None:
+        self._counts[topic].messages += messages
+        start, end = self._span or (first, last)
+        self._span = min(start, first), max(end, last)
+
+
+def _channel_metadata(topic: Topic) -> dict[str, str]:
+    names = {f"{key}_names": json.dumps(list(value)) for key, value in topic.array_names.items()}
+    ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
+    return ros | names

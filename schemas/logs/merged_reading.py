@@ -1,0 +1,279 @@
+"""The messages of several logs as one series, in the order of time and within bounded memory."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.storage.byte_ranges import map_logs
+from hearthlog.schemas.storage.prefetch import map_ahead
+
+_BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
+_READERS = 2  # threads: more than these wait for each other's Python
+_FIRST, _LAST = 0, (1 << 63) - 1  # log times
+
+
+class Messages(Protocol):
+    """Messages of one channel or topic, in the order of their log times, encoded or decoded."""
+
+    def __len__(self) -> int: ...
+
+    def between(self, start: int | None, end: int | None) -> Self:
+        """Return those with start <= log time < end."""
+
+
+Piece = TypeVar("Piece", bound=Messages)
+
+
+def time_spans(
+    logs: Iterable[Path], span_of: Callable[[Path], tuple[int, int] | None] = time_span
+) -> list[tuple[int, int, Path]]:
+    """Return first and last log time of each log that has messages, in the order of time.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    span_of : callable
+        Finds out those of one log, or None.
+
+    Raises
+    ------
+    LogError
+        If one is no MCAP file, or is damaged.
+    """
+    paths = list(logs)
+    found = zip(map_logs(span_of, paths), paths, strict=True)
+    spans = [(*span, path) for span, path in found if span is not None]
+    # Paths of this machine and of a store do not compare; their parts do.
+    return sorted(spans, key=lambda span: (*span[:2], tuple(span[2].parts)))
+
+
+class _Log:
+    """A log that is open, and the chunks of it that are wanted, by their start times."""
+
+    def __init__(self, path: Path, query: "_Query") -> None:
+        self.file = LogFile(path)
+        self.chunks = query.wanted(self.file)
+        sizes = self.chunks["size"] + self.chunks["length"]
+        self._ends = np.cumsum(np.clip(sizes, 0, LIMIT))
+        self._position = 0
+
+    @property
+    def start(self) -> int | None:
+        """Start of the next chunk; None at the end."""
+        if self._position == len(self.chunks):
+            return None
+        return int(self.chunks["start"][self._position])
+
+    def next_chunks(self, until: int, size: int) -> NDArray[np.void]:
+        """Hand out chunks that start up to a time, until they are of some size, at least one."""
+        first = self._position
+        read = int(self._ends[first - 1]) if first else 0
+        last = min(
+            np.searchsorted(self.chunks["start"], until, side="right"),
+            np.searchsorted(self._ends, read + size),
+        )
+        self._position = max(int(last), first + 1)
+        return self.chunks[first : self._position]
+
+
+class _Query(NamedTuple):
+    """What is wanted: topics, and log times from `start` on, before `end`."""
+
+    topics: Collection[str] | None
+    start: int
+    end: int
+    check: bool = False
+    every: int = 1
+
+    def wanted(self, file: LogFile) -> NDArray[np.void]:
+        """Return the chunks that may hold a wanted message."""
+        chunks = file.chunks[(file.chunks["end"] >= self.start) & (file.chunks["start"] < self.end)]
+        chunks = chunks[:: self.every]
+        if self.topics is None:
+            return chunks
+        others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}
+        wanted = [not ids or not ids <= others for ids in file.channel_sets]
+        return chunks[np.array(wanted, bool)[chunks["channels"]]]
+
+    def read(self, batch: "_Batch") -> list[RawMessages]:
+        """Read the wanted messages of a batch."""
+        found: list[RawMessages] = []
+        for file, chunks in batch.parts:
+            read = read_chunks(file, chunks, self.topics, check=self.check)
+            found += _between(read, self.start, self.end)
+        return found
+
+
+class _Batch(NamedTuple):
+    """What is read at once.
+
+    Attributes
+    ----------
+    parts : list of (LogFile, np.ndarray)
+        Chunks by log.
+    until : int
+        No later batch has an earlier message.
+    finished : list of LogFile
+        Logs of which nothing more is to be read.
+    """
+
+    parts: list[tuple[LogFile, NDArray[np.void]]]
+    until: int
+    finished: list[LogFile]
+
+
+def iterate_messages(
+    logs: Iterable[Path],
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    end: int | None = None,
+    *,
+    check: bool = False,
+) -> Iterator[list[RawMessages]]:
+    """Read the messages of some logs, still encoded.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    topics : collection of str, optional
+        All by default.
+    start, end : int, optional
+        Log times, in nanoseconds: from `start` on, before `end`.
+    check : bool
+        Whether to compare chunks with their checksums.
+
+    Yields
+    ------
+    list of RawMessages
+        Those of the next span of time, one or more for every channel that speaks in it. None
+        is older than any that was yielded before.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged.
+    """
+    return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
+
+
+def iterate_pieces(  # noqa: PLR0913
+    logs: Iterable[Path],
+    topics: Collection[str] | None,
+    start: int | None,
+    end: int | None,
+    function: Callable[[list[RawMessages]], list[Piece]],
+    *,
+    every: int = 1,
+) -> Iterator[list[Piece]]:
+    """Make something of the messages of some logs as they are read, in the threads that read.
+
+    Parameters and errors are those of `iterate_messages`; of `every` so many chunks of a log one
+    is read, for a sample.
+
+    Yields
+    ------
+    list of Piece
+        What the function made of messages: of those of the next span of time.
+    """
+    return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
+
+
+def _query(topics: Collection[str] | None, start: int | None, end: int | None) -> _Query:
+    return _Query(topics, _FIRST if start is None else start, _LAST if end is None else end)
+
+
+def _iterate(
+    logs: Iterable[Path], query: _Query, function: Callable[[list[RawMessages]], list[Piece]]
+) -> Iterator[list[Piece]]:
+    def read(batch: _Batch) -> tuple[_Batch, list[Piece]]:
+        return batch, function(query.read(batch))
+
+    pending: list[Piece] = []
+    with (
+        _Queue(logs, query) as queue,
+        closing(map_ahead(read, queue.batches(), _READERS)) as batches,
+    ):
+        for batch, pieces in batches:
+            pending += pieces
+            ready = _between(pending, _FIRST, batch.until)
+            if ready:
+                yield ready
+            pending = _between(pending, batch.until, _LAST)
+            queue.close(batch.finished)
+
+
+def _between(pieces: list[Piece], start: int, end: int) -> list[Piece]:
+    return [part for part in (piece.between(start, end) for piece in pieces) if len(part)]
+
+
+class _Queue:
+    """The chunks of several logs by their start times; a log is open while it is needed."""
+
+    def __init__(self, logs: Iterable[Path], query: _Query) -> None:
+        self._query = query
+        self._closed = [
+            (first, path)
+            for first, last, path in reversed(time_spans(logs))
+            if last >= query.start and first < query.end
+        ]
+        self._open: list[_Log] = []
+        self._finished: list[LogFile] = []
+        self._files: set[LogFile] = set()
+        self._open_next()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close(self._files)
+
+    @property
+    def start(self) -> int:
+        """No chunk that is still to come starts earlier."""
+        return min((_start(log) for log in self._open), default=_LAST)
+
+    def batches(self) -> Iterator["_Batch"]:
+        """Hand out the chunks, a few megabytes at a time."""
+        while self._open:
+            picked: dict[LogFile, list[NDArray[np.void]]] = {}
+            size = 0
+            while self._open and size < _BATCH:
+                log = min(self._open, key=_start)
+                others = [_start(other) for other in self._open if other is not log]
+                until = min([*others, *(first for first, _ in self._closed[-1:])], default=_LAST)
+                chunks = log.next_chunks(until, _BATCH - size)
+                picked.setdefault(log.file, []).append(chunks)
+                size += int(chunks["size"].sum())
+                self._open_next()
+            parts = [(file, np.concatenate(parts)) for file, parts in picked.items()]
+            finished, self._finished = self._finished, []
+            yield _Batch(parts, self.start, finished)
+
+    def close(self, files: Iterable[LogFile]) -> None:
+        """Close logs whose chunks were all read."""
+        for file in list(files):
+            file.close()
+            self._files.remove(file)
+
+    def _open_next(self) -> None:
+        """Open the logs that may have the next chunk, and put aside those that have no more."""
+        self._finished += [log.file for log in self._open if log.start is None]
+        self._open = [log for log in self._open if log.start is not None]
+        while self._closed and (not self._open or self._closed[-1][0] <= self.start):
+            log = _Log(self._closed.pop()[1], self._query)
+            self._files.add(log.file)
+            if log.start is None:
+                self._finished.append(log.file)
+            else:
+                self._open.append(log)
+
+
+def _start(log: _Log) -> int:
+    return _LAST if log.start is None else log.start

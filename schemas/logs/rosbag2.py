@@ -1,0 +1,74 @@
+"""What rosbag2 wants to find in an MCAP file."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hearthlog.schemas.messages.topics import Quality
+
+METADATA = "rosbag2"
+_FOREVER = {"sec": 9223372036, "nsec": 854775807}
+
+
+@dataclass
+class TopicCount:
+    """One topic of a file and how often it spoke."""
+
+    type: str
+    channel_metadata: Mapping[str, str]
+    messages: int = 0
+
+
+def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
+    """Return the metadata that a ROS 2 channel must have; JSON is a part of YAML."""
+    seconds = quality.lifespan_seconds
+    profile = {
+        "history": "keep_last",
+        "depth": quality.depth,
+        "reliability": "reliable",
+        "durability": "transient_local" if quality.transient_local else "volatile",
+        "deadline": _FOREVER,
+        "lifespan": _FOREVER if seconds is None else {"sec": seconds, "nsec": 0},
+        "liveliness": "automatic",
+        "liveliness_lease_duration": _FOREVER,
+        "avoid_ros_namespace_conventions": False,
+    }
+    return {"offered_qos_profiles": json.dumps([profile]), "topic_type_hash": type_hash}
+
+
+def file_metadata(
+    name: str, topics: Mapping[str, TopicCount], span: tuple[int, int]
+) -> dict[str, str]:
+    """Return the `rosbag2` metadata record of a file (version 9 of its `metadata.yaml`)."""
+    start, end = span
+    times = {
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "duration": {"nanoseconds": end - start},
+        "message_count": sum(topic.messages for topic in topics.values()),
+    }
+    information = {
+        "version": 9,
+        "storage_identifier": "mcap",
+        **times,
+        "topics_with_message_count": [
+            {"topic_metadata": _topic_metadata(key, topic), "message_count": topic.messages}
+            for key, topic in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [name],
+        "files": [{"path": name, **times}],
+        "custom_data": {},
+        "ros_distro": "",
+    }
+    return {"serialized_metadata": json.dumps(information)}
+
+
+def _topic_metadata(name: str, topic: TopicCount) -> dict[str, object]:
+    return {
+        "name": name,
+        "type": topic.type,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": json.loads(topic.channel_metadata["offered_qos_profiles"]),
+        "type_description_hash": topic.channel_metadata["topic_type_hash"],
+    }

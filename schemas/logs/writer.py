@@ -1,0 +1,113 @@
+"""Write a log: MCAP of profile `ros2`, under another name until it is complete."""
+
+import fcntl
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import active_path, sync_folder
+from hearthlog.schemas.logs.log_stream import (
+    ENCODING,
+    PROFILE,
+    SCHEMA_ENCODING,
+    Attachment,
+    LogContent,
+    Rows,
+)
+from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.messages.topics import Topic
+
+__all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
+
+
+class LogWriter:
+    """One log being written.
+
+    What was written is on its way to the disk after `flush`, and survives a power cut after
+    `sync`; only `finish` gives the file its name.
+
+    Parameters
+    ----------
+    path : Path
+        Name of the finished log. Neither it nor its active name may exist.
+    topics : sequence of Topic
+    metadata : mapping of str to str
+        The `hearthlog` record: what made this log.
+    attachments : sequence of Attachment
+    created : int
+        Time of the attachments, in nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        If there is such a log already.
+    OSError
+        If the folder or the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topics: Sequence[Topic],
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment] = (),
+        created: int = 0,
+    ) -> None:
+        self.path = path
+        self.active_path = active_path(path)
+        self._stream = _create(path, self.active_path)
+        self._content = LogContent(self._stream, topics)
+        self._content.add_metadata(METADATA, metadata)
+        for attachment in attachments:
+            self._content.add_attachment(attachment, created)
+
+    def write(self, topic: str, log_time: int, data: bytes) -> None:
+        """Append one encoded message; its publish time is its log time."""
+        self._content.write(topic, log_time, data)
+
+    def write_columns(self, batch: Sequence[Rows]) -> None:
+        """Append messages of several topics, as `LogContent.write_columns` does."""
+        self._content.write_columns(batch)
+
+    def flush(self) -> None:
+        """End the chunk and hand it to the operating system."""
+        self._content.flush()
+        self._stream.flush()
+
+    def sync(self) -> None:
+        """Wait until what was flushed is on the disk."""
+        os.fsync(self._stream.fileno())
+
+    def finish(self) -> Path:
+        """Complete the log, give it its name and return it."""
+        self._content.finish(self.path.name)
+        self._stream.flush()
+        self.sync()
+        self._stream.close()
+        self.active_path.rename(self.path)
+        sync_folder(self.path.parent)
+        return self.path
+
+    def abandon(self) -> None:
+        """Stop writing and leave the active file as it is, after the disk refused it."""
+        with suppress(OSError):  # it is the reason for being here
+            self._stream.close()
+
+
+def _create(path: Path, active: Path) -> BinaryIO:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        raise LogError(f"{path}: exists already; move it away or record into another folder")
+    try:
+        stream = active.open("xb")
+    except FileExistsError as error:
+        raise LogError(
+            f"{active}: is being written, or was left by a recorder that was killed"
+        ) from error
+    # By this lock a recorder knows another one's file from one that was left behind.
+    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    sync_folder(path.parent)
+    return stream

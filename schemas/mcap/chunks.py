@@ -1,0 +1,328 @@
+"""The messages of many chunks at once, still encoded, found through the index behind each chunk."""
+
+import struct
+from collections.abc import Collection, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import (
+    HEAD,
+    ChunkHead,
+    McapError,
+    chunk_head,
+    decompress_into,
+    parse,
+)
+
+_INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
+_INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")])
+_ENTRY = struct.Struct("<QQ")
+MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ]
+)
+_WRONG_INDEX = "the index of a chunk does not belong to it"
+_CHANNELS_LIMIT = 1 << 16
+_FIXED = MESSAGE_HEAD.itemsize - HEAD.size  # bytes of a message's content before its payload
+
+Entries = tuple[int, bytes | memoryview]  # of the index of a chunk, and which chunk that is
+
+
+@dataclass(frozen=True)
+class RawMessages:
+    """Some messages of one channel, in the order of their log times.
+
+    Attributes
+    ----------
+    channel : mcap.records.Channel
+    schema : mcap.records.Schema or None
+    buffer : np.ndarray [shape=(b,)], uint8
+        Holds their records, and others.
+    offsets : np.ndarray [shape=(n,)], int64
+        Where in the buffer their payloads begin.
+    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
+    """
+
+    channel: records.Channel
+    schema: records.Schema | None
+    buffer: Bytes
+    offsets: Int64
+    heads: NDArray[np.void]
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    @property
+    def sizes(self) -> Int64:
+        """Bytes of the payloads."""
+        return self.heads["length"] - _FIXED
+
+    @property
+    def log_times(self) -> Int64:
+        """Log times in nanoseconds."""
+        return self.heads["log_time"]
+
+    def between(self, start: int | None, end: int | None) -> "RawMessages":
+        """Return those with start <= log time < end."""
+        rows = slice(*bounds(self.log_times, start, end))
+        if rows == slice(0, len(self)):
+            return self
+        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+
+
+def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
+    """Tell where in ascending times those with start <= time < end begin and stop."""
+    first = 0 if start is None else int(np.searchsorted(times, start))
+    last = len(times) if end is None else int(np.searchsorted(times, end))
+    return first, max(first, last)
+
+
+def read_chunks(
+    file: LogFile,
+    chunks: NDArray[np.void],
+    topics: Collection[str] | None = None,
+    *,
+    check: bool = False,
+) -> list[RawMessages]:
+    """Read the messages of some topics, or of all, from some chunks of a log.
+
+    Channels and schemas that the chunks define are added to those of the file.
+
+    Parameters
+    ----------
+    file : LogFile
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+    topics : collection of str, optional
+    check : bool
+        Whether to compare chunks with their checksums, which takes longer than to decompress.
+
+    Raises
+    ------
+    LogError
+        If a chunk is damaged, or its index does not belong to it.
+    """
+    if not len(chunks):
+        return []
+    batch = _read(file, chunks, check=check)
+    indices = batch.indices(_unwanted(file, topics))
+    _define(file, indices.keys())
+    for identity in _unwanted(file, topics):
+        indices.pop(identity, None)
+    read = [batch.messages(identity, parts) for identity, parts in indices.items()]
+    return [messages for messages in read if len(messages)]
+
+
+def _unwanted(file: LogFile, topics: Collection[str] | None) -> list[int]:
+    """Return the channels, of those that are known, of other topics."""
+    if topics is None:
+        return []
+    return [number for number, channel in file.channels.items() if channel.topic not in topics]
+
+
+def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
+    """Read and decompress chunks."""
+    raw, starts = _read_stored(file, chunks)
+    lengths, indexed = chunks["length"], chunks["index_length"] >= 0
+    records: list[tuple[ChunkHead | None, memoryview]] = []
+    for number, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
+        record = raw[start : start + length].data
+        try:
+            records.append(_chunk(record) if indexed[number] else (None, record))
+        except McapError as error:
+            raise file.damaged(int(chunks["offset"][number]), error) from error
+    sizes = np.array([len(record) if head is None else head.size for head, record in records], int)
+    buffer = np.empty(sizes.sum(), np.uint8)
+    end = 0
+    for number, (head, record) in enumerate(records):
+        first, end = end, end + int(sizes[number])
+        if head is None:
+            buffer[first:end] = record
+            continue
+        try:
+            decompress_into(buffer[first:end].data, head, record, check=check)
+        except McapError as error:
+            raise file.damaged(int(chunks["offset"][number]), error) from error
+    return _Batch(file, chunks, sizes, buffer, raw, starts)
+
+
+def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]:
+    """Read chunks and the indexes behind them, neighbours at once; return where each begins."""
+    offsets = chunks["offset"]
+    lengths = chunks["length"] + np.maximum(chunks["index_length"], 0)
+    cut = offsets + lengths > file.size
+    if cut.any():
+        raise file.damaged(int(offsets[cut.argmax()]), "a chunk is shorter than it claims")
+    ends = np.cumsum(lengths)
+    raw = np.empty(lengths.sum(), np.uint8)
+    apart = np.flatnonzero(offsets[1:] != (offsets + lengths)[:-1]) + 1
+    for first, last in pairwise([0, *apart.tolist(), len(chunks)]):
+        start = int(ends[first] - lengths[first])
+        file.read_into(raw[start : ends[last - 1]].data, int(offsets[first]))
+    return raw, ends - lengths
+
+
+def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
+    if len(record) < HEAD.size or HEAD.unpack_from(record) != (
+        Opcode.CHUNK,
+        len(record) - HEAD.size,
+    ):
+        raise McapError("here should be a chunk")
+    content = record[HEAD.size :]
+    return chunk_head(content), content
+
+
+def _walk(file: LogFile, content: memoryview) -> dict[int, bytes]:
+    """Go through all records of a chunk: note its channels, make the index it should have."""
+    found: dict[int, list[bytes]] = {}
+    start = 0
+    while start < len(content):
+        if start + HEAD.size > len(content):
+            raise McapError("a record in a chunk is cut")
+        opcode, length = HEAD.unpack_from(content, start)
+        first, start = start + HEAD.size, start + HEAD.size + length
+        if start > len(content):
+            raise McapError("a record in a chunk claims to be longer than the chunk")
+        if opcode == Opcode.MESSAGE and length >= _FIXED:
+            identity, time = struct.unpack_from("<H4xQ", content, first)
+            found.setdefault(identity, []).append(_ENTRY.pack(time, first - HEAD.size))
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            record = parse(opcode, bytes(content[first:start]))
+            if isinstance(record, records.Schema):
+                file.schemas.setdefault(record.id, record)
+            elif isinstance(record, records.Channel):
+                file.channels.setdefault(record.id, record)
+    return {identity: b"".join(entries) for identity, entries in found.items()}
+
+
+def _define(file: LogFile, identities: AbstractSet[int]) -> None:
+    """Look for channels that nothing read so far defines, from the first chunk on."""
+    if identities <= file.channels.keys():
+        return
+    for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
+        with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
+            _read(file, np.array([chunk]), check=False).walk()
+        if identities <= file.channels.keys():
+            return
+
+
+class _Batch(NamedTuple):
+    """The records of some chunks of a log, in one buffer, and the chunks as they are stored."""
+
+    file: LogFile
+    chunks: NDArray[np.void]
+    sizes: Int64
+    buffer: Bytes
+    raw: Bytes
+    starts: Int64
+
+    def indices(self, unwanted: Sequence[int]) -> dict[int, list[Entries]]:
+        """Return the index entries of the other channels; chunks without index get one."""
+        ends = self.starts + self.chunks["length"]
+        parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
+        without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
+        found: dict[int, list[Entries]] = {}
+        for number, identity, first, size in parts[~np.isin(parts[:, 1], unwanted)].tolist():
+            found.setdefault(identity, []).append((number, self.raw[first : first + size].data))
+        unknown = not found.keys() <= self.file.channels.keys()
+        for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
+            walked = self.walk(number)
+            for identity, entries in walked.items() if without[number] else ():
+                found.setdefault(identity, []).append((number, entries))
+        return found
+
+    def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
+        """Go through the message indexes behind all chunks, one of each chunk at a time.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, 4)]
+            Number of the chunk, of the channel, and place and size of its entries.
+        """
+        parts = [np.empty((0, 4), np.int64)]
+        numbers = np.flatnonzero(starts < ends)
+        starts, ends = starts[numbers], ends[numbers]
+        while len(numbers):
+            if len(parts) > _CHANNELS_LIMIT:
+                raise self._damaged(numbers[0], "a chunk has more indexes than there are channels")
+            first = starts + _INDEX_HEAD.itemsize
+            if (first > ends).any():
+                raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
+            heads = gather(self.raw, starts, _INDEX_HEAD.itemsize).view(_INDEX_HEAD)
+            length, size = heads["length"], heads["size"].astype(np.int64)
+            sound = (
+                (heads["opcode"] == Opcode.MESSAGE_INDEX)
+                & (length >= size + _INDEX_HEAD.itemsize - HEAD.size)
+                & (length <= ends - starts - HEAD.size)
+                & (size % _INDEX.itemsize == 0)
+            )
+            if not sound.all():
+                raise self._damaged(numbers[sound.argmin()], "here should be a message index")
+            part = np.stack([numbers, heads["channel"], first, size], axis=1)
+            parts.append(part[size > 0])
+            starts = starts + HEAD.size + length
+            going = starts < ends
+            numbers, starts, ends = numbers[going], starts[going], ends[going]
+        return np.concatenate(parts)
+
+    def walk(self, number: int = 0) -> dict[int, bytes]:
+        """Go through the records of a chunk: note its channels, make the index it should have."""
+        end = int(self.sizes[: number + 1].sum())
+        content = self.buffer[end - int(self.sizes[number]) : end].data
+        try:
+            return _walk(self.file, content)
+        except (McapError, UnicodeDecodeError) as error:
+            raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
+
+    def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
+        """Follow the index entries of a channel to its messages, and check every one of them."""
+        entries = np.frombuffer(b"".join(part for _, part in parts), _INDEX)
+        counts = [len(part) // _INDEX.itemsize for _, part in parts]
+        number = np.repeat([number for number, _ in parts], counts)
+        channel = self.file.channels.get(identity)
+        if channel is None:
+            raise self._damaged(number[0], "a message of a channel that is not defined")
+        rest = self.sizes[number] - entries["offset"]
+        inside = (entries["offset"] >= 0) & (rest >= MESSAGE_HEAD.itemsize)
+        if not inside.all():
+            raise self._damaged(number[inside.argmin()], _WRONG_INDEX)
+        starts = entries["offset"] + (np.cumsum(self.sizes) - self.sizes)[number]
+        heads = gather(self.buffer, starts, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+        sound = (
+            (heads["opcode"] == Opcode.MESSAGE)
+            & (heads["channel"] == identity)
+            & (heads["log_time"] == entries["time"])
+            & (heads["length"] >= _FIXED)
+            & (heads["length"] <= rest - HEAD.size)
+            & (heads["log_time"] >= self.chunks["start"][number])
+            & (heads["log_time"] <= self.chunks["end"][number])
+        )
+        if not sound.all():
+            raise self._damaged(number[sound.argmin()], _WRONG_INDEX)
+        if (heads["length"] + HEAD.size).sum() > len(self.buffer):
+            raise self._damaged(number[0], _WRONG_INDEX)  # it leads to some of them twice
+        offsets = starts + MESSAGE_HEAD.itemsize
+        if (np.diff(heads["log_time"]) < 0).any():
+            order = np.argsort(heads["log_time"], kind="stable")
+            offsets, heads = offsets[order], heads[order]
+        schema = self.file.schemas.get(channel.schema_id)
+        return RawMessages(channel, schema, self.buffer, offsets, heads)
+
+    def _damaged(self, chunk: np.intp, what: str) -> LogError:
+        return self.file.damaged(int(self.chunks["offset"][chunk]), what)

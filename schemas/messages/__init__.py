@@ -1,0 +1,1 @@
+"""Messages: definitions, topics, and CDR to arrays and back."""

@@ -1,0 +1,311 @@
+"""Many messages of one type at once: from arrays to payloads, and back."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages.cdr_layout import (
+    AnyLeaf,
+    Default,
+    Layout,
+    Leaf,
+    Messages,
+    MessageType,
+    default_rows,
+    message_type,
+)
+from hearthlog.schemas.messages.versions import APPENDED
+from hearthlog.schemas.times import NANOSECONDS
+
+Column = NDArray[Any] | Sequence[str] | str
+Fields = dict[str, NDArray[Any]]
+_TRIED = 64  # layouts, before rows are looked at one by one
+Indices = NDArray[np.intp]
+
+
+def encode_groups(
+    typename: str, columns: Mapping[str, Column], count: int
+) -> Iterator[tuple[Indices, NDArray[np.void]]]:
+    """Encode `count` messages, each field given as one column.
+
+    Parameters
+    ----------
+    typename : str
+    columns : mapping from field path, such as "header.frame_id", to its values
+        An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
+        for an array of numbers; for a string, one for all messages or a sequence of `count`.
+        Fields that were appended to the type may be left out.
+    count : int
+
+    Yields
+    ------
+    rows : np.ndarray [shape=(m,)]
+        Which messages have strings of the same lengths.
+    payloads : np.ndarray [shape=(m,)], of a structured dtype
+        Equal to what the typestore gives for each message.
+    """
+    kind = message_type(typename)
+    arrays: dict[str, NDArray[Any]] = {}
+    texts: dict[str, _Texts] = {}
+    for path, values in _completed(typename, columns, count).items():
+        if isinstance(values, np.ndarray) and values.dtype != object:
+            arrays[path] = values
+        else:
+            texts[path] = _Texts(values, count)
+    widths = {k: v.shape[1] for k, v in arrays.items() if v.ndim > 1}
+    for rows in _same_lengths(texts.values(), count):
+        lengths = {k: text.length(rows[0]) for k, text in texts.items()}
+        layout = kind.layout_for(lengths | widths)
+        block = np.zeros(len(rows), layout.dtype)
+        for name, value in layout.fixed.items():
+            block[name] = value
+        for leaf in layout.leaves:
+            _fill(block, leaf, arrays, texts, rows)
+        yield rows, block
+
+
+def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
+    """Encode messages as `encode_groups` does, one `bytes` each."""
+    payloads: list[bytes] = [b""] * count
+    for rows, block in encode_groups(typename, columns, count):
+        raw, size = block.tobytes(), block.dtype.itemsize
+        for position, row in enumerate(rows.tolist()):
+            payloads[row] = raw[position * size : (position + 1) * size]
+    return payloads
+
+
+def _completed(typename: str, columns: Mapping[str, Column], count: int) -> Mapping[str, Column]:
+    """Add the defaults of fields that were appended to a type, where they are not given."""
+    appended = APPENDED.get(typename)
+    if not appended:
+        return columns
+    fields = [field for field in message_type(typename).types[typename] if field[0] in appended]
+    defaults: dict[str, Column] = {}
+    for path, row in default_rows(typename, fields):
+        is_empty = row.dtype == object and not isinstance(row[0], str)
+        defaults[path] = np.empty((count, 0)) if is_empty else np.repeat(row, count, axis=0)
+    return defaults | dict(columns)
+
+
+def _fill(
+    block: NDArray[np.void],
+    leaf: AnyLeaf,
+    arrays: Mapping[str, NDArray[Any]],
+    texts: Mapping[str, "_Texts"],
+    rows: Indices,
+) -> None:
+    if leaf.path in arrays and arrays[leaf.path].shape[1:] == (0,):
+        return
+    if not isinstance(leaf, Leaf) or leaf.kind == "texts":
+        raise LogError(f"{leaf.path}: arrays of texts or messages are encoded one by one")
+    if leaf.kind == "text":
+        if block.dtype.fields and leaf.path in block.dtype.fields:
+            block[leaf.path] = texts[leaf.path].encoded(rows)
+        return
+    values = arrays[leaf.path]
+    values = values if len(rows) == len(values) else values[rows]
+    if leaf.kind == "stamp":
+        block[leaf.path]["sec"] = values // NANOSECONDS
+        block[leaf.path]["nanosec"] = values % NANOSECONDS
+    else:
+        block[leaf.path] = values
+
+
+class _Texts:
+    """A column of strings: its distinct values, encoded, and which of them each row has."""
+
+    def __init__(self, values: Column, count: int) -> None:
+        if isinstance(values, str):
+            values = [values] * min(count, 1)
+        numbers = {text: number for number, text in enumerate(dict.fromkeys(values))}
+        self._values = [text.encode() for text in numbers]
+        self._codes: Indices | None = None  # not needed if all are alike
+        self.lengths: Indices | None = None
+        if len(numbers) > 1:
+            self._codes = np.fromiter(map(numbers.__getitem__, values), np.intp, count)
+            self.lengths = np.array([len(value) for value in self._values])[self._codes]
+
+    def length(self, row: np.intp) -> int:
+        """Bytes of the string of a row, with its end."""
+        return len(self._values[0 if self._codes is None else self._codes[row]]) + 1
+
+    def encoded(self, rows: Indices) -> NDArray[np.void] | np.void:
+        """Return the strings of some rows, all of one length."""
+        if self._codes is None:
+            return np.void(self._values[0])
+        codes = self._codes[rows]
+        size = len(self._values[codes[0]])
+        # Those of other lengths do not occur, but keep the others in their places.
+        return np.array([value[:size] for value in self._values], f"V{size}")[codes]
+
+
+def _same_lengths(texts: Collection[_Texts], count: int) -> list[Indices]:
+    """Group the rows whose strings have the same lengths."""
+    varying = [text.lengths for text in texts if text.lengths is not None]
+    if not varying:
+        return [np.arange(count)] if count else []
+    group = np.zeros(count, np.intp)
+    for lengths in varying:
+        _, group = np.unique(group * (lengths.max() + 1) + lengths, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(group))[:-1])
+
+
+def decode_rows(
+    kind: MessageType,
+    buffer: Bytes,
+    offsets: Int64,
+    sizes: Int64,
+    fields: Collection[str] | None = None,
+) -> Fields:
+    """Decode messages of one type.
+
+    Parameters
+    ----------
+    kind : MessageType
+    buffer : np.ndarray [shape=(b,)], uint8
+    offsets, sizes : np.ndarray [shape=(n,)], int64
+        Where in the buffer the payloads are.
+    fields : collection of str, optional
+        Paths of the fields that are wanted; all by default.
+
+    Returns
+    -------
+    dict of str to np.ndarray [shape=(n, ...)]
+        By field path: numbers as they are, stamps and durations as int64 nanoseconds, strings as
+        objects (`str`), arrays of numbers or strings with one row each, or as objects where their
+        lengths differ, arrays of messages as lists of dicts.
+
+    Raises
+    ------
+    LogError
+        If a payload is not of this type.
+    """
+    parts: list[tuple[Indices, Fields]] = []
+    for size, rows in _by_size(sizes):
+        parts += _decode_same_size(kind, rows, gather(buffer, offsets[rows], size), fields)
+    return _scattered(parts, len(sizes))
+
+
+def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
+    if len(sizes) and (sizes == sizes[0]).all():  # most often, and quicker
+        return [(int(sizes[0]), np.arange(len(sizes)))]
+    return [(size, np.flatnonzero(sizes == size)) for size in np.unique(sizes).tolist()]
+
+
+def _decode_same_size(
+    kind: MessageType, rows: Indices, payloads: NDArray[np.void], fields: Collection[str] | None
+) -> Iterator[tuple[Indices, Fields]]:
+    """Decode payloads by layout; yield which rows have it, and their fields."""
+    for layout, same in _by_layout(kind, payloads):
+        block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
+        yield rows[same], _decode(layout.leaves, block, fields)
+
+
+def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[Layout, Indices]]:
+    """Group payloads of one size by layout."""
+    rest = np.arange(len(payloads))
+    for layout in kind.layouts(payloads.dtype.itemsize)[:_TRIED]:
+        fitting = layout.fits(payloads[rest].view(layout.dtype))
+        if fitting.any():
+            yield layout, rest[fitting]
+            rest = rest[~fitting]
+        if not len(rest):
+            return
+    for _ in range(_TRIED):
+        layout = kind.layout_of(memoryview(payloads[rest[0]].tobytes()))
+        fitting = layout.fits(payloads[rest].view(layout.dtype))
+        yield layout, rest[fitting]
+        rest = rest[~fitting]
+        if not len(rest):
+            return
+    found: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
+    for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
+        layout = kind.layout_of(memoryview(payloads[row].tobytes()))
+        found.setdefault(tuple(layout.fixed.items()), (layout, []))[1].append(row)
+    yield from ((layout, np.array(same)) for layout, same in found.values())
+
+
+def _decode(
+    leaves: Sequence[AnyLeaf], block: NDArray[np.void], fields: Collection[str] | None
+) -> Fields:
+    return {
+        leaf.path: _values(leaf, block) for leaf in leaves if fields is None or leaf.path in fields
+    }
+
+
+def _values(leaf: AnyLeaf, block: NDArray[np.void]) -> NDArray[Any]:
+    if isinstance(leaf, Default):
+        return np.repeat(leaf.row, len(block), axis=0)
+    if isinstance(leaf, Messages):
+        return _messages(leaf, block)
+    if leaf.kind == "texts":
+        rows = [_texts(block, name) for name in leaf.names]
+        return np.stack(rows, axis=1) if rows else np.empty((len(block), 0), object)
+    if leaf.kind == "text":
+        return _texts(block, leaf.path)
+    values = block[leaf.path]
+    if leaf.kind == "stamp":
+        return values["sec"].astype(np.int64) * NANOSECONDS + values["nanosec"]
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+
+
+def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
+    """Decode strings of one length; equal ones become one object."""
+    assert block.dtype.names is not None
+    texts = np.empty(len(block), object)
+    if name not in block.dtype.names:
+        texts.fill("")
+        return texts
+    raw = np.ascontiguousarray(block[name])
+    if (raw == raw[:1]).all():
+        texts.fill(_text(raw[0], name))
+        return texts
+    distinct, which = np.unique(raw, return_inverse=True)
+    return np.array([_text(value, name) for value in distinct], object)[which]
+
+
+def _text(value: np.void, name: str) -> str:
+    try:
+        return value.tobytes().decode()
+    except UnicodeDecodeError as error:
+        raise LogError(f"{name}: a string is not UTF-8") from error
+
+
+def _messages(array: Messages, block: NDArray[np.void]) -> NDArray[np.object_]:
+    """Turn an array of messages into one list of dicts a row."""
+    elements = []
+    for leaves in array.elements:
+        columns = {leaf.path.rpartition("].")[2]: _values(leaf, block) for leaf in leaves}
+        lists = [column.tolist() for column in columns.values()]
+        elements.append([dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)])
+    rows = zip(*elements, strict=True) if elements else iter([()] * len(block))
+    return np.fromiter(map(list, rows), object, len(block))
+
+
+def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
+    """Put rows that were decoded apart back into their order."""
+    if len(parts) == 1:
+        return parts[0][1]
+    found: Fields = {}
+    for path in parts[0][1] if parts else ():
+        columns = [(rows, fields[path]) for rows, fields in parts]
+        like = columns[0][1]
+        if all(c.dtype == like.dtype and c.shape[1:] == like.shape[1:] for _, c in columns):
+            values = np.empty((count, *like.shape[1:]), like.dtype)
+        else:
+            values = np.empty(count, object)
+            columns = [(rows, ragged(column)) for rows, column in columns]
+        for rows, column in columns:
+            values[rows] = column
+        found[path] = values
+    return found
+
+
+def ragged(column: NDArray[Any]) -> NDArray[np.object_]:
+    """Make each row of an array an object of its own."""
+    return np.fromiter(column, object, len(column))

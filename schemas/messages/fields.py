@@ -1,0 +1,173 @@
+"""What the fields of a message type are, and whether those of a file's definition will do."""
+
+from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages.cdr_layout import MessageType, message_type
+from hearthlog.schemas.messages.message_types import PACKAGE
+from hearthlog.schemas.messages.versions import APPENDED
+
+TIME = "builtin_interfaces/msg/Time"
+DURATION = "builtin_interfaces/msg/Duration"
+_DEPTH_LIMIT = 32
+_FIELDS_LIMIT = 10_000
+
+
+class Field(NamedTuple):
+    """One field, as `Columns` has it.
+
+    Attributes
+    ----------
+    type : str
+        Of a number, or "string", or `TIME`, or `DURATION`, or empty for a message.
+    size : int or None
+        Of an array: how many elements it has, 0 if that differs between messages; None for a
+        field that is no array.
+    elements : mapping of str to Field
+        The fields of each element of an array of messages.
+    """
+
+    type: str
+    size: int | None = None
+    elements: Mapping[str, "Field"] = {}
+
+
+@lru_cache(64)
+def fields_of(kind: MessageType) -> dict[str, Field]:
+    """List the fields of a message type by path, those of messages in it among them.
+
+    Raises
+    ------
+    LogError
+        If it contains itself, or is too large.
+    """
+    return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
+
+
+def _fields(
+    kind: MessageType, name: str, prefix: str, depth: int, left: Iterator[int]
+) -> Iterator[tuple[str, Field]]:
+    if depth > _DEPTH_LIMIT or name not in kind.types:
+        raise LogError(f"{kind.name}: contains itself, or {name}, which is not defined")
+    for field, (node, about) in kind.read_fields(name):
+        if next(left, None) is None:
+            raise LogError(f"{kind.name}: has too many fields")
+        path = f"{prefix}{field}"
+        if node is Nodetype.BASE:
+            yield path, Field(about[0])
+        elif node is Nodetype.NAME and about in {TIME, DURATION}:
+            yield path, Field(about)
+        elif node is Nodetype.NAME:
+            yield from _fields(kind, about, f"{path}.", depth + 1, left)
+        else:
+            (element, base), count = about
+            size = count if node is Nodetype.ARRAY else 0
+            if element is Nodetype.NAME:
+                yield path, Field("", size, dict(_fields(kind, base, "", depth + 1, left)))
+            else:
+                yield path, Field(base[0], size)
+
+
+def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
+    """List the paths at which a file's definition has no field, or not one as ours of that name.
+
+    What was appended to one of our types since is not lacking: there is a default for it.
+
+    Raises
+    ------
+    LogError
+        If the definition cannot be understood.
+    """
+    theirs, ours = fields_of(kind), fields_of(message_type(kind.name))
+    return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))
+
+
+def _fits(theirs: Field, ours: Field | None) -> bool:
+    """Tell whether what is read of one field has all that is read of the other."""
+    return (
+        ours is not None
+        and (_plain(theirs.type), theirs.size) == (_plain(ours.type), ours.size)
+        and all(
+            p in theirs.elements and _fits(theirs.elements[p], ours.elements[p])
+            for p in ours.elements
+        )
+    )
+
+
+def _plain(name: str) -> str:
+    """Name a type as all do that mean the same: ROS 2 has three names for a byte."""
+    return "uint8" if name in {"byte", "char"} else name
+
+
+def difference(kind: MessageType, version: int) -> str:
+    """Say how a file's definition of a type is none that was ever released; empty if it is one.
+
+    Parameters
+    ----------
+    kind : MessageType
+    version : int
+        Of the file's messages: what was appended up to it must be there. More may be, as a later
+        version would have appended it.
+    """
+    ours = message_type(kind.name).types
+    for name in _built_on(ours, kind.name):
+        own, theirs = ours[name], kind.types[name]
+        grows = name.startswith(f"{PACKAGE}/")
+        appended = APPENDED.get(name, {})
+        least = sum(f not in appended or appended[f].since <= version for f, _ in own)
+        for place, (field, other) in enumerate(zip(own, theirs, strict=False)):
+            if field != other:
+                return f"field {place + 1} of {name} is {_words(*other)}, not {_words(*field)}"
+        if len(theirs) < least:
+            return f"{name} has no field {_words(*own[len(theirs)])}"
+        if not grows and len(theirs) != len(own):
+            return f"{name} has {len(theirs)} fields, not {len(own)}"
+    return ""
+
+
+def _built_on(types: Mapping[str, Any], name: str) -> dict[str, None]:
+    """List a type and those it builds on."""
+    names = {name: None}
+    for _, (node, about) in types[name]:
+        element, base = (node, about) if node in {Nodetype.BASE, Nodetype.NAME} else about[0]
+        if element is Nodetype.NAME and base not in names:
+            names |= _built_on(types, base)
+    return names
+
+
+def _words(name: str, described: tuple[Nodetype, Any]) -> str:
+    """Write a field as message definitions do."""
+    node, about = described
+    if node is Nodetype.BASE:
+        return f"{_base(about)} {name}"
+    if node is Nodetype.NAME:
+        return f"{about.replace('/msg/', '/')} {name}"
+    (element, base), count = about
+    limit = "" if not count else f"{count}" if node is Nodetype.ARRAY else f"<={count}"
+    return f"{_words('', (element, base)).strip()}[{limit}] {name}"
+
+
+def _base(about: tuple[str, int]) -> str:
+    name, limit = about
+    return f"{name}<={limit}" if limit else name
+
+
+def type_hash_of(kind: MessageType) -> str:
+    """Return the RIHS01 hash of a type as a file defines it.
+
+    Raises
+    ------
+    LogError
+        If it cannot be understood.
+    """
+    store = get_typestore(Stores.EMPTY)
+    store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})
+    try:
+        return store.hash_rihs01(kind.name)
+    except (KeyError, RecursionError) as error:
+        raise LogError(f"{kind.name}: contains itself, or what is not defined") from error

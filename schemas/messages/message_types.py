@@ -1,0 +1,112 @@
+"""The messages of a log and their CDR encoding, on the typestore of rosbags."""
+
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from hearthlog.schemas.messages.versions import APPENDED
+from hearthlog.schemas.times import NANOSECONDS
+
+PACKAGE = "hearthlog_msgs"
+STREAM_INFO = f"{PACKAGE}/msg/AudioStreamInfo"
+FEATURES = f"{PACKAGE}/msg/AudioFeatures"
+STATISTICS = f"{PACKAGE}/msg/AudioStatistics"
+LABEL = f"{PACKAGE}/msg/AudioLabel"
+SEGMENT = f"{PACKAGE}/msg/AudioSegment"
+MARK = f"{PACKAGE}/msg/AudioMark"
+GAP = f"{PACKAGE}/msg/AudioGap"
+RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+LOG = "rcl_interfaces/msg/Log"
+
+_DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, MARK, GAP, RAW_AUDIO)
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the types of ROS 2 and those of `schemas/msg`."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    folder = files("hearthlog.schemas.messages") / "msg"
+    for name in _DEFINED_HERE:
+        text = (folder / f"{name.rpartition('/')[2]}.msg").read_text()
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def message(typename: str, **fields: Any) -> Any:
+    """Make a message of the given type; fields that were appended to it may be left out."""
+    absent = APPENDED.get(typename, {}).keys() - fields.keys()
+    if absent:
+        descriptions = dict(typestore().fielddefs[typename][1])
+        for name in absent:
+            fields[name] = _default(descriptions[name], APPENDED[typename][name].default)
+    return typestore().types[typename](**fields)
+
+
+def _default(description: tuple[Nodetype, Any], value: float | str | None = None) -> Any:
+    """Return what stands for a field in a message, as `default_rows` does for one in columns."""
+    node, kind = description
+    if node is Nodetype.BASE:
+        return ("" if kind[0] == "string" else 0) if value is None else value
+    if node is Nodetype.NAME:
+        fields = [f for f in typestore().fielddefs[kind][1] if f[0] not in APPENDED.get(kind, {})]
+        return message(kind, **{name: _default(described) for name, described in fields})
+    (element, base), count = kind
+    length = count if node is Nodetype.ARRAY else 0
+    if element is Nodetype.BASE and base[0] != "string":
+        return np.zeros(length, number_type(base[0]))
+    return [_default((element, base)) for _ in range(length)]
+
+
+def number_type(name: str) -> np.dtype[Any]:
+    """Return the dtype of numbers, by the name that message definitions have for them."""
+    return np.dtype("uint8" if name in {"byte", "char"} else name)
+
+
+def header(stamp: int, frame_id: str) -> Any:
+    """Make a `std_msgs/Header`; `stamp` in nanoseconds of UTC."""
+    return message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
+
+
+def time_message(nanoseconds: int) -> Any:
+    """Make a `builtin_interfaces/Time`."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+
+
+def duration_message(nanoseconds: int) -> Any:
+    """Make a `builtin_interfaces/Duration`."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=rest)
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Read a `builtin_interfaces` Time or Duration."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def encode(fields: Any) -> bytes:
+    """Encode one message as little-endian CDR."""
+    return bytes(typestore().serialize_cdr(fields, fields.__msgtype__, little_endian=True))
+
+
+def decode(data: bytes | memoryview, typename: str) -> Any:
+    """Decode one message."""
+    return typestore().deserialize_cdr(data, typename)
+
+
+@cache
+def definition(typename: str) -> str:
+    """Return a type's definition and those it builds on, as MCAP's `ros2msg` wants them."""
+    return typestore().generate_msgdef(typename, ros_version=2)[0]
+
+
+@cache
+def type_hash(typename: str) -> str:
+    """Return the type's RIHS01 hash, by which ROS 2 tells that two sides mean the same type."""
+    return typestore().hash_rihs01(typename)

@@ -1,0 +1,94 @@
+"""The topics of a log: their types, their quality of service, the names behind their arrays."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages import message_types
+
+DIAGNOSTICS = "/diagnostics"
+ROSOUT = "/rosout"
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The quality of service of a topic, where topics differ: the defaults are those of ROS 2.
+
+    Attributes
+    ----------
+    depth : int
+        How many messages are kept.
+    transient_local : bool
+        They are kept for those who come late.
+    lifespan_seconds : int or None
+        For how long; None: for ever.
+    """
+
+    depth: int = 10
+    transient_local: bool = False
+    lifespan_seconds: int | None = None
+
+
+_LATCHED = Quality(depth=1, transient_local=True)
+_OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # of any ROS 2 node
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One channel of a log."""
+
+    name: str
+    type: str
+    quality: Quality = Quality()
+    array_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
+def check_microphone_name(name: str) -> str:
+    """Return the name if it can be part of a ROS topic."""
+    if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
+        raise LogError(
+            f"microphone name {name!r} cannot be a topic: use lower-case letters, digits and "
+            "single underscores, starting with a letter"
+        )
+    return name
+
+
+def topic(microphone: str, kind: str) -> str:
+    """Name the topic of one kind (`info`, `features`, `label` …) of a microphone."""
+    return f"/{microphone}/{kind}"
+
+
+def microphone_of(topic: str) -> str:
+    """Return the microphone of a topic; empty if it is of none."""
+    parts = topic.split("/")
+    return parts[1] if len(parts) > 2 else ""
+
+
+def topics_of(
+    microphone: str, feature_names: Sequence[str], classes: Sequence[str] | None
+) -> list[Topic]:
+    """List what a recorder writes for a microphone; without classes it writes no labels."""
+    statistics = {"mean": feature_names, "std": feature_names}
+    found = [
+        Topic(topic(microphone, "info"), message_types.STREAM_INFO, _LATCHED),
+        Topic(
+            topic(microphone, "features"),
+            message_types.FEATURES,
+            array_names={"values": feature_names},
+        ),
+        Topic(topic(microphone, "statistics"), message_types.STATISTICS, array_names=statistics),
+        Topic(topic(microphone, "gap"), message_types.GAP),
+        Topic(DIAGNOSTICS, message_types.DIAGNOSTICS),
+        Topic(ROSOUT, message_types.LOG, _OF_ROSOUT),
+    ]
+    if classes is not None:
+        names = {"probabilities": classes}
+        found.append(Topic(topic(microphone, "label"), message_types.LABEL, array_names=names))
+        found.append(Topic(topic(microphone, "segment"), message_types.SEGMENT))
+    return found
+
+
+def audio_topic(microphone: str) -> Topic:
+    """Return the one topic of a layer of sound."""
+    return Topic(topic(microphone, "audio"), message_types.RAW_AUDIO)

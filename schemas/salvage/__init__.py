@@ -1,0 +1,1 @@
+"""What is whole in a damaged file, and what was lost."""

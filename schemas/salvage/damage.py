@@ -1,0 +1,265 @@
+"""What was lost where a file is damaged, as far as it can still be known."""
+
+import struct
+import zlib
+from array import array
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.logfile import FOOTER_SIZE
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError, parse
+from hearthlog.schemas.salvage.record_verifier import MESSAGE_SIZE, SHORTEST, IntactReader
+
+_BLOCK = 1 << 20
+_TIMES = struct.Struct("<QQ")
+_NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
+_OF_INDEX = {
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.STATISTICS,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.SUMMARY_OFFSET,
+}
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A part of a file that is not whole, and what was lost with it.
+
+    Attributes
+    ----------
+    start, end : int
+        Bytes.
+    why : str
+    messages : mapping of str to int
+        Messages that are lost, by topic.
+    exact : bool
+        Whether these are all.
+    times : tuple of int, or None
+        Log times of the first and the last of them, where they are known.
+    others : sequence of str
+        What else is lost.
+    cut : bool
+        Whether the file just ends here.
+    """
+
+    start: int
+    end: int
+    why: str
+    messages: Mapping[str, int] = field(default_factory=dict)
+    exact: bool = True
+    times: tuple[int, int] | None = None
+    others: tuple[str, ...] = ()
+    cut: bool = False
+
+    @property
+    def lossless(self) -> bool:
+        """Whether nothing was lost with it."""
+        return self.exact and not self.messages and not self.others
+
+    def __str__(self) -> str:
+        about = f"damaged at byte {self.start} ({self.why})"
+        if self.lossless:
+            return f"{about}: nothing is lost"
+        lost = [f"{count} of {topic}" for topic, count in sorted(self.messages.items())]
+        if not self.exact:
+            lost.append("perhaps more" if lost else "an unknown number of messages")
+        span = (
+            "" if self.times is None else f", {_moment(self.times[0])} to {_moment(self.times[1])}"
+        )
+        return f"{about}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
+
+
+def _moment(stamp: int) -> str:
+    moment = datetime.fromtimestamp(stamp / 1e9, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+class Index(NamedTuple):
+    """What the index of a file says, whose checksum is right.
+
+    Attributes
+    ----------
+    start : int
+        Where it begins.
+    definitions : list of mcap.records.Schema and mcap.records.Channel
+    messages : dict of int to int
+        By channel.
+    chunks : np.ndarray [shape=(n, 5)], int64
+        Offset, length, length of the message indexes, first and last log time of each chunk, in
+        the order of the file.
+    names : dict of int to str
+        Metadata and attachments, by their offsets.
+    """
+
+    start: int
+    definitions: list[records.Schema | records.Channel]
+    messages: dict[int, int]
+    chunks: NDArray[np.int64]
+    names: dict[int, str]
+
+
+class Stretch(NamedTuple):
+    """Bytes of a file that hold no whole record.
+
+    `opcode` is the first of them, and `ends` where the record should end that may have been here.
+    """
+
+    start: int
+    end: int
+    opcode: int
+    ends: tuple[int, ...]
+
+
+class Lost(NamedTuple):
+    """What was in a stretch; the fields are those of `Damage`, but messages are by channel."""
+
+    messages: dict[int, int]
+    exact: bool
+    times: tuple[int, int] | None = None
+    others: tuple[str, ...] = ()
+
+
+_NOTHING = Lost({}, exact=True)
+
+
+def read_index(reader: IntactReader, limit: int) -> Index | None:
+    """Read the index of a finished file; None if there is none, or if it may be damaged.
+
+    Parameters
+    ----------
+    reader : IntactReader
+    limit : int
+        Bytes; a longer index is not read.
+    """
+    end = reader.end - FOOTER_SIZE
+    tail = reader.read(max(end, 0), FOOTER_SIZE)
+    if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
+        return None
+    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
+    assert isinstance(footer, records.Footer)
+    start = footer.summary_start
+    if not len(MAGIC) <= start < end or end - start > limit:
+        return None
+    crc = 0
+    for place in range(start, end, _BLOCK):
+        crc = zlib.crc32(reader.read(place, min(_BLOCK, end - place)), crc)
+    if zlib.crc32(tail[: HEAD.size + 16], crc) != footer.summary_crc:
+        return None
+    with suppress(McapError, UnicodeDecodeError, OverflowError):
+        return _records_of_index(reader, start, end)
+    return None
+
+
+def _records_of_index(reader: IntactReader, start: int, end: int) -> Index:
+    definitions: list[records.Schema | records.Channel] = []
+    names: dict[int, str] = {}
+    messages: dict[int, int] = {}
+    chunks = array("q")
+    offset = start
+    while offset < end:
+        found = reader.whole(offset)
+        record = found.record
+        if isinstance(record, records.Schema | records.Channel):
+            definitions.append(record)
+        elif isinstance(record, records.Statistics):
+            messages = record.channel_message_counts
+        elif isinstance(record, records.ChunkIndex):
+            chunks.extend(
+                (
+                    record.chunk_start_offset,
+                    record.chunk_length,
+                    record.message_index_length,
+                    record.message_start_time,
+                    record.message_end_time,
+                )
+            )
+        elif isinstance(record, records.MetadataIndex):
+            if record.name != rosbag2.METADATA:  # it is made anew
+                names[record.offset] = f"the metadata {record.name!r}"
+        elif isinstance(record, records.AttachmentIndex):
+            names[record.offset] = f"the attachment {record.name!r}"
+        elif not isinstance(record, records.SummaryOffset):
+            raise McapError("here should be the index")
+        offset = found.end
+    table = np.array(chunks, np.int64).reshape(-1, 5)
+    table = table[np.argsort(table[:, 0])]
+    ends = table[:, :3].sum(axis=1)
+    if (table < 0).any() or (ends[:-1] > table[1:, 0]).any():
+        raise McapError("chunks overlap")
+    return Index(start, definitions, messages, table, names)
+
+
+def lost_in(reader: IntactReader, stretch: Stretch, index: Index | None) -> Lost:
+    """Say what was lost in a stretch."""
+    if index is None:
+        return _by_what_is_around(reader, stretch)
+    others = tuple(
+        name for offset, name in index.names.items() if stretch.start <= offset < stretch.end
+    )
+    first, last = np.searchsorted(index.chunks[:, 0], [stretch.start, stretch.end])
+    if first == last:
+        exact = bool(len(index.chunks)) or stretch.end - stretch.start < MESSAGE_SIZE
+        return Lost({}, exact, None, others)
+    chunks = index.chunks[first:last]
+    messages: dict[int, int] = {}
+    exact = True
+    for offset, length, index_length, _, _ in chunks.tolist():
+        end, _ = _count(reader, offset + length, messages)
+        exact &= end == offset + length + index_length
+    return Lost(messages, exact, (int(chunks[:, 3].min()), int(chunks[:, 4].max())), others)
+
+
+def _by_what_is_around(reader: IntactReader, stretch: Stretch) -> Lost:
+    start, end, opcode, ends = stretch
+    if end - start < MESSAGE_SIZE and (end < reader.end or opcode != Opcode.CHUNK):
+        return _NOTHING
+    is_record = end in ends or end == reader.end
+    if end in ends and reader.like_message_index(start):
+        return _NOTHING  # whatever its first byte says
+    if opcode == Opcode.CHUNK:
+        messages: dict[int, int] = {}
+        behind, span = _count(reader, end, messages)
+        times = _TIMES.unpack(reader.read(start + HEAD.size, 16).ljust(16, b"\0"))
+        exact = bool(messages) and end in ends and behind < reader.end
+        exact = (
+            exact and reader.plausible(behind) and reader.head(behind)[0] != Opcode.MESSAGE_INDEX
+        )
+        is_sound = 0 < times[0] <= times[1] < 1 << 63
+        return Lost(messages, exact, span or (times if is_sound else None))
+    if opcode in _NAME_AFTER and is_record:
+        name = _name(reader, start + HEAD.size + _NAME_AFTER[Opcode(opcode)])
+        kind = "the metadata" if opcode == Opcode.METADATA else "the attachment"
+        return Lost({}, True, None, () if name == rosbag2.METADATA else (f"{kind} {name!r}",))
+    is_message = opcode == Opcode.MESSAGE or SHORTEST[opcode] > LIMIT
+    return _NOTHING if is_record and not is_message else Lost({}, exact=False)
+
+
+def _count(
+    reader: IntactReader, offset: int, messages: dict[int, int]
+) -> tuple[int, tuple[int, int] | None]:
+    """Count messages by the indexes from here on; return where these end, and their times."""
+    times = []
+    with suppress(McapError):
+        while True:
+            channel, entries, offset = reader.message_index(offset)
+            messages[channel] = messages.get(channel, 0) + len(entries)
+            if len(entries):
+                times += [int(entries["time"].min()), int(entries["time"].max())]
+    return offset, (min(times), max(times)) if times else None
+
+
+def _name(reader: IntactReader, offset: int) -> str:
+    length = int.from_bytes(reader.read(offset, 4), "little")
+    return reader.read(offset + 4, min(length, 100)).decode(errors="replace")

@@ -1,0 +1,397 @@
+"""Everything that is whole in an MCAP file that was cut or damaged, and what is not.
+
+The file is walked from record to record. Where no whole record follows, the next one is searched
+for: a length that is wrong hides nothing behind it.
+
+The time that this takes grows with the size of the file, not with what it claims: what is whole
+is read once, and what is read in vain, because it only looks like a record, may be `_VAIN` times
+the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, and reported.
+"""
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError
+from hearthlog.schemas.salvage.damage import Damage, Stretch, lost_in, read_index
+from hearthlog.schemas.salvage.record_verifier import (
+    SHORTEST,
+    Found,
+    FoundAttachment,
+    FoundChunk,
+    IntactReader,
+    messages_of,
+)
+from hearthlog.schemas.storage.regular_file import open_regular
+
+_VAIN = 8
+_HELD = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
+_HELD_EACH = 256
+_DAMAGES = 1000  # as many are told apart
+_WINDOW = 1 << 20
+_OVERLAP = 64  # a head of a chunk fits in, and where its data begin
+_COMPRESSED = re.compile(
+    rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL
+)
+_BEFORE_COMPRESSION = HEAD.size + 28
+_FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
+
+Definition = records.Schema | records.Channel
+Piece = records.Metadata | records.Message | FoundAttachment | FoundChunk
+
+
+class Definitions:
+    """Schemas and channels, by number, wherever a file defines them."""
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, records.Schema] = {}
+        self.channels: dict[int, records.Channel] = {}
+        self._doubtful: set[tuple[type, int]] = set()
+
+    def add(self, record: Definition) -> bool:
+        """Add one; False if its number has another meaning already."""
+        if isinstance(record, records.Schema):
+            return self.schemas.setdefault(record.id, record) == record
+        return self.channels.setdefault(record.id, record) == record
+
+    def doubt(self, record: Definition) -> None:
+        """From now on it is not known what this number means."""
+        self._doubtful.add((type(record), record.id))
+
+    def defines(self, number: int) -> bool:
+        """Whether it is known what the messages of a channel are."""
+        channel = self.channels.get(number)
+        if channel is None or (records.Channel, number) in self._doubtful:
+            return False
+        schema = channel.schema_id
+        known = schema == 0 or schema in self.schemas
+        return known and (records.Schema, schema) not in self._doubtful
+
+    def topic(self, number: int) -> str:
+        """Name the topic of a channel, or the channel if that is not known."""
+        return self.channels[number].topic if self.defines(number) else f"channel {number}"
+
+
+@dataclass
+class Unnamed:
+    """Messages of one channel that are whole, while nothing says what they are.
+
+    Attributes
+    ----------
+    messages : int
+    times : tuple of int
+        The first and the last log time.
+    place : tuple of int
+        Bytes of the file.
+    """
+
+    messages: int
+    times: tuple[int, int]
+    place: tuple[int, int]
+
+    def add(self, messages: int, times: tuple[int, int], place: tuple[int, int]) -> None:
+        """Add some more."""
+        self.messages += messages
+        self.times = min(self.times[0], times[0]), max(self.times[1], times[1])
+        self.place = self.place[0], place[1]
+
+
+class Salvage:
+    """A file whose whole pieces are looked for.
+
+    Parameters
+    ----------
+    path : Path
+    known : iterable of mcap.records.Schema and mcap.records.Channel
+        Definitions of the same file that an earlier salvage met too late.
+
+    Attributes
+    ----------
+    is_mcap : bool
+        Whether it begins as such a file does.
+    complete : bool
+        Whether it is finished, and its index is whole.
+    header : mcap.records.Header or None
+    definitions : Definitions
+        Those met so far.
+    expected : dict of int to int, or None
+        How many messages each channel should have, if an index says so that is whole.
+    unnamed : dict of int to Unnamed
+
+    Raises
+    ------
+    LogError
+        If it cannot be read.
+    """
+
+    def __init__(self, path: Path, known: Iterable[Definition] = ()) -> None:
+        self.header: records.Header | None = None
+        self.definitions = Definitions()
+        self.unnamed: dict[int, Unnamed] = {}
+        try:
+            self._descriptor = open_regular(path)
+        except OSError as error:
+            raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+        self.size = os.fstat(self._descriptor).st_size
+        self._reader = IntactReader(self._descriptor, self.size)
+        start = self._reader.read(0, len(MAGIC))
+        self.is_mcap = bool(start) and MAGIC.startswith(start)
+        self._index = read_index(self._reader, _HELD)
+        self.complete = self._index is not None
+        self.expected = None if self._index is None else self._index.messages
+        if self._index is not None:
+            self._reader.end = self._index.start
+            known = [*self._index.definitions, *known]
+        for record in known:
+            self.definitions.add(record)
+        self._damages: list[tuple[Damage, dict[int, int]]] = []
+        self._found: Found | None = None  # by the last search
+        self._vain = self._held = 0
+        self._cost = 0  # of what was last read in vain
+        self._has_chunks = False
+        self._ended = False  # the data: the index follows
+        self._astray = False  # perhaps inside a damaged chunk
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+    @property
+    def offset(self) -> int:
+        """How many bytes have been passed."""
+        return self._offset
+
+    def damages(self) -> list[Damage]:
+        """List what was not whole so far, in the order of the file, and then what has no name."""
+        found = []
+        for damage, lost in self._damages:
+            messages: dict[str, int] = {}
+            for channel, count in lost.items():
+                topic = self.definitions.topic(channel)
+                messages[topic] = messages.get(topic, 0) + count
+            found.append(replace(damage, messages=messages))
+        for channel, some in self.unnamed.items():
+            why = f"nothing that is left says what channel {channel} is"
+            messages = {self.definitions.topic(channel): some.messages}
+            found.append(Damage(*some.place, why, messages, times=some.times))
+        return found
+
+    def pieces(self) -> Iterator[Piece]:
+        """Read whatever is whole, in the order of the file.
+
+        Chunks have been compared with their checksums, and have the message index that they
+        should have. They hold no messages of undefined channels: where there are such, the other
+        messages come one by one.
+        """
+        self._offset = len(MAGIC) if self.is_mcap else 0
+        while self._offset < self._reader.end:
+            offset = self._offset
+            try:
+                found = self._at(offset)
+            except McapError as error:
+                if self._ended and MAGIC.startswith(self._reader.read(offset, len(MAGIC) + 1)):
+                    return
+                self._offset = self._pass(offset, str(error))
+                continue
+            if found.wrong:
+                self._add(Damage(offset, found.end, f"{found.wrong} is wrong"))
+            self._offset = found.end
+            yield from self._taken(found)
+            del found  # before the next is read, which may be as large
+
+    def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> Found:
+        """Read the record that begins here; raise McapError if there is none that is whole."""
+        if self._found is not None and self._found.offset == offset:
+            found, self._found = self._found, None
+            return found
+        reader = self._reader
+        self._cost = 0
+        if self._vain > 4 * LIMIT + _VAIN * offset:
+            raise McapError("too much looks like records here and is none")
+        if reader.inner > (1 << 20) + 4 * self.size:
+            raise McapError("the file holds more messages than one of its size can")
+        work = reader.work
+        try:
+            found = reader.chunk(offset) if chunk else reader.whole(offset, 3 if searching else 1)
+            self._hold(found)
+            self._doubt(found, searching=searching)
+        except (McapError, UnicodeDecodeError) as error:
+            self._cost = reader.work - work
+            raise McapError(str(error)) from error
+        return found
+
+    def _hold(self, found: Found) -> None:
+        """Count what will be kept of a record as long as the file is read."""
+        record, held = found.record, _HELD_EACH
+        if isinstance(record, FoundChunk):
+            held += 16 * len(record.stored.entries)
+            held += sum(_size(definition) for definition in record.definitions)
+        elif isinstance(record, Definition):
+            held += _size(record)
+        elif isinstance(record, FoundAttachment):
+            held += len(record.about.name) + len(record.about.media_type)
+        elif isinstance(record, records.Metadata):
+            held += len(record.name)
+        else:
+            return
+        if self._held + held > _HELD:
+            raise McapError("the file holds more definitions than can be kept")
+        self._held += held
+
+    def _doubt(self, found: Found, *, searching: bool) -> None:
+        """Raise McapError for what may be another record, or look like one only by chance."""
+        if self._astray and isinstance(found.record, records.Message | Definition):
+            raise McapError("what is in a damaged chunk is not proved")
+        if isinstance(found.record, records.Message) and self._has_chunks:
+            if searching or self._ended:
+                raise McapError("messages are in chunks here")
+            if self._reader.like_message_index(found.offset):
+                raise McapError("a message index has become a message")
+        if not searching:
+            return
+        if not isinstance(found.record, FoundChunk) and not self._reader.plausible(found.end):
+            raise McapError("no record begins where this one ends")
+
+    def _pass(self, offset: int, why: str) -> int:
+        """Note that no whole record begins here; return where the next one does."""
+        reader, cost = self._reader, self._cost
+        opcode = reader.read(offset, 1)[0]
+        ends: tuple[int, ...] = ()
+        with suppress(McapError):
+            ends = reader.ends(offset)
+        if opcode == Opcode.CHUNK:
+            self._has_chunks = True
+        else:  # perhaps only this byte of it is wrong
+            try:
+                self._found = self._at(offset, chunk=True)
+            except McapError:
+                cost += self._cost
+            else:
+                return offset
+        end = -1
+        if opcode in _FRAMED:
+            end = next((e for e in sorted(ends) if e < reader.end and reader.plausible(e)), -1)
+        if end < 0:
+            self._vain += cost  # for its bytes are read again
+            self._astray = opcode == Opcode.CHUNK
+            end = self._search(offset + 1)
+        cut = end == self.size and SHORTEST[opcode] < LIMIT and min(ends, default=end + 1) > end
+        if cut:
+            why = "the file ends within a record"
+        elif not any(reader.read(offset, 64)):
+            why = "zeros"
+        if self._ended:  # it was part of the index
+            self._add(Damage(offset, end, why, cut=cut))
+        else:
+            lost = lost_in(reader, Stretch(offset, end, opcode, ends), self._index)
+            self._add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
+        return end
+
+    def _search(self, start: int) -> int:
+        """Return where the next whole record begins, or where the data end."""
+        end = self._reader.end
+        while start < end:
+            window = os.pread(self._descriptor, min(_WINDOW + _OVERLAP, end - start), start)
+            chunks = set(_chunks_in(window))
+            for place in sorted(chunks.union(_heads_in(window))):
+                try:
+                    self._found = self._at(start + place, searching=True, chunk=place in chunks)
+                except McapError:
+                    self._vain += self._cost
+                else:
+                    return start + place
+            start += _WINDOW
+        return end
+
+    def _taken(self, found: Found) -> Iterator[Piece]:
+        """Remember what a record says of the file; hand it on if it is to be kept."""
+        record = found.record
+        if isinstance(record, records.Header):
+            self.header = self.header or record
+            self._ended = False
+        elif isinstance(record, records.DataEnd | records.Footer):
+            self._ended = True
+        elif isinstance(record, Definition):
+            if not self.definitions.add(record) and not self._ended and self._index is None:
+                self.definitions.doubt(record)
+        elif isinstance(record, FoundChunk):
+            self._ended, self._astray, self._has_chunks = False, False, True
+            yield from self._named(record, found)
+        elif isinstance(record, records.Message):
+            self._ended = False
+            if self.definitions.defines(record.channel_id):
+                yield record
+            else:
+                times = record.log_time, record.log_time
+                self._miss(record.channel_id, 1, times, found)
+        elif isinstance(record, records.Metadata | FoundAttachment):
+            yield record
+
+    def _named(self, chunk: FoundChunk, found: Found) -> Iterator[Piece]:
+        """Hand on a chunk if all is defined that it holds, else those messages of it that are."""
+        agree = True
+        for record in chunk.definitions:
+            if not self.definitions.add(record):
+                self.definitions.doubt(record)
+                agree = False
+        defined = {number: self.definitions.defines(number) for number in chunk.stored.entries}
+        if agree and all(defined.values()):
+            if defined:
+                yield chunk
+            return
+        for number, entries in chunk.stored.entries.items():
+            if not defined[number]:
+                times = np.frombuffer(entries, np.int64)[::2]
+                self._miss(number, len(times), (int(times.min()), int(times.max())), found)
+        if any(defined.values()):
+            for message in messages_of(chunk.stored):
+                if defined[message.channel_id]:
+                    yield message
+
+    def _miss(self, channel: int, messages: int, times: tuple[int, int], found: Found) -> None:
+        place = found.offset, found.end
+        self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
+
+    def _add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
+        if len(self._damages) == _DAMAGES:
+            last, known = self._damages.pop()
+            lossless = damage.lossless and last.lossless and not messages and not known
+            damage = Damage(last.start, damage.end, "and more", exact=lossless, cut=damage.cut)
+            messages = known
+        self._damages.append((damage, messages or {}))
+
+
+def _size(record: Definition) -> int:
+    if isinstance(record, records.Schema):
+        return _HELD_EACH + len(record.data) + len(record.name)
+    texts = [record.topic, record.message_encoding, *record.metadata, *record.metadata.values()]
+    return _HELD_EACH + sum(map(len, texts))
+
+
+def _heads_in(window: bytes) -> list[int]:
+    """Find the bytes at which opcode and length of a record may stand."""
+    count = min(len(window) - HEAD.size + 1, _WINDOW)
+    if count <= 0:
+        return []
+    shortest = SHORTEST[np.frombuffer(window, np.uint8)[:count]]
+    places = np.flatnonzero(shortest <= LIMIT)
+    lengths = np.ndarray((count,), "<u8", window, 1, (1,))[places]
+    found: list[int] = places[(lengths <= LIMIT) & (lengths >= shortest[places])].tolist()
+    return found
+
+
+def _chunks_in(window: bytes) -> list[int]:
+    """Find the bytes at which the head of a compressed chunk may stand, damaged or not."""
+    places = [match.start() - _BEFORE_COMPRESSION for match in _COMPRESSED.finditer(window)]
+    return [place for place in places if 0 <= place < _WINDOW]

@@ -1,0 +1,69 @@
+"""Files that people write or pass on: read whole within limits, or refused with one line."""
+
+import os
+import tomllib
+from pathlib import Path
+from typing import IO, Any
+
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.storage.byte_ranges import is_local
+from hearthlog.schemas.storage.regular_file import open_regular
+
+_TOML_LIMIT = 1 << 20
+_DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of their number
+
+
+def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
+    """Read a regular file.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or in a store.
+    what : str
+        What it should be, for the message.
+    limit : int
+        Bytes, at most.
+    error : type of HearthlogError
+        What is raised if there is no such file, or it is larger or cannot be read.
+    """
+    try:
+        if not path.exists():
+            raise error(f"{path}: no such {what}")
+        with _opened(path) as stream:
+            data = stream.read(limit + 1)
+    except OSError as reason:
+        raise error(f"{path}: cannot be read ({reason.strerror})") from reason
+    if len(data) > limit:
+        raise error(f"{path}: larger than {limit >> 20} MB; this is no {what}")
+    return data
+
+
+def _opened(path: Path) -> IO[bytes]:
+    """Open a file, which in a store is a regular one."""
+    return os.fdopen(open_regular(path), "rb") if is_local(path) else path.open("rb")
+
+
+def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
+    """Read a TOML file; the parameters are those of `read_whole`.
+
+    Raises
+    ------
+    HearthlogError
+        `error`, if it cannot be read, is larger than 1 MB, nested too deeply, or no TOML in UTF-8.
+    """
+    data = read_whole(path, what, _TOML_LIMIT, error)
+    content: dict[str, Any] = {}
+    try:
+        text = data.decode("utf-8")
+        keys = (line for line in text.split("\n") if not line.lstrip().startswith("#"))
+        deep = any(line.count(".") > _DEEPEST for line in keys)
+        if not deep:
+            content = tomllib.loads(text)
+    except ValueError as reason:
+        raise error(f"{path}: cannot be read as TOML ({str(reason)[:200]})") from reason
+    except RecursionError:
+        deep = True
+    if deep:
+        raise error(f"{path}: cannot be read as TOML (it is nested too deeply)")
+    return content
