@@ -68,7 +68,7 @@ def test_blocks_make_the_same_file_as_single_messages(batches, chunk_size, flush
             theirs.add_message(channel, stamp, data, stamp + 1, number)
             by_one.add_message(channel, stamp, data, stamp + 1, number)
         ours.write(blocks(rows))
-        if flush:
+        if flush and hasattr(theirs, "flush"):  # from mcap 1.5 on
             for writer in (theirs, ours, by_one):
                 writer.flush()
     for writer in (theirs, ours, by_one):
