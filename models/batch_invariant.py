@@ -1,13 +1,14 @@
 """Matrix products whose rows do not depend on each other."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Float64
 
 _ROWS = 16
 _LINE = 64  # bytes of a cache
 
 
-def rowwise_matmul(rows: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
     """Multiply `rows @ weights` so that a row's result is the same in any company.
 
     A BLAS picks its kernels, and its threads, by the size of the whole product, and each sums
@@ -40,7 +41,7 @@ def rowwise_matmul(rows: NDArray[np.float64], weights: NDArray[np.float64]) -> N
     return product
 
 
-def aligned(weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def aligned(weights: Float64) -> Float64:
     """Copy weights to where a line of the cache begins: products with them take a third less time.
 
     Parameters

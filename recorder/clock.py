@@ -3,7 +3,8 @@
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hearthlog.schemas.arrays import Float64
 
 _WINDOW_SECONDS = 2.0
 _WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
@@ -60,7 +61,7 @@ class SampleClock:
         if self._earliest is None or steered < self._earliest_steered:
             self._earliest, self._earliest_steered = (nominal, late), steered
 
-    def time(self, index: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    def time(self, index: Float64 | float) -> Float64:
         """Return the time of samples on the clock of the observations, in seconds."""
         assert self._origin is not None
         nominal = np.asarray(index) / self._rate

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
+from hearthlog.schemas.arrays import Float32, Int64
 
 
 @dataclass(frozen=True)
@@ -21,8 +20,8 @@ class Frames:
     """
 
     first: int
-    samples: NDArray[np.float32]
-    stamps: NDArray[np.int64]
+    samples: Float32
+    stamps: Int64
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
@@ -15,6 +14,7 @@ from hearthlog.recorder import rosout
 from hearthlog.recorder.clips.clip_choice import Labelled
 from hearthlog.recorder.events import Event, Frames, Gap, Health
 from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
@@ -26,9 +26,6 @@ from hearthlog.schemas.messages.message_types import (
     nanoseconds,
 )
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 _ROW_TYPES = {
     "features": message_types.FEATURES,

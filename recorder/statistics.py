@@ -1,13 +1,11 @@
 """Mean and standard deviation of the features over the last window, at every frame."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.features.window_inputs import mean_and_std, successive
+from hearthlog.schemas.arrays import Float32
 
 _FRAMES_AT_ONCE = 256
-
-Float32 = NDArray[np.float32]
 
 
 class RollingStatistics:

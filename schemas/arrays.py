@@ -3,7 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
+Bool = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Int64 = NDArray[np.int64]
 
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import delayed
-from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.errors import DataError
@@ -16,14 +15,13 @@ from hearthlog.analyzer.training.dataset import Dataset, Progress
 from hearthlog.analyzer.training.home_data import HOME_WEIGHT
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
+from hearthlog.schemas.arrays import Indices
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_GROUPS = 8
 _FEWEST_CLASSES = 2
 _FEWEST_SEGMENTS = max(CORRECTED)  # to correct, and as many to be tried on
 _SHUFFLES = 3
-
-Indices = NDArray[np.intp]
 
 
 class Curve(NamedTuple):

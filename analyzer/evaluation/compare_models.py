@@ -19,8 +19,8 @@ from hearthlog.analyzer.training.scores import (
 )
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Float32
 
-Float32 = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 

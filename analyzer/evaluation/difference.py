@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events, Int64
+from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.labellings import Side
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
-
-Float64 = NDArray[np.float64]
 
 
 class Pieces(NamedTuple):

@@ -11,7 +11,6 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import (
     Detections,
     Events,
-    Int64,
     common,
     detect,
     laid_out,
@@ -23,6 +22,7 @@ from hearthlog.analyzer.logs.labelling import REVIEW, Labelling
 from hearthlog.analyzer.marks.formats import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS

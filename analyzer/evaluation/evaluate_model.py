@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
@@ -15,10 +14,9 @@ from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, r
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.labels.segments import Segmenter
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.times import NANOSECONDS
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

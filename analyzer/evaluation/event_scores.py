@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 COLLAR = NANOSECONDS // 5
@@ -23,7 +24,6 @@ _PART_OF_LENGTH = 0.5
 _DAY = 24 * 3600 * NANOSECONDS
 _MOST_PAIRS = 20_000_000
 
-Int64 = NDArray[np.int64]
 Spans = tuple[Int64, Int64]
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -23,8 +24,6 @@ _RATES = range(1_000, 768_001)
 _MOST_CHANNELS = 256
 _JOINED = 10_000_000  # nanoseconds between clips that still follow each other
 _REASON = "no clip holds it"
-
-Float32 = NDArray[np.float32]
 
 
 class ClipFramer:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Int64 = NDArray[np.int64]
+from hearthlog.schemas.arrays import Int64
 
 
 class Spans(NamedTuple):

@@ -3,20 +3,17 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.labels.segments import Run, Segment, Segmenter
 from hearthlog.recorder.events import Gap
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.logs.log_stream import Rows
 from hearthlog.schemas.times import NANOSECONDS
 
 _STEP = NANOSECONDS // 5  # what the line through a sound card's times may jump by
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 
 class Labels(NamedTuple):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.recorder_info import Origin, features_of
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.recorder.events import Gap, Health
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -37,8 +38,8 @@ class Features(NamedTuple):
     """Features of successive frames, as `Pipeline.push_features` takes them."""
 
     first: int
-    values: NDArray[np.float32]
-    stamps: NDArray[np.int64]
+    values: Float32
+    stamps: Int64
 
 
 class Piece(NamedTuple):
@@ -176,7 +177,7 @@ def _state(time: int, status: dict[str, Any]) -> Health:
     return Health(time, status["level"], status["message"], values)
 
 
-def _check_times(columns: Columns, times: NDArray[np.int64]) -> None:
+def _check_times(columns: Columns, times: Int64) -> None:
     if not np.array_equal(columns.log_times, times):
         raise LogError(
             f"{columns.topic}: log times are not those of the sound; this was not written by "

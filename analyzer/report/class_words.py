@@ -5,8 +5,8 @@ from datetime import date, tzinfo
 import numpy as np
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.logs.spans import Int64
 from hearthlog.models.classes import find_class
+from hearthlog.schemas.arrays import Int64
 
 _WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
 _MONTHS = (

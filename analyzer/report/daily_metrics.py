@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.local_time import at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
     NONE,
-    Int64,
     Spans,
     common,
     cut,
@@ -23,6 +22,7 @@ from hearthlog.analyzer.logs.spans import (
 from hearthlog.analyzer.report.read_home import Heard, Segments
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
 from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 EVENING, MORNING = 22, 7  # of the clock: between them is the night

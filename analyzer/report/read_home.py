@@ -16,12 +16,13 @@ from hearthlog.analyzer.logs.channel_names import names_of
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.logs.layers import RELABEL, REVIEW, Entry, Shelf
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.spans import NONE, Int64, Spans, common, joined, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, without
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.models.classes import class_name
 from hearthlog.models.classifiers.description import CLASS_NAME, class_metrics
 from hearthlog.models.modelfile.card import DESCRIPTION
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import SUFFIX, stem

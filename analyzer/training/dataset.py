@@ -8,7 +8,6 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import Clip
@@ -17,6 +16,7 @@ from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
 HOP_FRAMES = 10
@@ -24,8 +24,6 @@ SEGMENTS_PER_GROUP = 24
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 
-Float32 = NDArray[np.float32]
-Indices = NDArray[np.intp]
 Progress = Callable[[int, int], None]
 
 
@@ -88,7 +86,7 @@ class Dataset:
     target: Indices
     group: Indices
     collection: Indices
-    weight: NDArray[np.float64]
+    weight: Float64
     classes: tuple[str, ...]
     seconds: Mapping[str, float]
     collection_names: tuple[str, ...]
@@ -265,7 +263,7 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]
     return ("" if len(loud) else "nowhere above -60 dBFS"), loud
 
 
-def _thinned(key: Indices, weight: NDArray[np.float64]) -> Indices:
+def _thinned(key: Indices, weight: Float64) -> Indices:
     """Choose evenly spaced rows of each key; return their indices in order.
 
     At most 24 are chosen, and more of what weighs more.

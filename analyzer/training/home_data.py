@@ -4,7 +4,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import names_of
 from hearthlog.analyzer.marks.marks import Mark, read_marks
@@ -12,6 +11,7 @@ from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.models.classes import translation
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
@@ -20,8 +20,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 HOME_WEIGHT = 5.0  # of a segment of the home, where others count 1
 HOME = "this home"
-
-Int64 = NDArray[np.int64]
 
 
 def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:

@@ -17,11 +17,10 @@ from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _SEED = 20_261_121
 
-Float64 = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Fold = tuple[Indices, Indices]  # segments that are seen, and those that are not
 NO_HOME: Indices = np.empty(0, np.intp)
 
@@ -36,7 +35,7 @@ class Examples(NamedTuple):
     weight : np.ndarray [shape=(n,)], float64
     """
 
-    inputs: NDArray[np.float32]
+    inputs: Float32
     target: Indices
     weight: Float64
 
@@ -44,7 +43,7 @@ class Examples(NamedTuple):
 class Learned(Protocol):
     """What was learned from segments."""
 
-    def decide(self, inputs: NDArray[np.float32], classes: int) -> Float64:
+    def decide(self, inputs: Float32, classes: int) -> Float64:
         """Decide as the kind of classifier does with the arrays.
 
         Parameters

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.schemas.arrays import Float64, Int64
 
 RESAMPLES = 1000
 _BINS = 15
@@ -15,8 +16,7 @@ _COUNTS_AT_ONCE = 4_000_000  # of the counts of resamples: bounds memory
 _INTERVAL = (2.5, 97.5)
 
 Interval = tuple[float, float]
-Float64 = NDArray[np.float64]
-Counts = NDArray[np.int64]
+Counts = Int64
 Indices = NDArray[np.integer]
 
 

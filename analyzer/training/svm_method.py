@@ -13,9 +13,10 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.method import NO_HOME, Examples, Float64, Indices, Method
+from hearthlog.analyzer.training.method import NO_HOME, Examples, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
@@ -99,12 +100,12 @@ class LearnedSvm:
         Their classes.
     """
 
-    def __init__(self, machine: Pipeline, home: NDArray[np.float32], home_target: Indices) -> None:
+    def __init__(self, machine: Pipeline, home: Float32, home_target: Indices) -> None:
         self.machine = machine
         self._home = home
         self._home_target = home_target
 
-    def decide(self, inputs: NDArray[np.float32], classes: int) -> Float64:
+    def decide(self, inputs: Float32, classes: int) -> Float64:
         """Decide as `SvmMachine` of `svm_rbf` does; see `Learned.decide`."""
         values = self.machine.decision_function(inputs.astype(np.float64))
         pairs = -values[:, np.newaxis] if values.ndim == 1 else values
@@ -113,7 +114,7 @@ class LearnedSvm:
         decision[:, learned] = weakest_pairs(pairs, len(learned))
         return decision + self._votes(inputs, classes) if len(self._home) else decision
 
-    def _votes(self, inputs: NDArray[np.float32], classes: int) -> Float64:
+    def _votes(self, inputs: Float32, classes: int) -> Float64:
         scaler, svc = self.machine
         gamma, here = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
         home = scaler.transform(self._home.astype(np.float64))

@@ -5,7 +5,6 @@ from dataclasses import asdict, replace
 from importlib.metadata import version
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
 
@@ -39,13 +38,11 @@ from hearthlog.models.classifiers.description import (
     TrainingData,
 )
 from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Float64, Int64
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")
 _SHUFFLES = 20
-
-Float64 = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 
 def train_model(
@@ -118,7 +115,7 @@ def train_model(
     )
 
 
-def adapt_model(base: Model, home: Dataset, sequences: Sequence[NDArray[np.int64]] = ()) -> Model:
+def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> Model:
     """Learn once more what a model has learned, and a home's own segments with it.
 
     Parameters

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.classes import find_class
-from hearthlog.models.labels.smoothing import Float64
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not
@@ -60,7 +59,7 @@ def transitions_from_durations(durations: Float64, frame_seconds: float) -> Floa
 
 
 def transitions_from_sequences(
-    sequences: Sequence[NDArray[np.int64]],
+    sequences: Sequence[Int64],
     durations: Float64,
     frame_seconds: float = FRAME_SECONDS,
 ) -> Float64:

@@ -6,7 +6,8 @@ hmmlearn has no wheel for Python 3.14 yet; nothing but this module needs it.
 import numpy as np
 from hmmlearn.base import BaseHMM
 
-from hearthlog.models.labels.smoothing import Float32, Float64, States, log_likelihoods
+from hearthlog.models.labels.smoothing import States, log_likelihoods
+from hearthlog.schemas.arrays import Float32, Float64
 
 
 def viterbi(probabilities: Float32, transitions: Float64) -> States:

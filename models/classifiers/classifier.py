@@ -1,7 +1,6 @@
 """Probabilities of a model's classes, whatever kind of classifier it is."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.model import Model
@@ -9,11 +8,10 @@ from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.arrays import Float32
 
 CLASSIFIERS = Extensions("hearthlog.classifiers", ClassifierKind, [SVM_RBF])  # type: ignore[type-abstract]
 _ROWS_AT_ONCE = 256
-
-Float32 = NDArray[np.float32]
 
 
 def classifier_kind(name: str) -> ClassifierKind:

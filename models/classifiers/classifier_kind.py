@@ -5,13 +5,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from hearthlog.models.classifiers.model import Array, Model
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+from hearthlog.schemas.arrays import Float32, Float64
 
 
 class Machine(Protocol):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.description import Description
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 
 Array = NDArray[Any]
 
@@ -35,12 +36,10 @@ class Model:
 
     description: Description
     arrays: Mapping[str, Array]
-    transitions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-    training_windows: NDArray[np.float32] = field(
-        default_factory=lambda: np.empty((0, 0, 0), np.float32)
-    )
-    training_target: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    training_group: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    transitions: Float64 = field(default_factory=lambda: np.empty((0, 0)))
+    training_windows: Float32 = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
+    training_target: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
+    training_group: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     name: str = ""
     sha256: str = ""
 

@@ -5,12 +5,12 @@ from itertools import combinations, pairwise
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.schemas.arrays import Float32, Float64
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
 HOME_SHARE = 100.0  # of one vector of the home, where a support vector has 1
@@ -19,8 +19,6 @@ _TINY = 1e-200
 _SUPPORT_AT_ONCE = 256  # a product this small no BLAS divides among threads
 _SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 _Part = tuple[int, slice, Float64]  # a class, its columns, their coefficients
 _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.features.window_inputs import Inputs
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SECONDS
-
-Float32 = NDArray[np.float32]
 
 
 class Extractor(Protocol):

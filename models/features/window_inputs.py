@@ -7,10 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-_FRAMES_AT_ONCE = 256
+from hearthlog.schemas.arrays import Float32, Float64
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
+_FRAMES_AT_ONCE = 256
 
 
 class InputStream(Protocol):

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.labels.smoothing import FixedLagSmoother
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 States = NDArray[np.intp]
 
 _UNITS = 1 << 30  # to 1: finer than what a float32 below 1 can tell
@@ -96,9 +95,7 @@ class Segmenter:
         Whether sound before the first frame would have left no trace in the segments to come.
     """
 
-    def __init__(
-        self, smoothing: Smoothing, transitions: NDArray[np.float64], frame_seconds: float
-    ) -> None:
+    def __init__(self, smoothing: Smoothing, transitions: Float64, frame_seconds: float) -> None:
         self._smoother = None
         self._lag = 0
         if smoothing.method == "hmm":

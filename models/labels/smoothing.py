@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.schemas.arrays import Float32, Float64
+
 _FLOOR = 1e-6  # of a probability: no single frame forbids a class
 # Logarithms are rounded to multiples of this, so that their sums are exact. The path then does not
 # depend on when the scores are brought back to zero, nor on what is long past.
@@ -11,8 +13,6 @@ _FRAMES_AT_ONCE = 4096
 _LANE = 128  # frames
 _WARM_UP = 64  # frames; in real sound 99 of 100 beginnings are forgotten after 32
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 States = NDArray[np.intp]
 
 

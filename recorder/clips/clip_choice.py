@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.recorder.events import Frames
+from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -19,9 +20,6 @@ PRIVATE_LIMIT = 0.02
 UNSURE_CONFIDENCE = 0.5
 UNSURE_NOVELTY = 0.7
 _BEHIND_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
-
-Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 
 class Labelled(NamedTuple):
@@ -49,7 +47,7 @@ class Sound(NamedTuple):
     samples : np.ndarray [shape=(n, 800)], int16
     """
 
-    stamps: NDArray[np.int64]
+    stamps: Int64
     samples: NDArray[np.int16]
 
 
@@ -91,7 +89,7 @@ class ClipFinder:
         """
         self._next = -1
         self._samples: NDArray[np.int16] = np.empty((0, FRAME_SAMPLES), np.int16)
-        self._stamps: NDArray[np.int64] = np.empty(0, np.int64)
+        self._stamps: Int64 = np.empty(0, np.int64)
         self._private: Float32 = self._unlabelled(_BEHIND_FRAMES)
         self._wanted: Bool = np.zeros(_BEHIND_FRAMES, bool)
 

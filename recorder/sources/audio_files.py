@@ -6,18 +6,16 @@ from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import Event, Frames, Health
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 
 _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
-
-Float32 = NDArray[np.float32]
 
 
 class FileSource:
@@ -82,7 +80,7 @@ class FileSource:
             files = ", ".join(str(path) for path in self._paths)
             raise SourceError(f"{files}: shorter than one frame of 50 ms")
 
-    def _stamps(self, first: int, count: int) -> NDArray[np.int64]:
+    def _stamps(self, first: int, count: int) -> Int64:
         return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS
 
     def _frames(self) -> Iterator[Float32]:

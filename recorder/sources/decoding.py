@@ -7,15 +7,13 @@ from pathlib import Path
 import numpy as np
 import soundfile
 import soxr
-from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _BLOCK_SECONDS = 10.0
 _RATES = range(1_000, 768_001)  # what any recording has, and soxr converts in bounded memory
-
-Float32 = NDArray[np.float32]
 
 
 def read_audio(path: Path) -> Iterator[Float32]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hearthlog.recorder.clock import SampleClock
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -16,8 +17,6 @@ _LOSS_SECONDS = 0.010
 _STEADY_SECONDS = 0.002  # an ADC that has been this exact for so many blocks
 _STEADY_BLOCKS = 50  # is believed when it says that samples are missing
 _INT16_FULL_SCALE = np.float32(32768.0)
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ class Framer:
         self._last_stamp = int(stamps[-1])
         return [found] if gap is None else [gap, found]
 
-    def _times(self, count: int) -> NDArray[np.int64]:
+    def _times(self, count: int) -> Int64:
         """Return when the next frames start, in nanoseconds of CLOCK_MONOTONIC."""
         heard = self._heard + np.arange(count) * FRAME_SAMPLES
         index = self._origin + heard * np.float64(self._rate / SAMPLE_RATE)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.arrays import Bytes, Indices, Int64, gather
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.cdr_layout import (
     AnyLeaf,
@@ -24,7 +24,6 @@ from hearthlog.schemas.times import NANOSECONDS
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
 _TRIED = 64  # layouts, before rows are looked at one by one
-Indices = NDArray[np.intp]
 
 
 def encode_groups(

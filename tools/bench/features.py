@@ -4,9 +4,9 @@ from collections.abc import Callable
 from importlib.metadata import version
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
@@ -17,7 +17,6 @@ _SINGLE_FRAMES = 2000
 _FAST = Target(10_000)
 _FASTER_THAN_THE_PAPERS_LIBRARY = Target(50)
 
-Float32 = NDArray[np.float32]
 Peer = Callable[[Float32], Callable[[], object]]
 
 

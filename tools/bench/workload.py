@@ -16,6 +16,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.bench.timing import BenchError
 from hearthlog.tools.home.simulate import write_day, write_training_set
@@ -25,8 +26,6 @@ _MOST_SECONDS = 3600
 _SEED = 1
 # Simulated sounds hardly overlap, and would need a third of the support vectors that real ones do.
 _OVERLAP = 0.75  # standard deviations
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass

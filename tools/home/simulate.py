@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-from numpy.typing import NDArray
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import SIMULATED
+from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.sounds import (
     LABELS,
@@ -190,7 +190,7 @@ def _plan_part(
     ]
 
 
-def _perform(events: list[Event], seed: int) -> Iterator[NDArray[np.float64]]:
+def _perform(events: list[Event], seed: int) -> Iterator[Float64]:
     """Yield the samples, one sound or at most 10 s of silence at a time."""
     # From 1: a seed (s, 0) gives the numbers of the seed s, which planned the day.
     room = RoomTone(generator(seed, 1))

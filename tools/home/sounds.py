@@ -7,9 +7,9 @@ apart, and never twice the same. A model trained on them knows nothing of real h
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.waveforms import (
@@ -32,9 +32,6 @@ _DOOR_DECIBELS = 10.0
 _FADE_SECONDS = 0.01
 _TINY = 1e-9
 _SCALES = ((0, 2, 4, 5, 7, 9, 11), (0, 2, 3, 5, 7, 8, 10))  # major, minor; semitones
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 class SimulationError(HearthlogError):

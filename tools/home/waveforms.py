@@ -4,9 +4,9 @@ Everything works on whole sounds at 16 kHz.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, lfilter, sosfilt
 
+from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 # First three formants of a man's vowels (Peterson & Barney 1952), and a fixed fourth.
@@ -19,8 +19,6 @@ _VOWELS = {
 }
 _BANDWIDTHS = (80, 100, 140, 220)
 
-Float64 = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Range = tuple[float, float]
 
 

@@ -3,20 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY, events_of
-from hearthlog.analyzer.evaluation.event_scores import Int64
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources, label_topic
 from hearthlog.analyzer.logs.selection import Progress
 from hearthlog.analyzer.review.queue.uncertainty import Doubt
 from hearthlog.analyzer.review.queue.windows import Windows, other_labels, windows_of, without
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
-
-Float64 = NDArray[np.float64]
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])

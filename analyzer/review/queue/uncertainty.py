@@ -5,12 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.evaluation.event_scores import Int64
 from hearthlog.analyzer.logs.channel_names import names_of
 from hearthlog.analyzer.review.queue.windows import Windows
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
-
-Float64 = NDArray[np.float64]
 
 
 class Doubt:

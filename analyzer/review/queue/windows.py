@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import laid_over
-from hearthlog.analyzer.evaluation.event_scores import Events, Int64
+from hearthlog.analyzer.evaluation.event_scores import Events
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 SHORTEST = NANOSECONDS // 2

@@ -3,12 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.review.timeline.contents import Clip
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
-
-Float32 = NDArray[np.float32]
 
 
 def listen(clips: Sequence[Clip], start: int, end: int) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.review.timeline.grid import Float64, Grid, Int64
+from hearthlog.analyzer.review.timeline.grid import Grid
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 
-Float32 = NDArray[np.float32]
 LIVE, REVIEW = "live", "review"
 
 

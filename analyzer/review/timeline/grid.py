@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Int64 = NDArray[np.int64]
-Float64 = NDArray[np.float64]
+from hearthlog.schemas.arrays import Float64, Int64
 
 
 @dataclass(frozen=True)

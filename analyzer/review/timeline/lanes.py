@@ -8,8 +8,9 @@ import numpy as np
 
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.review.timeline.contents import Labelling, Spans, no_spans
-from hearthlog.analyzer.review.timeline.grid import Float64, Grid, Int64, time_shares
+from hearthlog.analyzer.review.timeline.grid import Grid, time_shares
 from hearthlog.models.classes import SILENCE, class_name, translation
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 BLOCKS = 420  # of a lane seen from afar: what is narrower than four pixels would be drawn grey

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.typed_columns import decode_known
 from hearthlog.analyzer.review.timeline.contents import Lines, Spans
 from hearthlog.analyzer.review.timeline.decode import FIELDS, TOPIC, decibel, spans_of, value_names
-from hearthlog.analyzer.review.timeline.grid import Float64, Grid, Int64
+from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.lanes import Changes, changes, clock
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.review.timeline.contents import Clip, Frames, Lines
-from hearthlog.analyzer.review.timeline.grid import Float64, Int64
+from hearthlog.schemas.arrays import Float64, Int64
 
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough

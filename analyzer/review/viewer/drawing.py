@@ -16,9 +16,9 @@ from hearthlog.analyzer.review.timeline.contents import (
     Timeline,
     no_spans,
 )
-from hearthlog.analyzer.review.timeline.grid import Int64
 from hearthlog.analyzer.review.timeline.lanes import changes, clock, disagreements, from_afar
 from hearthlog.analyzer.review.viewer.canvas import TIMELINE, Canvas
+from hearthlog.schemas.arrays import Int64
 
 APPLICATION = "hearthlog"
 AFAR, EXACT = "lanes", "exact"

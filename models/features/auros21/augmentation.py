@@ -5,11 +5,11 @@ the cepstra stand for, so the sound itself is not needed.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.features.auros21.extractor import mel_centres
 from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
 from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY
+from hearthlog.schemas.arrays import Float32, Float64
 
 _SHARE = 0.6  # of the segments, of each of gain, tilt and every bump
 _GAIN = 12.0  # dB, and how far it may be from none
@@ -19,9 +19,6 @@ _BUMP_OCTAVES = (0.3, 1.0)  # how wide
 _NOISE_SHARE = 0.5
 _NOISE = (-95.0, -55.0)  # dB in each band
 _NEPER = 10.0 / np.log(10.0)  # dB of a power e times as large
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 def augmented(windows: Float32, rng: np.random.Generator) -> Float32:

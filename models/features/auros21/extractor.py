@@ -8,11 +8,11 @@ and a batch of the same samples agree bit for bit.
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import rowwise_matmul
 from hearthlog.models.features.auros21.inputs import dct_weights
 from hearthlog.models.features.auros21.names import CEPSTRA, FEATURE_NAMES, MEL_BANDS
+from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 _BINS = FRAME_SAMPLES // 2
@@ -25,9 +25,6 @@ _SANE_SAMPLE = 1e3  # full scale is 1
 _SANE_ENERGY = _SANE_SAMPLE**2
 _POWER_FLOOR = 1e-7  # about -70 dBFS: below it a spectrum tells of the codec, not of the sound
 _FRAMES_AT_ONCE = 384  # more would leave a core's cache, fewer cost more in calls
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 class FeatureExtractor:

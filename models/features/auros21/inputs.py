@@ -8,18 +8,15 @@ bands they stand for, and besides mean and deviation how much a value changes fr
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import rowwise_matmul
 from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY, FEATURE_NAMES, FLUX, MEL_BANDS
 from hearthlog.models.features.window_inputs import WindowStatistics
+from hearthlog.schemas.arrays import Float32, Float64
 
 WINDOW_FRAMES = 20
 _SCALARS, _WIDTH = CEPSTRA.start, len(FEATURE_NAMES)
 _FLOOR = 1e-7
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 def features_themselves(features: Float32) -> Float32:
