@@ -20,7 +20,7 @@ from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.salvage.damage import Damage
-from hearthlog.schemas.salvage.record_verifier import FoundAttachment, FoundChunk
+from hearthlog.schemas.salvage.record_verifier import WholeAttachment, WholeChunk
 from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
 from hearthlog.schemas.storage.regular_file import open_regular
 
@@ -231,7 +231,7 @@ class _Copy:
     def _add(self, piece: Piece) -> None:
         self._begin()
         self.pieces += 1
-        if isinstance(piece, FoundChunk):
+        if isinstance(piece, WholeChunk):
             chunk = piece.stored
             self._define(chunk.entries, piece.definitions)
             self._writer.copy_chunk(chunk)
@@ -243,7 +243,7 @@ class _Copy:
             number, time = piece.channel_id, piece.log_time
             self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
             self._count(number, 1, time, time)
-        elif isinstance(piece, FoundAttachment):
+        elif isinstance(piece, WholeAttachment):
             self._writer.copy_attachment(piece.record, piece.about)
         elif piece.name != rosbag2.METADATA:
             self._writer.add_metadata(piece.name, piece.metadata)
@@ -307,7 +307,7 @@ def _check(path: Path, topics: dict[str, Topic]) -> None:
     expected = {name: topic.messages for name, topic in topics.items() if topic.messages}
     found: dict[str, int] = {}
     with LogFile(path) as file:
-        for place in file.places:
+        for place in file.record_locations:
             file.record(place)
         groups = np.cumsum(file.chunks["size"]) // _READ_SIZE
         for chunks in np.split(file.chunks, np.flatnonzero(np.diff(groups)) + 1):

@@ -11,7 +11,7 @@ import numpy as np
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.logs.log_stream import Attachment, Rows
+from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
@@ -176,7 +176,7 @@ def _write_hour(  # noqa: PLR0913, PLR0917
             "label": [row[2] for row in rows],
             "confidence": np.array([row[3] for row in rows], np.float32),
         }
-        writer.write_columns([Rows(f"/{microphone}/segment", ends, fields)])
+        writer.write_columns([TopicBatch(f"/{microphone}/segment", ends, fields)])
     for start, seconds, reason in gaps:
         stamp = begin + round(start * NANOSECONDS)
         length = round(seconds * NANOSECONDS)

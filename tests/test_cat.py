@@ -22,7 +22,7 @@ from hearthlog.analyzer.logs.pieces import pieces
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.reader import LogReader
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import (
     FEATURES,
@@ -120,7 +120,7 @@ def write_features(path, names, times):
     log = LogWriter(path, [topic], {})
     fields = {"header.stamp": times, "header.frame_id": "mic", "frame": times}
     values = np.repeat(times, len(names)).reshape(-1, len(names)).astype(np.float32)
-    log.write_columns([Rows("/mic/features", times, fields | {"values": values})])
+    log.write_columns([TopicBatch("/mic/features", times, fields | {"values": values})])
     return log.finish()
 
 

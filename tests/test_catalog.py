@@ -39,7 +39,7 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import FOOTER_SIZE, time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -97,7 +97,7 @@ def relabelled(log: Path, segments: list[tuple[int, str]]) -> Path:
         "feature_set": "auros21",
     }
     writer = LogWriter(path, [Topic(topic, message_types.SEGMENT)], about)
-    writer.write_columns([Rows(topic, start + np.cumsum(lengths), fields)])
+    writer.write_columns([TopicBatch(topic, start + np.cumsum(lengths), fields)])
     return writer.finish()
 
 

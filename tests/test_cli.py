@@ -10,7 +10,7 @@ import pytest
 from conftest import HEARTHLOG
 from mcap.writer import Writer as McapWriter
 
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
@@ -79,7 +79,7 @@ def gaps(path, count, reason="overrun"):
         "frames_lost": np.full(count, 5, np.uint64),
     }
     writer = LogWriter(path, [Topic("/hall/gap", message_types.GAP)], {})
-    writer.write_columns([Rows("/hall/gap", times, fields)])
+    writer.write_columns([TopicBatch("/hall/gap", times, fields)])
     return writer.finish()
 
 

@@ -24,7 +24,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.reader import LogReader
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter, StoredChunk
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -244,7 +244,7 @@ def test_files_that_overlap_and_layers_come_as_one_series_in_the_order_of_time(t
 def written(path, topic, times, *, label="speech", width=3):
     """Write labels at these times, whose frame numbers are the times."""
     writer = LogWriter(path, [Topic(topic, message_types.LABEL)], {})
-    writer.write_columns([Rows(topic, times, label_fields(times, label, width))])
+    writer.write_columns([TopicBatch(topic, times, label_fields(times, label, width))])
     return writer.finish()
 
 
@@ -272,7 +272,8 @@ def test_rows_whose_arrays_differ_in_length_come_as_objects(tmp_path):
 def test_two_types_on_one_topic_are_told(tmp_path):
     first = written(tmp_path / "a.mcap", "/mic/label", np.arange(5))
     writer = LogWriter(tmp_path / "b.mcap", [Topic("/mic/label", "std_msgs/msg/Float32")], {})
-    writer.write_columns([Rows("/mic/label", np.arange(3), {"data": np.zeros(3, np.float32)})])
+    fields = {"data": np.zeros(3, np.float32)}
+    writer.write_columns([TopicBatch("/mic/label", np.arange(3), fields)])
     with pytest.raises(LogError, match="/mic/label: is of type std_msgs/msg/Float32 and of "):
         read_columns([first, writer.finish()])
 
@@ -367,7 +368,7 @@ def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
             "mean": np.tile(times.astype(np.float32)[:, np.newaxis], 21),
             "std": np.ones((len(times), 21), np.float32),
         }
-        writer.write_columns([Rows("/mic/statistics", times, fields)])
+        writer.write_columns([TopicBatch("/mic/statistics", times, fields)])
     writer.finish()
     code = f"""
 from pathlib import Path
@@ -432,7 +433,7 @@ def test_chunks_that_overlap_in_time_are_one_series(tmp_path):
         for first in range(0, 100_000, 20_000):
             times = np.arange(first + part, first + 30_000, 2 + part)
             text = {"stamp": times, "frame_id": "x" * 300}
-            writer.write_columns([Rows("/a", times, text)])
+            writer.write_columns([TopicBatch("/a", times, text)])
             writer.flush()
         logs.append(writer.finish())
     expected = sorted(m.log_time for log in logs for m in LogReader(log).messages())

@@ -29,7 +29,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
@@ -77,7 +77,8 @@ def write_layer(log, other, name, kinds=("label", "segment"), change=lambda _: {
     path = log.with_name(f"{log.name.removesuffix('.mcap')}.relabel-{name}.mcap")
     writer = LogWriter(path, topics, {"model": name, "log": log.name})
     for kind, own in columns.items():
-        writer.write_columns([Rows(f"{base}/{kind}", own.log_times, own.fields | change(own))])
+        fields = own.fields | change(own)
+        writer.write_columns([TopicBatch(f"{base}/{kind}", own.log_times, fields)])
         writer.flush()
     return writer.finish()
 
@@ -371,7 +372,8 @@ def write_home(path, rows, probabilities):
         Topic("/mic/segment", message_types.SEGMENT),
     ]
     writer = LogWriter(path, topics, {})
-    writer.write_columns([Rows("/mic/label", stamps, frames), Rows("/mic/segment", ends, spans)])
+    batch = [TopicBatch("/mic/label", stamps, frames), TopicBatch("/mic/segment", ends, spans)]
+    writer.write_columns(batch)
     return writer.finish()
 
 

@@ -14,7 +14,7 @@ from logs import features
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.follow import follow
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 
@@ -66,7 +66,7 @@ def write(writer, first, count=20):
         "frame": times,
         "values": np.zeros((count, 3), np.float32),
     }
-    writer.write_columns([Rows(TOPIC, times, fields)])
+    writer.write_columns([TopicBatch(TOPIC, times, fields)])
     writer.flush()
 
 

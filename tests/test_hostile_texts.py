@@ -20,7 +20,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
@@ -185,7 +185,7 @@ def gap_on(topic, path):
         "frames_lost": np.full(3, 5, np.uint64),
     }
     writer = LogWriter(path, [Topic(topic, message_types.GAP)], {})
-    writer.write_columns([Rows(topic, times, fields)])
+    writer.write_columns([TopicBatch(topic, times, fields)])
     return writer.finish()
 
 

@@ -29,7 +29,7 @@ from hearthlog.analyzer.report.html import paragraph
 from hearthlog.analyzer.report.read_home import read_heard
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.schemas.logs.log_stream import Rows
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
@@ -262,7 +262,7 @@ def one_segment(path, topic, start, seconds, label):
         "label": [label],
         "confidence": np.ones(1, np.float32),
     }
-    writer.write_columns([Rows(topic, np.array([start + length]), fields)])
+    writer.write_columns([TopicBatch(topic, np.array([start + length]), fields)])
     return writer.finish()
 
 

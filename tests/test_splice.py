@@ -15,7 +15,7 @@ from hearthlog.analyzer.export.merge import splice
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.reader import LogReader
-from hearthlog.schemas.logs.writer import Attachment, LogWriter, Rows
+from hearthlog.schemas.logs.writer import Attachment, LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message
 from hearthlog.schemas.messages.topics import Quality, Topic
@@ -64,7 +64,7 @@ def small_log(path, topics, rows=(), info=(), about=({}, ())):
     if rows:
         values = times[:, None] * np.ones(len(topics[0].array_names["values"]), np.float32)
         fields = {"header.stamp": times, "header.frame_id": "mic", "frame": times}
-        log.write_columns([Rows(topics[0].name, times, fields | {"values": values})])
+        log.write_columns([TopicBatch(topics[0].name, times, fields | {"values": values})])
     return log.finish()
 
 
@@ -292,7 +292,7 @@ def test_logs_of_any_size_are_merged_in_little_memory(tmp_path):
             times = np.arange(first, first + 50_000) * 2 + part
             values = np.random.default_rng(part).random((50_000, 21), np.float32)
             fields = {"header.stamp": times, "header.frame_id": "mic", "frame": times}
-            log.write_columns([Rows(topic.name, times, fields | {"values": values})])
+            log.write_columns([TopicBatch(topic.name, times, fields | {"values": values})])
         logs.append(log.finish())
     tracemalloc.start()
     splice(select(logs), tmp_path / "all.mcap")

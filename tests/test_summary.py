@@ -24,7 +24,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.files import active_path, find_logs
 from hearthlog.schemas.logs.reader import LogReader
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (
     definition,
@@ -269,7 +269,7 @@ def test_a_relabelling_is_a_layer_with_labels_of_its_own(logs, tmp_path):
         "probabilities": np.ones((10, 2), np.float32),
     }
     writer = LogWriter(path, [Topic(topic, message_types.LABEL)], {})
-    writer.write_columns([Rows(topic, times, fields)])
+    writer.write_columns([TopicBatch(topic, times, fields)])
     writer.finish()
     alone, both = summarise([path]), summarise([*logs, path])
     assert both.layers == [path]

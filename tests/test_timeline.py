@@ -44,7 +44,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import audio_path, find_logs
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds
 from hearthlog.schemas.messages.topics import Topic
@@ -317,7 +317,7 @@ def labels_log(path, names, count, width=2, **about):
     }
     topic = Topic("/mic/label", message_types.LABEL, array_names=names)
     writer = LogWriter(path, [topic], about)
-    writer.write_columns([Rows("/mic/label", times, fields)])
+    writer.write_columns([TopicBatch("/mic/label", times, fields)])
     return writer.finish()
 
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import LogContent
+from hearthlog.schemas.logs.log_stream import LogStreamWriter
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter, Rows
-from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
@@ -114,8 +114,8 @@ def test_columns_make_the_same_log_as_encoded_messages(tmp_path_factory, seed, c
     for part in (slice(0, count // 3), slice(count // 3, count)):
         many.write_columns(
             [
-                Rows("/mic/features", times[part], rows({**common, "values": values}, part)),
-                Rows("/mic/label", times[part], rows({**common, **decided}, part)),
+                TopicBatch("/mic/features", times[part], rows({**common, "values": values}, part)),
+                TopicBatch("/mic/label", times[part], rows({**common, **decided}, part)),
             ]
         )
     one = LogWriter(folder / "one.mcap", TOPICS, {"node": "home"})
@@ -155,7 +155,7 @@ def label(time, frame, name, values):
 def content(path):
     """Return all bytes up to the last metadata record, which has the name of the file in it."""
     with LogFile(path) as file:
-        last = max(place.offset for place in file.places)
+        last = max(place.offset for place in file.record_locations)
         return file.read(0, last)
 
 
@@ -181,7 +181,7 @@ def test_messages_that_were_read_are_written_as_they_were(source, request, tmp_p
                 channel.topic, channel.message_encoding, channel.schema_id, channel.metadata
             )
     for batch in iterate_messages([log]):
-        writer.write([block for raw in batch for block in blocks_of(raw, raw.channel.id)])
+        writer.write([block for raw in batch for block in message_blocks(raw, raw.channel.id)])
     writer.finish()
     copy = tmp_path / "copy.mcap"
     copy.write_bytes(stream.getvalue())
@@ -214,7 +214,7 @@ def test_a_log_says_how_many_messages_it_has_and_from_when_to_when(tmp_path):
     times = np.arange(5) * NANOSECONDS + 7
     fields = {"header.stamp": times, "header.frame_id": "mic", "frame": np.arange(5)}
     values = np.zeros((5, 2), np.float32)
-    writer.write_columns([Rows("/mic/features", times, {**fields, "values": values})])
+    writer.write_columns([TopicBatch("/mic/features", times, {**fields, "values": values})])
     with LogFile(writer.finish()) as file:
         about = file.statistics
     assert about.message_count == 5
@@ -225,7 +225,7 @@ def test_a_log_says_how_many_messages_it_has_and_from_when_to_when(tmp_path):
 
 def test_a_log_goes_on_in_another_process_as_if_nothing_had_been():
     wholes, parts = BytesIO(), BytesIO()
-    whole, part = LogContent(wholes, TOPICS), LogContent(parts, TOPICS)
+    whole, part = LogStreamWriter(wholes, TOPICS), LogStreamWriter(parts, TOPICS)
     for first in (0, 40, 80):
         times = 10**18 + np.arange(first, first + 40) * NANOSECONDS
         fields = {
@@ -238,7 +238,7 @@ def test_a_log_goes_on_in_another_process_as_if_nothing_had_been():
             "probabilities": np.ones((40, 2), np.float32),
         }
         for one in (whole, part):
-            one.write_columns([Rows("/mic/label", times, fields)])
+            one.write_columns([TopicBatch("/mic/label", times, fields)])
             one.flush()
         part = pickle.loads(pickle.dumps(part))
         parts = BytesIO(parts.getvalue())

@@ -131,7 +131,8 @@ def _known(path: Path, source: Source) -> _Known:
     try:
         with LogFile(path) as file:
             ours = _is_ours(file)
-            places = [*file.chunks["offset"].tolist(), *(place.offset for place in file.places)]
+            places = file.chunks["offset"].tolist()
+            places += [location.offset for location in file.record_locations]
     except LogError:
         places, ours = [], False
     if HEAD.size < start < source.size:

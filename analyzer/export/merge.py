@@ -20,7 +20,7 @@ from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.files import new_file
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import ENCODING
-from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, blocks_of
+from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.mcap.logfile import LogFile
 
@@ -122,7 +122,7 @@ class _Log:
             channel = self._channel((messages.channel, messages.schema))
             blocks += (
                 block._replace(rank=start + messages.offsets[block.rank])
-                for block in blocks_of(messages, channel)
+                for block in message_blocks(messages, channel)
             )
             times = messages.log_times
             self._counts[channel] += len(messages)
@@ -143,7 +143,7 @@ class _Log:
         names: set[str] = set()
         for path in logs:
             with LogFile(path) as file:
-                for place in sorted(file.places, key=lambda place: place.offset):
+                for place in sorted(file.record_locations, key=lambda place: place.offset):
                     record = file.record(place)
                     key = _key(record)
                     if key is None or key in seen:

@@ -105,8 +105,8 @@ def labelling_of(segments: Columns) -> Labelling:
     LogError
         If they overlap.
     """
-    segments = segments.taken(np.flatnonzero(segments["duration"] > 0))
-    segments = segments.taken(np.argsort(segments["header.stamp"], kind="stable"))
+    segments = segments.take(np.flatnonzero(segments["duration"] > 0))
+    segments = segments.take(np.argsort(segments["header.stamp"], kind="stable"))
     starts = segments["header.stamp"]
     ends = starts + segments["duration"]
     if (starts[1:] < ends[:-1]).any():

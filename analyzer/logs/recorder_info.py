@@ -108,7 +108,7 @@ def read_origin(path: Path, kind: str) -> Origin | None:
         if len(microphones) > 1:
             names = ", ".join(sorted(microphones))
             raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
-        attached = [file.record(p) for p in file.places if p.opcode == Opcode.ATTACHMENT]
+        attached = [file.record(p) for p in file.record_locations if p.opcode == Opcode.ATTACHMENT]
         # What was merged is of the last of its recorders.
         about = next(reversed(read_provenance(file)), {})
         complete = file.complete

@@ -18,7 +18,7 @@ from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.logs.provenance import read_provenance, version_text
 from hearthlog.schemas.mcap.chunks import read_chunks
-from hearthlog.schemas.mcap.logfile import LogFile, Place
+from hearthlog.schemas.mcap.logfile import LogFile, RecordLocation
 from hearthlog.schemas.mcap.records import HEAD
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
@@ -253,14 +253,14 @@ def _about(file: LogFile) -> Summary:
     if file.header is not None:
         summary.profiles |= {file.header.profile} - {""}
         summary.libraries |= {file.header.library} - {""}
-    for place in file.places:
+    for place in file.record_locations:
         names = summary.metadata if place.opcode == Opcode.METADATA else summary.attachments
         names.add(_name(file, place))
     summary.schema_versions |= {version_text(record) for record in read_provenance(file)}
     return summary
 
 
-def _name(file: LogFile, place: Place) -> str:
+def _name(file: LogFile, place: RecordLocation) -> str:
     """Read the name of a metadata record or an attachment, and nothing else of it."""
     head = file.read(place.offset + HEAD.size, _TIMES + _NAME_LENGTH.size + _NAME_LIMIT)
     start = 0 if place.opcode == Opcode.METADATA else _TIMES

@@ -22,7 +22,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import SUFFIX, replaced_file, stem
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topic
@@ -229,7 +229,7 @@ def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
         return writer.finish().read_bytes()
 
 
-def _rows(name: str, kind: str, marks: Sequence[Mark]) -> Rows:
+def _rows(name: str, kind: str, marks: Sequence[Mark]) -> TopicBatch:
     microphone = name.split("/")[1]
     own = [mark for mark in marks if mark.microphone == microphone]
     starts = np.array([mark.start for mark in own])
@@ -241,10 +241,10 @@ def _rows(name: str, kind: str, marks: Sequence[Mark]) -> Rows:
         "label": [mark.label for mark in own],
     }
     if kind == message_types.SEGMENT:
-        return Rows(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
+        return TopicBatch(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
     says = {
         "reviewer": [mark.reviewer for mark in own],
         "made": np.array([mark.made for mark in own]),
         "corrects": [mark.corrects for mark in own],
     }
-    return Rows(name, ends, fields | says)
+    return TopicBatch(name, ends, fields | says)

@@ -36,7 +36,7 @@ from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import new_file, replaced_file, stem
-from hearthlog.schemas.logs.log_stream import LogContent, Rows
+from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.cdr_codec import Column
 
@@ -76,7 +76,7 @@ class Labelled(NamedTuple):
     ----------
     part : Path
         The beginning of the layer.
-    content : LogContent
+    content : LogStreamWriter
         That has written it.
     source : Source
     microphone, node : str
@@ -95,7 +95,7 @@ class Labelled(NamedTuple):
     """
 
     part: Path
-    content: LogContent
+    content: LogStreamWriter
     source: Source
     microphone: str
     node: str
@@ -164,7 +164,7 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Labelle
     part = part_path(job.layer)
     try:
         with part.open("xb") as out:
-            content = LogContent(out, topics)
+            content = LogStreamWriter(out, topics)
             frames = 0
             for event in heard(origin, 0):
                 labels = stream.push(event)
@@ -251,7 +251,7 @@ def complete_layer(job: Job, labelled: Labelled) -> None:
     delete_parts(job.layer)
 
 
-def _rows(topic: str, labelled: Labelled, classes: Sequence[str]) -> Rows:
+def _rows(topic: str, labelled: Labelled, classes: Sequence[str]) -> TopicBatch:
     """Make messages of segments."""
     segments = labelled.segments
     starts = np.array([segment.start for segment in segments], np.int64)
@@ -263,4 +263,4 @@ def _rows(topic: str, labelled: Labelled, classes: Sequence[str]) -> Rows:
         "label": [classes[segment.label] for segment in segments],
         "confidence": np.array([segment.confidence for segment in segments], np.float32),
     }
-    return Rows(topic, np.array([segment.known for segment in segments], np.int64), fields)
+    return TopicBatch(topic, np.array([segment.known for segment in segments], np.int64), fields)

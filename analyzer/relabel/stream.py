@@ -10,7 +10,7 @@ from hearthlog.models.labels.segments import Run, Segment, Segmenter
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
-from hearthlog.schemas.logs.log_stream import Rows
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.times import NANOSECONDS
 
 _STEP = NANOSECONDS // 5  # what the line through a sound card's times may jump by
@@ -33,7 +33,7 @@ class Labels(NamedTuple):
     probabilities: Float32
     novelty: Float32
 
-    def rows(self, topic: str, microphone: str) -> Rows:
+    def rows(self, topic: str, microphone: str) -> TopicBatch:
         """Make messages of them, as a recorder would."""
         best = self.probabilities.argmax(axis=1)
         fields = {
@@ -45,7 +45,7 @@ class Labels(NamedTuple):
             "novelty": self.novelty,
             "probabilities": self.probabilities,
         }
-        return Rows(topic, self.stamps, fields)
+        return TopicBatch(topic, self.stamps, fields)
 
 
 class Stream:

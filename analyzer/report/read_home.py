@@ -358,7 +358,7 @@ def _precisions(entries: Iterable[Entry]) -> dict[str, float]:
 
 def _precisions_of(path: Path) -> dict[str, float]:
     with LogFile(path) as file:
-        places = [place for place in file.places if place.opcode == Opcode.ATTACHMENT]
+        places = [place for place in file.record_locations if place.opcode == Opcode.ATTACHMENT]
         records = [file.record(place) for place in places]
     texts = [r.data for r in records if isinstance(r, Attachment) and r.name == DESCRIPTION]
     precisions: dict[str, float] = {}

@@ -66,9 +66,9 @@ class Columns:
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
-        return self.taken(rows)
+        return self.take(rows)
 
-    def taken(self, rows: slice | NDArray[np.intp]) -> "Columns":
+    def take(self, rows: slice | NDArray[np.intp]) -> "Columns":
         """Return some of the messages."""
         return replace(
             self,
@@ -113,10 +113,10 @@ def read_columns(
     logs = list(logs)
     whole = start is None and end is None
     expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
-    found: dict[str, _Pile] = {}
+    found: dict[str, _ColumnBuilder] = {}
     for batch in iterate_columns(logs, topics, start, end, fields):
         for columns in batch:
-            found.setdefault(columns.topic, _Pile(expected[columns.topic])).add(columns)
+            found.setdefault(columns.topic, _ColumnBuilder(expected[columns.topic])).add(columns)
     return {topic: found.pop(topic).columns() for topic in list(found)}
 
 
@@ -188,13 +188,13 @@ def join(parts: Sequence[Columns]) -> Columns:
     LogError
         If they are of different types.
     """
-    pile = _Pile()
+    builder = _ColumnBuilder()
     for part in parts:
-        pile.add(part)
-    return pile.columns()
+        builder.add(part)
+    return builder.columns()
 
 
-class _Pile:
+class _ColumnBuilder:
     """Pieces of one topic, until they are joined."""
 
     def __init__(self, expected: int = 0) -> None:
@@ -264,4 +264,4 @@ class _Growing:
 
 
 def _in_order(columns: Columns) -> Columns:
-    return columns.taken(np.argsort(columns.log_times, kind="stable"))
+    return columns.take(np.argsort(columns.log_times, kind="stable"))

@@ -102,7 +102,7 @@ def follow_messages(
     growing = [g for path in present if path.name.endswith(ACTIVE_SUFFIX) for g in _open(path)]
     if start is None:
         for log in growing:
-            log.file.walk()  # and forget what was written before
+            log.file.scan_new()  # and forget what was written before
     try:
         while not stop.is_set():
             found = False
@@ -152,7 +152,7 @@ class _Growing:
         self, topics: Collection[str] | None, start: int | None
     ) -> Iterator[list[RawMessages]]:
         self._replaced = self._is_replaced()  # asked first, so that nothing comes in between
-        chunks = self.file.walk()
+        chunks = self.file.scan_new()
         for part in _batches(chunks):
             messages = [m.between(start, None) for m in read_chunks(self.file, part, topics)]
             if any(map(len, messages)):

@@ -28,7 +28,7 @@ class Attachment:
     data: bytes
 
 
-class Rows(NamedTuple):
+class TopicBatch(NamedTuple):
     """Messages of one topic as columns.
 
     Attributes
@@ -45,7 +45,7 @@ class Rows(NamedTuple):
     fields: Mapping[str, Column]
 
 
-class LogContent:
+class LogStreamWriter:
     """A log on a stream.
 
     What is pickled goes on elsewhere: `continue_on` a stream that has what was flushed.
@@ -93,7 +93,7 @@ class LogContent:
         self._writer.add_message(self._channels[topic], log_time, data, log_time)
         self._count(topic, 1, log_time, log_time)
 
-    def write_columns(self, batch: Sequence[Rows]) -> None:
+    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, in the order of their log times.
 
         Messages of one time are written in the order of the batch. The file is the same as if

@@ -12,7 +12,7 @@ from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.storage.byte_ranges import map_logs
-from hearthlog.schemas.storage.prefetch import map_ahead
+from hearthlog.schemas.storage.prefetch import prefetch
 
 _BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
 _READERS = 2  # threads: more than these wait for each other's Python
@@ -198,7 +198,7 @@ def _iterate(
     pending: list[Piece] = []
     with (
         _Queue(logs, query) as queue,
-        closing(map_ahead(read, queue.batches(), _READERS)) as batches,
+        closing(prefetch(read, queue.batches(), _READERS)) as batches,
     ):
         for batch, pieces in batches:
             pending += pieces

@@ -44,7 +44,7 @@ def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
     """Read the records of a file as `read_provenance` does, whatever their version."""
     different: dict[frozenset[tuple[str, str]], Mapping[str, str]] = {}
     size = 0
-    for place in file.places:
+    for place in file.record_locations:
         if place.opcode == Opcode.METADATA and place.length <= _LARGEST and size < _MOST:
             record = file.record(place)
             size += place.length

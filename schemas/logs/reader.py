@@ -109,7 +109,7 @@ class LogReader:
         self.channels: dict[str, Channel] = {}
         with LogFile(path) as file:
             self.complete = file.complete
-            for place in file.places:
+            for place in file.record_locations:
                 record = file.record(place)
                 if isinstance(record, Metadata):
                     self.metadata[record.name] = record.metadata

@@ -14,13 +14,13 @@ from hearthlog.schemas.logs.log_stream import (
     PROFILE,
     SCHEMA_ENCODING,
     Attachment,
-    LogContent,
-    Rows,
+    LogStreamWriter,
+    TopicBatch,
 )
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.topics import Topic
 
-__all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "Rows"]
+__all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "TopicBatch"]
 
 
 class LogWriter:
@@ -59,7 +59,7 @@ class LogWriter:
         self.path = path
         self.active_path = active_path(path)
         self._stream = _create(path, self.active_path)
-        self._content = LogContent(self._stream, topics)
+        self._content = LogStreamWriter(self._stream, topics)
         self._content.add_metadata(METADATA, metadata)
         for attachment in attachments:
             self._content.add_attachment(attachment, created)
@@ -68,8 +68,8 @@ class LogWriter:
         """Append one encoded message; its publish time is its log time."""
         self._content.write(topic, log_time, data)
 
-    def write_columns(self, batch: Sequence[Rows]) -> None:
-        """Append messages of several topics, as `LogContent.write_columns` does."""
+    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
+        """Append messages of several topics, as `LogStreamWriter.write_columns` does."""
         self._content.write_columns(batch)
 
     def flush(self) -> None:

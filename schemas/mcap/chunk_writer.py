@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Int64, gather
 from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD, RawMessages
 from hearthlog.schemas.mcap.records import HEAD, MAGIC
-from hearthlog.schemas.storage.prefetch import map_ahead
+from hearthlog.schemas.storage.prefetch import prefetch
 
 CHUNK_SIZE = 1 << 20
 _COMPRESSION = b"zstd"
@@ -131,7 +131,7 @@ class StoredChunk(NamedTuple):
     entries: Mapping[int, bytes | bytearray]
 
 
-def blocks_of(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
+def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
     """Group messages that were read by the sizes of their payloads, to write them as they are.
 
     Parameters
@@ -383,7 +383,7 @@ class ChunkWriter:
             if beyond < len(ends):
                 full.append(chunk)
                 self._chunk = _Chunk()
-        for stored in map_ahead(_Chunk.stored, full, _COMPRESSORS):
+        for stored in prefetch(_Chunk.stored, full, _COMPRESSORS):
             self._put(stored)
 
     def _write(self, record: records.McapRecord) -> tuple[int, int]:

@@ -42,7 +42,7 @@ ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 _RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
 
 
-class Place(NamedTuple):
+class RecordLocation(NamedTuple):
     """A record in a file; its length includes opcode and length."""
 
     opcode: int
@@ -58,24 +58,23 @@ class LogFile:
     path : Path
         On this machine, or a `upath.UPath` of a store, which is read by ranges.
     indexed : bool
-        Whether to use the index of a finished log; without it `chunks` is empty, and `walk` gives
-        the chunks.
+        Whether to look for the chunks at once; without that, `scan_new` finds them.
 
     Attributes
     ----------
     complete : bool
         Whether the file was finished.
     ended : bool
-        Whether `walk` came to the end of a finished log.
+        Whether `scan_new` came to the end of a finished log.
     header : mcap.records.Header or None
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
         Of a file without an index, those inside chunks are not among them.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        In the order of their start times; after further walks, those of each walk.
+        All that are known so far, by start time.
     channel_sets : list of frozenset of int
         Channels with messages in a chunk. An empty set: it is not known which.
     statistics : mcap.records.Statistics or None
-    places : list of Place
+    record_locations : list of RecordLocation
         Of metadata records and attachments.
 
     Raises
@@ -92,7 +91,7 @@ class LogFile:
         self.schemas: dict[int, records.Schema] = {}
         self.channels: dict[int, records.Channel] = {}
         self.statistics: records.Statistics | None = None
-        self.places: list[Place] = []
+        self.record_locations: list[RecordLocation] = []
         self.channel_sets: list[frozenset[int]] = []
         self.chunks = np.empty(0, CHUNKS)
         self.end = len(MAGIC)  # of the records that were walked through
@@ -133,7 +132,7 @@ class LogFile:
         """Read as many bytes as there is room for, or fewer at the end of the file."""
         self._file.read_into(out, offset)
 
-    def record(self, place: Place) -> McapRecord | None:
+    def record(self, place: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages."""
         if place.length > LIMIT:
             raise self.damaged(place.offset, "a record claims to be too large")
@@ -164,7 +163,7 @@ class LogFile:
             assert isinstance(footer, records.Footer)
             if self._read_summary(footer, size - FOOTER_SIZE):
                 return
-        self.walk()
+        self.scan_new()
 
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
         """Read the summary, and return whether it has an index and is sound."""
@@ -189,11 +188,11 @@ class LogFile:
             self._forget()
             return False
         opcode, length = HEAD.unpack(self.read(len(MAGIC), HEAD.size))
-        self._note(Place(opcode, len(MAGIC), HEAD.size + length))
-        self.chunks = _table(rows)
+        self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
+        self.chunks = _by_start(np.frombuffer(rows, CHUNKS))
         return True
 
-    def _records(self, start: int, end: int) -> Iterator[tuple[Place, bytes]]:
+    def _records(self, start: int, end: int) -> Iterator[tuple[RecordLocation, bytes]]:
         """Read the records of a section one by one, heads included."""
         with io.BufferedReader(Section(self._file, start), 1 << 20) as stream:
             while start < end:
@@ -201,10 +200,10 @@ class LogFile:
                 opcode, length = HEAD.unpack(head)
                 if length > min(LIMIT, end - start - HEAD.size):
                     raise McapError("a record claims to be too large")
-                yield Place(opcode, start, HEAD.size + length), head + stream.read(length)
+                yield RecordLocation(opcode, start, HEAD.size + length), head + stream.read(length)
                 start += HEAD.size + length
 
-    def walk(self) -> NDArray[np.void]:
+    def scan_new(self) -> NDArray[np.void]:
         """Walk through the records that were written since the last walk.
 
         Returns
@@ -229,21 +228,22 @@ class LogFile:
                 self._note(place)
         if chunk:  # its indexes may not all be there yet
             rows.extend([*chunk[:2], min(chunk[2], 0), *chunk[3:], self._channel_set(frozenset())])
-        found = _table(rows)
-        self.chunks = np.concatenate([self.chunks, found])
-        return found
+        chunks = _by_start(np.frombuffer(rows, CHUNKS))
+        if len(chunks):
+            self.chunks = _by_start(np.concatenate([self.chunks, chunks]))
+        return chunks
 
     @staticmethod
-    def _continues(run: list[int], place: Place) -> bool:
+    def _continues(run: list[int], place: RecordLocation) -> bool:
         return run[2] < 0 and run[0] + run[1] == place.offset and run[1] < _RUN_LIMIT
 
-    def _note(self, place: Place) -> None:
+    def _note(self, place: RecordLocation) -> None:
         if place.opcode in {Opcode.METADATA, Opcode.ATTACHMENT}:
-            self.places.append(place)
+            self.record_locations.append(place)
         elif place.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
             self._add(self.record(place))
 
-    def _places(self, size: int) -> Iterator[Place]:
+    def _places(self, size: int) -> Iterator[RecordLocation]:
         """Go from record to record, up to where the file ends or is cut."""
         while True:
             head = self.read(self.end, HEAD.size)
@@ -257,10 +257,10 @@ class LogFile:
                 if self.complete:
                     raise self.damaged(self.end, "a record claims to be longer than the file")
                 return
-            yield Place(opcode, self.end, HEAD.size + length)
+            yield RecordLocation(opcode, self.end, HEAD.size + length)
             self.end += HEAD.size + length
 
-    def _chunk(self, place: Place) -> list[int]:
+    def _chunk(self, place: RecordLocation) -> list[int]:
         """Describe a chunk, or a message outside of one; nothing if this is neither."""
         if place.opcode not in {Opcode.CHUNK, Opcode.MESSAGE}:
             return []
@@ -305,14 +305,19 @@ class LogFile:
         elif isinstance(record, records.Statistics):
             self.statistics = record
         elif isinstance(record, records.AttachmentIndex):
-            self.places.append(Place(Opcode.ATTACHMENT, record.offset, record.length))
+            self._add_location(Opcode.ATTACHMENT, record)
         elif isinstance(record, records.MetadataIndex):
-            self.places.append(Place(Opcode.METADATA, record.offset, record.length))
+            self._add_location(Opcode.METADATA, record)
+
+    def _add_location(
+        self, opcode: int, index: records.AttachmentIndex | records.MetadataIndex
+    ) -> None:
+        self.record_locations.append(RecordLocation(opcode, index.offset, index.length))
 
     def _forget(self) -> None:
         self.schemas.clear()
         self.channels.clear()
-        self.places.clear()
+        self.record_locations.clear()
         self.channel_sets.clear()
         self._sets.clear()
         self.statistics = None
@@ -322,9 +327,8 @@ def _span(chunk: list[int], start: int, end: int) -> tuple[int, int]:
     return min(chunk[4], start), max(chunk[5], end)
 
 
-def _table(rows: "array[int]") -> NDArray[np.void]:
-    table = np.frombuffer(rows, np.int64).view(CHUNKS)
-    return table[np.argsort(table["start"], kind="stable")]
+def _by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
+    return chunks[np.argsort(chunks["start"], kind="stable")]
 
 
 def time_span(path: Path) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.logfile import FOOTER_SIZE
 from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError, parse
-from hearthlog.schemas.salvage.record_verifier import MESSAGE_SIZE, SHORTEST, IntactReader
+from hearthlog.schemas.salvage.record_verifier import MESSAGE_SIZE, SHORTEST, RecordVerifier
 
 _BLOCK = 1 << 20
 _TIMES = struct.Struct("<QQ")
@@ -110,7 +110,7 @@ class Index(NamedTuple):
     names: dict[int, str]
 
 
-class Stretch(NamedTuple):
+class DamagedRange(NamedTuple):
     """Bytes of a file that hold no whole record.
 
     `opcode` is the first of them, and `ends` where the record should end that may have been here.
@@ -122,7 +122,7 @@ class Stretch(NamedTuple):
     ends: tuple[int, ...]
 
 
-class Lost(NamedTuple):
+class Loss(NamedTuple):
     """What was in a stretch; the fields are those of `Damage`, but messages are by channel."""
 
     messages: dict[int, int]
@@ -131,15 +131,15 @@ class Lost(NamedTuple):
     others: tuple[str, ...] = ()
 
 
-_NOTHING = Lost({}, exact=True)
+_NOTHING = Loss({}, exact=True)
 
 
-def read_index(reader: IntactReader, limit: int) -> Index | None:
+def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     """Read the index of a finished file; None if there is none, or if it may be damaged.
 
     Parameters
     ----------
-    reader : IntactReader
+    reader : RecordVerifier
     limit : int
         Bytes; a longer index is not read.
     """
@@ -162,7 +162,7 @@ def read_index(reader: IntactReader, limit: int) -> Index | None:
     return None
 
 
-def _records_of_index(reader: IntactReader, start: int, end: int) -> Index:
+def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
     definitions: list[records.Schema | records.Channel] = []
     names: dict[int, str] = {}
     messages: dict[int, int] = {}
@@ -201,7 +201,7 @@ def _records_of_index(reader: IntactReader, start: int, end: int) -> Index:
     return Index(start, definitions, messages, table, names)
 
 
-def lost_in(reader: IntactReader, stretch: Stretch, index: Index | None) -> Lost:
+def loss_in(reader: RecordVerifier, stretch: DamagedRange, index: Index | None) -> Loss:
     """Say what was lost in a stretch."""
     if index is None:
         return _by_what_is_around(reader, stretch)
@@ -211,17 +211,17 @@ def lost_in(reader: IntactReader, stretch: Stretch, index: Index | None) -> Lost
     first, last = np.searchsorted(index.chunks[:, 0], [stretch.start, stretch.end])
     if first == last:
         exact = bool(len(index.chunks)) or stretch.end - stretch.start < MESSAGE_SIZE
-        return Lost({}, exact, None, others)
+        return Loss({}, exact, None, others)
     chunks = index.chunks[first:last]
     messages: dict[int, int] = {}
     exact = True
     for offset, length, index_length, _, _ in chunks.tolist():
         end, _ = _count(reader, offset + length, messages)
         exact &= end == offset + length + index_length
-    return Lost(messages, exact, (int(chunks[:, 3].min()), int(chunks[:, 4].max())), others)
+    return Loss(messages, exact, (int(chunks[:, 3].min()), int(chunks[:, 4].max())), others)
 
 
-def _by_what_is_around(reader: IntactReader, stretch: Stretch) -> Lost:
+def _by_what_is_around(reader: RecordVerifier, stretch: DamagedRange) -> Loss:
     start, end, opcode, ends = stretch
     if end - start < MESSAGE_SIZE and (end < reader.end or opcode != Opcode.CHUNK):
         return _NOTHING
@@ -237,17 +237,17 @@ def _by_what_is_around(reader: IntactReader, stretch: Stretch) -> Lost:
             exact and reader.plausible(behind) and reader.head(behind)[0] != Opcode.MESSAGE_INDEX
         )
         is_sound = 0 < times[0] <= times[1] < 1 << 63
-        return Lost(messages, exact, span or (times if is_sound else None))
+        return Loss(messages, exact, span or (times if is_sound else None))
     if opcode in _NAME_AFTER and is_record:
         name = _name(reader, start + HEAD.size + _NAME_AFTER[Opcode(opcode)])
         kind = "the metadata" if opcode == Opcode.METADATA else "the attachment"
-        return Lost({}, True, None, () if name == rosbag2.METADATA else (f"{kind} {name!r}",))
+        return Loss({}, True, None, () if name == rosbag2.METADATA else (f"{kind} {name!r}",))
     is_message = opcode == Opcode.MESSAGE or SHORTEST[opcode] > LIMIT
-    return _NOTHING if is_record and not is_message else Lost({}, exact=False)
+    return _NOTHING if is_record and not is_message else Loss({}, exact=False)
 
 
 def _count(
-    reader: IntactReader, offset: int, messages: dict[int, int]
+    reader: RecordVerifier, offset: int, messages: dict[int, int]
 ) -> tuple[int, tuple[int, int] | None]:
     """Count messages by the indexes from here on; return where these end, and their times."""
     times = []
@@ -260,6 +260,6 @@ def _count(
     return offset, (min(times), max(times)) if times else None
 
 
-def _name(reader: IntactReader, offset: int) -> str:
+def _name(reader: RecordVerifier, offset: int) -> str:
     length = int.from_bytes(reader.read(offset, 4), "little")
     return reader.read(offset + 4, min(length, 100)).decode(errors="replace")

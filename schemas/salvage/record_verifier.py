@@ -61,30 +61,30 @@ _INDEX_HEAD = struct.Struct("<BQHI")
 _ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
 
 
-class FoundChunk(NamedTuple):
+class WholeChunk(NamedTuple):
     """A chunk whose content is proved, and what it defines."""
 
     stored: StoredChunk
     definitions: list[records.Schema | records.Channel]
 
 
-class FoundAttachment(NamedTuple):
+class WholeAttachment(NamedTuple):
     """An attachment as the file holds it, and what an index says of it."""
 
     record: bytes
     about: records.AttachmentIndex
 
 
-class Found(NamedTuple):
+class WholeRecord(NamedTuple):
     """A whole record, from `offset` to `end`; `wrong` says what of its head had to be corrected."""
 
     offset: int
     end: int
-    record: McapRecord | FoundChunk | FoundAttachment | None
+    record: McapRecord | WholeChunk | WholeAttachment | None
     wrong: str = ""
 
 
-class IntactReader:
+class RecordVerifier:
     """Reads whole records of a file from any byte on.
 
     Parameters
@@ -165,7 +165,7 @@ class IntactReader:
         opcode, length = HEAD.unpack(data)
         return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
 
-    def whole(self, offset: int, chained: int = 1) -> Found:
+    def whole(self, offset: int, chained: int = 1) -> WholeRecord:
         """Read the record that begins here, if it is whole.
 
         Parameters
@@ -198,15 +198,15 @@ class IntactReader:
         if wrong and not self.plausible(inner):
             raise McapError("a record has another length than it claims")
         if opcode == Opcode.MESSAGE_INDEX:  # it is made anew
-            return Found(offset, inner, None, wrong)
+            return WholeRecord(offset, inner, None, wrong)
         raw = self.read(offset, inner - offset)
         if wrong:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         if opcode == Opcode.ATTACHMENT:
-            return Found(offset, inner, _attachment(raw), wrong)
-        return Found(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
+            return WholeRecord(offset, inner, _attachment(raw), wrong)
+        return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
 
-    def chunk(self, offset: int) -> Found:
+    def chunk(self, offset: int) -> WholeRecord:
         """Read a chunk that should begin here, if its content is proved.
 
         Whatever its head says beside that is not needed.
@@ -248,7 +248,7 @@ class IntactReader:
         definitions, entries, span = self._content(content)
         wrong = "" if exact and (not entries or span == (start, end)) else "the head of a chunk"
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
-        return Found(offset, offset + first + number, FoundChunk(chunk, definitions), wrong)
+        return WholeRecord(offset, offset + first + number, WholeChunk(chunk, definitions), wrong)
 
     def _data(self, offset: int, length: int) -> memoryview:
         """Read the data of a chunk, of which there may be any length."""
@@ -301,7 +301,7 @@ class IntactReader:
         }
         return definitions, index, span
 
-    def _message(self, offset: int, chained: int) -> Found:
+    def _message(self, offset: int, chained: int) -> WholeRecord:
         opcode, length = self.head(offset)
         end = offset + HEAD.size + length
         if length > LIMIT:
@@ -319,7 +319,7 @@ class IntactReader:
                 break
             follower += HEAD.size + length
         raw = self.read(offset, end - offset)
-        return Found(offset, end, _as_message(raw))
+        return WholeRecord(offset, end, _as_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index: its channel, its entries, and where it ends.
@@ -342,7 +342,7 @@ class IntactReader:
         return channel, np.frombuffer(entries, _ENTRY), inner
 
 
-def messages_of(chunk: StoredChunk) -> Iterator[records.Message]:
+def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
     """Read the messages of a chunk that was found."""
     head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
     content = decompress(head, chunk.data)
@@ -389,7 +389,7 @@ def _as_message(raw: bytes) -> records.Message:
     )
 
 
-def _attachment(raw: bytes) -> FoundAttachment:
+def _attachment(raw: bytes) -> WholeAttachment:
     record = memoryview(raw)
     (crc,) = _TEXT.unpack(record[-4:])
     if crc not in {0, zlib.crc32(record[HEAD.size : -4])}:
@@ -397,7 +397,7 @@ def _attachment(raw: bytes) -> FoundAttachment:
     log_time, create_time, name = struct.unpack_from("<QQI", record, HEAD.size)
     first = HEAD.size + 20 + name
     (media,) = _TEXT.unpack_from(record, first)
-    return FoundAttachment(
+    return WholeAttachment(
         raw,
         records.AttachmentIndex(
             offset=0,

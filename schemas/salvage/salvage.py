@@ -22,14 +22,14 @@ from mcap.opcode import Opcode
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError
-from hearthlog.schemas.salvage.damage import Damage, Stretch, lost_in, read_index
+from hearthlog.schemas.salvage.damage import Damage, DamagedRange, loss_in, read_index
 from hearthlog.schemas.salvage.record_verifier import (
     SHORTEST,
-    Found,
-    FoundAttachment,
-    FoundChunk,
-    IntactReader,
-    messages_of,
+    RecordVerifier,
+    WholeAttachment,
+    WholeChunk,
+    WholeRecord,
+    chunk_messages,
 )
 from hearthlog.schemas.storage.regular_file import open_regular
 
@@ -46,7 +46,7 @@ _BEFORE_COMPRESSION = HEAD.size + 28
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
 
 Definition = records.Schema | records.Channel
-Piece = records.Metadata | records.Message | FoundAttachment | FoundChunk
+Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
 
 
 class Definitions:
@@ -142,7 +142,7 @@ class Salvage:
         except OSError as error:
             raise LogError(f"{path}: cannot be read ({error.strerror})") from error
         self.size = os.fstat(self._descriptor).st_size
-        self._reader = IntactReader(self._descriptor, self.size)
+        self._reader = RecordVerifier(self._descriptor, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
         self._index = read_index(self._reader, _HELD)
@@ -154,7 +154,7 @@ class Salvage:
         for record in known:
             self.definitions.add(record)
         self._damages: list[tuple[Damage, dict[int, int]]] = []
-        self._found: Found | None = None  # by the last search
+        self._found: WholeRecord | None = None  # by the last search
         self._vain = self._held = 0
         self._cost = 0  # of what was last read in vain
         self._has_chunks = False
@@ -210,7 +210,7 @@ class Salvage:
             yield from self._taken(found)
             del found  # before the next is read, which may be as large
 
-    def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> Found:
+    def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
         """Read the record that begins here; raise McapError if there is none that is whole."""
         if self._found is not None and self._found.offset == offset:
             found, self._found = self._found, None
@@ -231,15 +231,15 @@ class Salvage:
             raise McapError(str(error)) from error
         return found
 
-    def _hold(self, found: Found) -> None:
+    def _hold(self, found: WholeRecord) -> None:
         """Count what will be kept of a record as long as the file is read."""
         record, held = found.record, _HELD_EACH
-        if isinstance(record, FoundChunk):
+        if isinstance(record, WholeChunk):
             held += 16 * len(record.stored.entries)
             held += sum(_size(definition) for definition in record.definitions)
         elif isinstance(record, Definition):
             held += _size(record)
-        elif isinstance(record, FoundAttachment):
+        elif isinstance(record, WholeAttachment):
             held += len(record.about.name) + len(record.about.media_type)
         elif isinstance(record, records.Metadata):
             held += len(record.name)
@@ -249,7 +249,7 @@ class Salvage:
             raise McapError("the file holds more definitions than can be kept")
         self._held += held
 
-    def _doubt(self, found: Found, *, searching: bool) -> None:
+    def _doubt(self, found: WholeRecord, *, searching: bool) -> None:
         """Raise McapError for what may be another record, or look like one only by chance."""
         if self._astray and isinstance(found.record, records.Message | Definition):
             raise McapError("what is in a damaged chunk is not proved")
@@ -260,7 +260,7 @@ class Salvage:
                 raise McapError("a message index has become a message")
         if not searching:
             return
-        if not isinstance(found.record, FoundChunk) and not self._reader.plausible(found.end):
+        if not isinstance(found.record, WholeChunk) and not self._reader.plausible(found.end):
             raise McapError("no record begins where this one ends")
 
     def _pass(self, offset: int, why: str) -> int:
@@ -294,7 +294,7 @@ class Salvage:
         if self._ended:  # it was part of the index
             self._add(Damage(offset, end, why, cut=cut))
         else:
-            lost = lost_in(reader, Stretch(offset, end, opcode, ends), self._index)
+            lost = loss_in(reader, DamagedRange(offset, end, opcode, ends), self._index)
             self._add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
         return end
 
@@ -314,7 +314,7 @@ class Salvage:
             start += _WINDOW
         return end
 
-    def _taken(self, found: Found) -> Iterator[Piece]:
+    def _taken(self, found: WholeRecord) -> Iterator[Piece]:
         """Remember what a record says of the file; hand it on if it is to be kept."""
         record = found.record
         if isinstance(record, records.Header):
@@ -325,7 +325,7 @@ class Salvage:
         elif isinstance(record, Definition):
             if not self.definitions.add(record) and not self._ended and self._index is None:
                 self.definitions.doubt(record)
-        elif isinstance(record, FoundChunk):
+        elif isinstance(record, WholeChunk):
             self._ended, self._astray, self._has_chunks = False, False, True
             yield from self._named(record, found)
         elif isinstance(record, records.Message):
@@ -335,10 +335,10 @@ class Salvage:
             else:
                 times = record.log_time, record.log_time
                 self._miss(record.channel_id, 1, times, found)
-        elif isinstance(record, records.Metadata | FoundAttachment):
+        elif isinstance(record, records.Metadata | WholeAttachment):
             yield record
 
-    def _named(self, chunk: FoundChunk, found: Found) -> Iterator[Piece]:
+    def _named(self, chunk: WholeChunk, found: WholeRecord) -> Iterator[Piece]:
         """Hand on a chunk if all is defined that it holds, else those messages of it that are."""
         agree = True
         for record in chunk.definitions:
@@ -355,11 +355,13 @@ class Salvage:
                 times = np.frombuffer(entries, np.int64)[::2]
                 self._miss(number, len(times), (int(times.min()), int(times.max())), found)
         if any(defined.values()):
-            for message in messages_of(chunk.stored):
+            for message in chunk_messages(chunk.stored):
                 if defined[message.channel_id]:
                     yield message
 
-    def _miss(self, channel: int, messages: int, times: tuple[int, int], found: Found) -> None:
+    def _miss(
+        self, channel: int, messages: int, times: tuple[int, int], found: WholeRecord
+    ) -> None:
         place = found.offset, found.end
         self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.storage.prefetch import map_ahead
+from hearthlog.schemas.storage.prefetch import prefetch
 from hearthlog.schemas.storage.regular_file import open_regular
 
 _BLOCK = 1 << 17  # bytes: a store hands them out in hardly more time than a few
@@ -28,7 +28,7 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
     """Apply a function to logs, in their order; to several at once where a store has to answer."""
     if all(map(is_local, logs)):
         return map(function, logs)
-    return map_ahead(function, logs, _ASKED)
+    return prefetch(function, logs, _ASKED)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from mcap.writer import Writer
 
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.writer import LogWriter, Rows
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import definition, encode, message, time_message
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.tools.bench.table import Row, Table, Target
@@ -55,7 +55,7 @@ def _as_columns(path: Path, columns: Mapping[str, Columns]) -> None:
         rows = slice(start, start + _AT_ONCE)
         writer.write_columns(
             [
-                Rows(name, part.log_times[rows], {k: v[rows] for k, v in part.fields.items()})
+                TopicBatch(name, part.log_times[rows], {k: v[rows] for k, v in part.fields.items()})
                 for name, part in columns.items()
             ]
         )

@@ -161,7 +161,7 @@ class _Reading:
             self._note_segments(columns)
 
     def _note_features(self, columns: Columns) -> None:
-        ends = columns.taken(np.array([0, len(columns) - 1]))
+        ends = columns.take(np.array([0, len(columns) - 1]))
         pairs = zip(ends["frame"].tolist(), ends["header.stamp"].tolist(), strict=True)
         first, self._found.last = pairs
         self._found.first = self._found.first or first
