@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.record_verifier import WholeAttachment, WholeChunk
 from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
@@ -77,7 +78,7 @@ class Recovery:
 
 
 def recover_log(
-    source: Path, copy: Path, name: str, progress: Callable[[float], None] = lambda _: None
+    source: Path, copy: Path, name: str, progress: Progress = ignore_progress
 ) -> Recovery:
     """Copy what is whole in a log to a new one, read that again and count it.
 
@@ -117,9 +118,7 @@ def recover_log(
     return recovery
 
 
-def recover_in_place(
-    log: Path, progress: Callable[[float], None] = lambda _: None
-) -> tuple[Path, Recovery]:
+def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
     """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
 
     Returns
@@ -187,7 +186,7 @@ class _Copy:
         self._ends: dict[int, int] = {}
         self._span = (1 << 63, 0)
 
-    def write(self, name: str, progress: Callable[[float], None]) -> None:
+    def write(self, name: str, progress: Progress) -> None:
         """Write all, and complete the file, which will bear this name."""
         for piece in self._salvage.pieces():
             self._add(piece)

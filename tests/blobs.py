@@ -40,7 +40,3 @@ def blobs(classes: int, count: int, *, spread: float = 1.5) -> tuple[Dataset, Sc
 def with_arrays(model: Model, **arrays: np.ndarray) -> Model:
     """Return a model with other arrays of its classifier."""
     return replace(model, arrays={**model.arrays, **arrays})
-
-
-def ignore_progress(_done: int, _total: int) -> None:
-    """Take a report of progress."""

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import soundfile
-from blobs import blobs, ignore_progress
+from blobs import blobs
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation_curve
@@ -28,6 +28,7 @@ from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.progress import ignore_progress
 
 RATE = 16_000
 

@@ -2,7 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from blobs import blobs, ignore_progress, with_arrays
+from blobs import blobs, with_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics.pairwise import rbf_kernel
@@ -17,6 +17,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.schemas.progress import ignore_progress
 
 pytestmark = pytest.mark.fast
 

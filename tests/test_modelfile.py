@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from blobs import blobs, ignore_progress, with_arrays
+from blobs import blobs, with_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
@@ -15,6 +15,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.progress import ignore_progress
 
 pytestmark = pytest.mark.fast
 

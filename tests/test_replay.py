@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import soundfile
 import typer
-from blobs import blobs, ignore_progress
+from blobs import blobs
 from conftest import HEARTHLOG
 from logs import features, read
 from lossy import LossySource
@@ -47,6 +47,7 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
 )
 from hearthlog.schemas.messages.topics import Topic, topics_of
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.replay import Source
 from hearthlog.tools.cli.replay import replay as verb
 

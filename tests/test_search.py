@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import tasks
-from blobs import blobs, ignore_progress
+from blobs import blobs
 from clusters import running, scheduler_in, worker_of
 from joblib import delayed
 
@@ -22,6 +22,7 @@ from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.parallel import in_parallel, joblib_on
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 
 
@@ -175,11 +176,11 @@ def test_wrong_use_is_one_line(words, line, tmp_path, hearthlog):
 
 _STEPS = """
 import time
-from hearthlog.tools.cli.progress import steps_done
-with steps_done("trying") as report:
+from hearthlog.tools.cli.progress import share_done
+with share_done("trying") as report:
     for done in range(1, 5):
         time.sleep(0.3)
-        report(done, 2000)
+        report(done / 2000)
 """
 
 

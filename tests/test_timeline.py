@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
-from blobs import blobs, ignore_progress
+from blobs import blobs
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import features, read
@@ -48,6 +48,7 @@ from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds
 from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.progress import ignore_progress
 
 __all__ = ["viewer"]  # a fixture
 

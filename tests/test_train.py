@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import soundfile
-from blobs import SOURCES, blobs, ignore_progress
+from blobs import SOURCES, blobs
 from typer import Typer
 from typer.testing import CliRunner
 
@@ -19,6 +19,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.home.simulate import write_training_set
 

@@ -1,6 +1,6 @@
 """Check logs: against the specification of MCAP, against docs/log.md, and with each other."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.doctor.check import Examined, examine_file
@@ -8,11 +8,12 @@ from hearthlog.analyzer.doctor.findings import Finding, Findings
 from hearthlog.analyzer.doctor.folder_checks import check_leftovers, check_series
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 __all__ = ["Examined", "Finding", "Findings", "examine", "examine_file"]
 
 
-def examine(path: Path, progress: Callable[[float], None] = lambda _: None) -> list[Findings]:
+def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
     """Check a log, or all logs of a folder and how they follow each other.
 
     Parameters
@@ -43,7 +44,7 @@ def examine(path: Path, progress: Callable[[float], None] = lambda _: None) -> l
     return [*(file.findings for file in files), *left]
 
 
-def _examine_all(logs: Sequence[Path], progress: Callable[[float], None]) -> list[Examined]:
+def _examine_all(logs: Sequence[Path], progress: Progress) -> list[Examined]:
     sizes = [log.stat().st_size if log.is_file() else 0 for log in logs]
     whole = max(sum(sizes), 1)
     files = []

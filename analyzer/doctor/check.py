@@ -23,12 +23,11 @@ from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, FOOTER_SIZE, LogFile
 from hearthlog.schemas.mcap.records import HEAD, MAGIC, parse
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
 _ENCODINGS = ("ros2msg", "ros2idl")
-
-Progress = Callable[[float], None]
 
 
 @dataclass
@@ -54,7 +53,7 @@ class Examined:
     frames: dict[str, Frames] = field(default_factory=dict)
 
 
-def examine_file(path: Path, progress: Progress = lambda _: None) -> Examined:
+def examine_file(path: Path, progress: Progress = ignore_progress) -> Examined:
     """Check one file against the specification of MCAP and, if it is ours, against the contract.
 
     Parameters

@@ -11,11 +11,12 @@ from joblib import delayed
 from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.home_data import HOME_WEIGHT
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
 from hearthlog.schemas.arrays import Indices
+from hearthlog.schemas.progress import Progress
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_GROUPS = 8
@@ -48,7 +49,7 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve
     data : Dataset
     method : Method
     progress : callable
-        Told how many fits of how many are done.
+        Told the share of the fits that is done.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve
     scores = np.empty((len(splits), len(CORRECTED)))
     for place, found in enumerate(in_parallel(calls)):
         scores[place] = found
-        progress(place + 1, len(splits))
+        progress((place + 1) / len(splits))
     each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
     found = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
     return Curve(CORRECTED, found, each.mean(axis=0).tolist())

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import (
     Fold,
     Method,
@@ -17,6 +17,7 @@ from hearthlog.analyzer.training.method import (
 )
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
+from hearthlog.schemas.progress import Progress
 
 Kind = Literal["segment", "source", "collection"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -54,7 +55,7 @@ def evaluate_method(
         since segments of one recording are alike), a `source`, or a `collection`, which is what
         a new home is.
     progress : callable
-        Told how many folds of how many are done.
+        Told the share of the folds that is done.
 
     Raises
     ------

@@ -7,7 +7,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
-from hearthlog.analyzer.training.dataset import Progress, Recording, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.manifest import Clip
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
@@ -16,6 +16,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.labels.segments import Segmenter
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
 
@@ -68,7 +69,7 @@ def evaluate_model(
     scenario : Scenario
         With the classes of the model.
     progress : callable
-        Told how many clips of how many are done.
+        Told the share of the clips that is done.
 
     Raises
     ------

@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 from hearthlog.analyzer.evaluation.evaluate_method import Kind, divide
-from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Method, cross_validate, prepare
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.analyzer.training.train import check_varied
+from hearthlog.schemas.progress import Progress
 
 
 class Tried(NamedTuple):
@@ -26,7 +27,7 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
     by : str
         What is never on both sides of a fold: see `analyzer.evaluation.folds.evaluate_method`.
     progress : callable
-        Told how many fits of how many are done.
+        Told the share of the fits that is done.
 
     Returns
     -------

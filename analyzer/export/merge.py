@@ -14,7 +14,7 @@ from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hearthlog.analyzer.logs.channel_names import unused
-from hearthlog.analyzer.logs.selection import Described, Progress, Selection, identity
+from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.files import new_file
@@ -23,6 +23,7 @@ from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters
@@ -32,7 +33,7 @@ _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
 def splice(
     selection: Selection,
     output: Path,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
     *,
     latched: bool = False,
 ) -> None:
@@ -67,7 +68,7 @@ def write_log(
     selection: Selection,
     stream: BinaryIO,
     name: str,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
     *,
     latched: bool = False,
 ) -> Mapping[str, str] | None:

@@ -13,11 +13,12 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from hearthlog.analyzer.export.merge import lasts
-from hearthlog.analyzer.logs.selection import Progress, Selection
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.messages.message_types import definition, typestore
+from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _HEADER = "std_msgs/msg/Header"

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from hearthlog.analyzer.export.merge import write_log
-from hearthlog.analyzer.logs.selection import Progress, Selection
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.progress import Progress
 
 
 def save_rosbag2(folder: Path, name: str, selection: Selection, progress: Progress) -> None:

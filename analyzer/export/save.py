@@ -19,11 +19,12 @@ from hearthlog.analyzer.export.rosbag2 import save_rosbag2
 from hearthlog.analyzer.export.wav import WavFiles
 from hearthlog.analyzer.logs.channel_names import file_stem, unused
 from hearthlog.analyzer.logs.pieces import Piece, pieces
-from hearthlog.analyzer.logs.selection import Progress, Selection
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import check_new, new_file, sync_folder
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 
@@ -88,7 +89,7 @@ def export(
     selection: Selection,
     output: Path,
     form: Format,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
     *,
     folder: bool,
 ) -> None:

@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.labelling import (
     labelling_of,
     with_layers,
 )
-from hearthlog.analyzer.logs.selection import Progress, Selection, select
+from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.description import CLASS_NAME
@@ -26,6 +26,7 @@ from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
 LIVE, REVIEW, RELABEL = "live", "review", "relabel"
@@ -150,7 +151,7 @@ class Sources:
         name: str,
         start: int | None = None,
         end: int | None = None,
-        progress: Progress = lambda _: None,
+        progress: Progress = ignore_progress,
     ) -> Side:
         """Read the segments of a labelling; of a log that is damaged `losses` tell.
 

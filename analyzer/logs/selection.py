@@ -1,6 +1,6 @@
 """What is wanted of some logs: topics, by name or by pattern, and a span of time."""
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,6 +15,7 @@ from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 _LAST = (1 << 63) - 1  # log time
 _BATCH = 2 << 20  # bytes, stored and decompressed together, that are verified at once
-Progress = Callable[[float], None]
 Described = tuple[Channel, Schema | None]
 
 
@@ -60,7 +60,7 @@ class Selection:
     end: int | None
     span: tuple[int, int]
 
-    def messages(self, progress: Progress = lambda _: None) -> Iterator[list[RawMessages]]:
+    def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
         """Read the messages as `iterate_messages` does, and report the share that is done."""
         first, last = self.span
         for batch in iterate_messages(self.logs, self.topics, self.start, self.end):

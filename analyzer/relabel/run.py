@@ -17,11 +17,10 @@ from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.provenance import check_version
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _MOST_BEFORE = 24  # logs: within as many a model forgets what was before them
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass
@@ -62,7 +61,7 @@ def relabel(
     model: Model,
     model_path: Path,
     workers: Workers,
-    progress: Progress = lambda _done, _total: None,
+    progress: Progress = ignore_progress,
 ) -> Relabelled:
     """Label logs anew, in layers beside them; layers that would be the same are left alone.
 
@@ -78,7 +77,7 @@ def relabel(
         Where workers find it.
     workers : Workers
     progress : callable
-        Told how many logs are done with, and how many there are.
+        Told the share of the logs that is done.
 
     Raises
     ------
@@ -88,7 +87,7 @@ def relabel(
     chains = find_chains(paths)
     total = sum(len(chain.asked) for chain in chains)
     work = _Relabelling(chains, model, model_path, workers)
-    work.run(lambda done: progress(done, total))
+    work.run(lambda done: progress(done / max(total, 1)))
     return work.result
 
 

@@ -17,6 +17,7 @@ from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.logfile import time_span
 from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _REWOUND = 60 * NANOSECONDS
@@ -123,7 +124,7 @@ def replay(
     logs: LogSet,
     wanted: Wanted,
     stop: Flag,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Replay:
     """Run logs through the pipeline again.
 

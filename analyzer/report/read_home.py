@@ -1,7 +1,7 @@
 """What the logs of a home say: segments, with what a reviewer says; gaps; trouble."""
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +29,7 @@ from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, microphone_of
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 LIVE = "live"
@@ -38,7 +39,6 @@ _MOST_CLASSES = 100
 _FIELDS = {"header.stamp", "duration", "label", "confidence"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 _SEGMENTS = re.compile(r"/(?P<microphone>[^/]+)/segment")
-Progress = Callable[[float], None]
 Source = tuple[str, str]  # node, microphone
 
 
@@ -98,7 +98,7 @@ def read_heard(
     labelling: str,
     since: int,
     close: tuple[int, int],
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Heard:
     """Read what was heard.
 

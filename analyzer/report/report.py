@@ -1,6 +1,6 @@
 """A report: from the logs of a home to a page and the picture beside it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
 from pathlib import Path
@@ -19,9 +19,9 @@ from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import check_new, new_file
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 WEEK = 7
-Progress = Callable[[float], None]
 
 
 class Period(NamedTuple):
@@ -46,7 +46,7 @@ def make_report(
     period: Period,
     page: Path,
     labelling: str = LIVE,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Made:
     """Write the report of a day, or of a week.
 

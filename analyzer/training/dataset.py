@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
@@ -18,13 +18,12 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
 _FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
-
-Progress = Callable[[int, int], None]
 
 
 class Recording(NamedTuple):
@@ -131,7 +130,7 @@ def build_dataset(
     clips : sequence of Clip
     scenario : Scenario
     progress : callable
-        Told how many clips of how many are done.
+        Told the share of the clips that is done.
     home : iterable of Recording
         More to learn from.
     features : FeatureSet
@@ -167,12 +166,12 @@ def clip_recordings(
         If a clip cannot be read.
     """
     for number, clip in enumerate(clips):
-        progress(number, len(clips))
+        progress(number / len(clips))
         values = np.empty((0, features.width), np.float32)
         if scenario.find(clip.label) is not None:
             values = clip_features(clip, features)
         yield Recording(clip.label, clip.source_group, clip.source, clip.licence, values)
-    progress(len(clips), len(clips))
+    progress(1.0)
 
 
 def cut_recordings(

@@ -1,7 +1,7 @@
 """Ways to learn: how a classifier is made from segments, and tried on those it has not seen."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple, Protocol, Self
@@ -18,6 +18,7 @@ from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.schemas.progress import Progress
 
 _SEED = 20_261_121
 
@@ -161,7 +162,7 @@ def cross_validate(
     examples: Examples,
     classes: int,
     folds: Iterable[Fold],
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> Float64:
     """Decide about segments with classifiers that have not seen them.
 
@@ -173,7 +174,7 @@ def cross_validate(
     classes : int
     folds : iterable of (seen, unseen)
     progress : callable
-        Told how many fits of how many are done.
+        Told the share of the fits that is done.
 
     Returns
     -------
@@ -190,7 +191,7 @@ def cross_validate(
     for done, decided in enumerate(in_parallel(calls)):
         number, (_, unseen) = tasks[done]
         decisions[number, unseen] = decided
-        progress(done + 1, len(tasks))
+        progress((done + 1) / len(tasks))
     return decisions
 
 

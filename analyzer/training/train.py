@@ -9,7 +9,7 @@ from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import Dataset, Progress
+from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import (
     Fold,
     Method,
@@ -39,6 +39,7 @@ from hearthlog.models.classifiers.description import (
 )
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.progress import Progress
 
 MOST_FOLDS = 5
 SMOOTHINGS = ("hmm", "merge")
@@ -60,7 +61,7 @@ def train_model(
     scenario : Scenario
         The one the data was built for.
     progress : callable
-        Told how many fits of how many are done.
+        Told the share of the fits that is done.
     method : Method
     smoothing : str
         How labels become segments: see `hearthlog.models.modelfile.modelfile.Smoothing`.
@@ -74,13 +75,13 @@ def train_model(
     folds = group_folds(data)
     examples = prepare(method, data)
 
-    def report(done: int, _total: int) -> None:
-        progress(done, len(folds) + 1)
+    def report(share: float) -> None:
+        progress(share * len(folds) / (len(folds) + 1))
 
     [decisions] = cross_validate([method], examples, len(data.classes), folds, report)
     inverse = inverse_temperature(decisions, data.target)
     learned = method.fit(examples)
-    progress(len(folds) + 1, len(folds) + 1)
+    progress(1.0)
     features, hidden = method.features, smoothing == "hmm"
     about = Description(
         format=FORMAT,

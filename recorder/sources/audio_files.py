@@ -1,7 +1,7 @@
 """Audio files in the place of a microphone."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Event as Flag
 
@@ -12,6 +12,7 @@ from hearthlog.recorder.events import Event, Frames, Health
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _REALTIME_FRAMES = 10
@@ -45,7 +46,7 @@ class FileSource:
         start: int,
         *,
         realtime: bool = False,
-        progress: Callable[[float], None] = lambda _: None,
+        progress: Progress = ignore_progress,
     ) -> None:
         self._seconds = sum(audio_seconds(path) for path in paths)
         self.device = _name(paths)

@@ -28,6 +28,7 @@ from hearthlog.schemas.messages.message_types import (
     message,
     nanoseconds,
 )
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.bench.inference import fit_scikit_learn
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import HEARTHLOG, BenchError, hearthlog
@@ -59,7 +60,7 @@ def measure(work: Workload) -> Table:
     """Measure relabelling a day of hourly logs."""
     logs = work.folder / "relabel"
     data = _part(work)
-    model = train_model(data, work.training[1], lambda _done, _total: None)
+    model = train_model(data, work.training[1], ignore_progress)
     path = work.folder / "day.safetensors"
     save_model(model, path)
     sound = [work.wav] * round(_HOURS * 3600 / work.seconds)

@@ -18,6 +18,7 @@ from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.bench.timing import BenchError
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
@@ -103,11 +104,11 @@ class Workload:
         if self.audio is not None and (self.audio / "manifest.csv").exists():
             scenario = BUILTIN["general"]
             clips = read_manifest(self.audio / "manifest.csv", scenario.labels)
-            return build_dataset(clips, scenario, _ignore_progress), scenario
+            return build_dataset(clips, scenario, ignore_progress), scenario
         manifest = write_training_set(self.folder / "clips", self.clips_per_class, _SEED)
         scenario = Scenario("simulated", {label: (label,) for label in LABELS})
         clips = read_manifest(manifest, scenario.labels)
-        data = build_dataset(clips, scenario, _ignore_progress)
+        data = build_dataset(clips, scenario, ignore_progress)
         noise = np.random.default_rng(_SEED).standard_normal((len(data), 1, data.windows.shape[2]))
         blurred = data.windows + _OVERLAP * noise * data.windows.std(axis=(0, 1))
         return dataclasses.replace(data, windows=blurred.astype(np.float32)), scenario
@@ -115,7 +116,7 @@ class Workload:
     @cached_property
     def model(self) -> Model:
         """A model of realistic size; its labels of simulated sound are not to be trusted."""
-        return train_model(*self.training, _ignore_progress)
+        return train_model(*self.training, ignore_progress)
 
     @cached_property
     def model_file(self) -> Path:
@@ -138,7 +139,3 @@ def _recordings(folder: Path) -> NDArray[np.int16]:
     if sum(map(len, blocks)) < SAMPLE_RATE:
         raise BenchError(f"{folder}: holds no second of sound in files *.flac or *.wav")
     return np.concatenate(blocks)
-
-
-def _ignore_progress(_done: int, _total: int) -> None:
-    """Take a report of progress: nothing here takes long."""

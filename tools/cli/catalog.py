@@ -62,7 +62,7 @@ def _written(folder: Path) -> "Catalog":
         print(f"hearthlog: {error}; it is made anew", file=sys.stderr)
     try:
         with share_done("reading logs") as report:
-            return write_catalog(folder, known, lambda done, total: report(done / total))
+            return write_catalog(folder, known, report)
     except KeyboardInterrupt:
         print(
             "hearthlog: interrupted; what was read is in the catalogue, and the same command goes "

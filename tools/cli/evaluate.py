@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.tools.cli.method import chosen_method
-from hearthlog.tools.cli.progress import steps_done
+from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.selection import wrong_use
 from hearthlog.tools.cli.text import tell
 
@@ -130,7 +130,7 @@ def _evaluate_model(
     chosen = scenario_of(model) if scenario is None else load_scenario(scenario)
     check_classes(model, chosen)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
-    with steps_done(f"listening to {len(clips)} clips") as report:
+    with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         found = evaluate_model(model, clips, chosen, report)
     if plot is not None:
         _save_plot(plot, f"{model.name} on {data} ({chosen.name})", found.scores, found.reliability)
@@ -176,7 +176,7 @@ def _evaluate_method(
 
     chosen, by = chosen_method(method), _kind(folds)
     segments = _segments(data, scenario, chosen)
-    with steps_done(f"learning from {len(segments)} segments") as report:
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         found = evaluate_method(segments, chosen, by, report)
     if plot is not None:
         _save_plot(
@@ -210,7 +210,7 @@ def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool
 
     chosen, by = chosen_method(method), _kind(folds)
     segments = _segments(data, scenario, chosen)
-    with steps_done(f"learning from {len(segments)} segments") as report:
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         tried = search(segments, chosen.variations(), by, report)
     if as_json:
         found = [one.method.parameters | asdict(one.scores) for one in tried]
@@ -240,7 +240,7 @@ def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: boo
 
     chosen = chosen_method(method)
     segments = _segments(data, scenario, chosen)
-    with steps_done(f"learning from {len(segments)} segments") as report:
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         found = adaptation_curve(segments, chosen, report)
     if as_json:
         _print_json({"scenario": scenario, "method": method} | found._asdict())
@@ -260,7 +260,7 @@ def _segments(data: Path, scenario: str, method: "Method") -> "Dataset":
 
     chosen = load_scenario(scenario)
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
-    with steps_done(f"listening to {len(clips)} clips") as report:
+    with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         return build_dataset(clips, chosen, report, features=method.features)
 
 

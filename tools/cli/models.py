@@ -163,11 +163,7 @@ def _recordings(
         return list(home_recordings(logs, features))
     assert data is not None
     clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, scenario.labels)
-    with share_done(f"listening to {len(clips)} clips") as share:
-
-        def report(done: int, total: int) -> None:
-            share(done / max(total, 1))
-
+    with share_done(f"listening to {len(clips)} clips") as report:
         return list(clip_recordings(clips, scenario, report, features))
 
 

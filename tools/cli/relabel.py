@@ -41,11 +41,14 @@ def relabel(
     from hearthlog.analyzer.relabel.run import relabel as run
     from hearthlog.analyzer.workers import open_workers
     from hearthlog.models.modelfile.modelfile import load_model
-    from hearthlog.tools.cli.progress import steps_done
+    from hearthlog.tools.cli.progress import share_done
 
     loaded = load_model(model)
     count = workers or os.cpu_count() or 1
-    with open_workers(count, scheduler) as pool, steps_done("labelling logs") as report:
+    with (
+        open_workers(count, scheduler) as pool,
+        share_done("labelling logs", announce=True) as report,
+    ):
         found = run(logs, loaded, model.resolve(), pool, report)
     if as_json:
         print(json.dumps(_as_json(found, loaded.name, loaded.sha256), indent=2))

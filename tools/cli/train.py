@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.tools.cli.method import chosen_method
-from hearthlog.tools.cli.progress import steps_done
+from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.selection import wrong_use
 
 if TYPE_CHECKING:
@@ -96,11 +96,11 @@ def _learned(
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
-    with steps_done(f"listening to {len(clips)} clips") as report:
+    with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         recordings = _heard_at(home, method.features)
         segments = build_dataset(clips, chosen, report, recordings, method.features)
     _warn_of_few(segments)
-    with steps_done(f"learning from {len(segments)} segments") as report:
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         return train_model(segments, chosen, report, method, smoothing), segments
 
 
@@ -114,7 +114,7 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     model = load_model(base)
     features = feature_set(model.description.feature_set)
     segments = cut_recordings(_heard_at(home, features), _scenario(model), features)
-    with steps_done(f"learning from {len(segments)} segments of the home besides"):
+    with share_done(f"learning from {len(segments)} segments of the home besides", announce=True):
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         return adapt_model(model, segments, sequences), segments
 

@@ -1,7 +1,7 @@
 """The rows of a catalogue: made from the files, and asked for them."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from hearthlog.analyzer.logs.catalog.file import (
 )
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -36,7 +37,6 @@ _NODE = re.compile(r"(.+)_\d{8}T\d{6}Z")
 _LAYER = re.compile(rf"(.+)\.(?:({RELABEL})-.+|({REVIEW})){re.escape(SUFFIX)}", re.DOTALL)
 _BATCH = 1000  # rows
 _NEVER = -1
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def load_catalog(folder: Path) -> Catalog | None:
 
 
 def write_catalog(
-    folder: Path, known: Catalog | None = None, progress: Progress = lambda *_: None
+    folder: Path, known: Catalog | None = None, progress: Progress = ignore_progress
 ) -> Catalog:
     """Make the catalogue of a folder; in one step it takes the place of the one that is there.
 
@@ -197,7 +197,7 @@ def write_catalog(
                 if len(rows) == _BATCH:
                     tables.append(table_of([vars(row) for row in rows]))
                     rows = []
-                progress(len(kept) + done, len(logs))
+                progress((len(kept) + done) / len(logs))
         except KeyboardInterrupt as error:
             interrupt = error
         table = pa.concat_tables([*tables, table_of([vars(row) for row in rows])]).sort_by("path")

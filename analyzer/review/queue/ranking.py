@@ -8,12 +8,12 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY, events_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources, label_topic
-from hearthlog.analyzer.logs.selection import Progress
 from hearthlog.analyzer.review.queue.uncertainty import Doubt
 from hearthlog.analyzer.review.queue.windows import Windows, other_labels, windows_of, without
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])
@@ -68,7 +68,7 @@ def make_queue(  # noqa: PLR0913
     marks: Labelling | None,
     count: int,
     ranking: str | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Queue:
     """Choose spans whose labels are likely to be wrong, of many days and classes.
 

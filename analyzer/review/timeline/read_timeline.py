@@ -1,7 +1,7 @@
 """Read logs, their layers and clips, as a timeline: once through, within bounded memory."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
@@ -55,8 +56,6 @@ _ENERGY = "energy"
 _RELABELLED = re.compile(r"\.(?=relabel-)")  # in the name of a layer, between log and labelling
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
 
-Progress = Callable[[float], None]
-
 
 def read_timeline(
     paths: Iterable[Path],
@@ -64,7 +63,7 @@ def read_timeline(
     end: int | None = None,
     *,
     zone: str | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = ignore_progress,
 ) -> Timeline:
     """Read what some logs hold.
 

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.training.method import NO_HOME, Examples, Indices, Method
+from hearthlog.analyzer.training.method import NO_HOME, Examples, Method
+from hearthlog.schemas.arrays import Indices
 from hearthlog_example.classifier import NEAREST_MEAN, NearestMeanMachine
 from hearthlog_example.features import OCTAVES
 
