@@ -45,8 +45,9 @@ class Victim:
 
 
 def _serve(pipe, folder: Path) -> None:
+    from logreader import LogReader  # noqa: PLC0415
+
     from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
-    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
 
     assert examine
     assert LogReader
@@ -70,7 +71,7 @@ def _try(reader, path: Path, folder: Path) -> str:
 
 
 def message_by_message(path: Path, _folder: Path) -> None:
-    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
+    from logreader import LogReader  # noqa: PLC0415
 
     for item in LogReader(path).messages():
         item.decode()
@@ -104,10 +105,11 @@ def examined(path: Path, _folder: Path) -> None:
 
 def recovered(path: Path, folder: Path) -> None:
     """What is recovered can be read, and breaks no rule of MCAP."""
+    from logreader import LogReader  # noqa: PLC0415
+
     from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
     from hearthlog.recorder.recovery import recover_log  # noqa: PLC0415
     from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
-    from hearthlog.schemas.logs.reader import LogReader  # noqa: PLC0415
 
     copy = folder / "recovered.mcap"
     recover_log(path, copy, copy.name)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from logreader import LogMessage
 from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
@@ -17,7 +18,6 @@ from hearthlog.analyzer.logs import typed_columns as known
 from hearthlog.analyzer.relabel.layer import digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
 from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.logs.reader import LogMessage
 from hearthlog.schemas.messages import cdr_layout as layout
 from hearthlog.schemas.messages import fields as schema_fields
 from hearthlog.schemas.messages import message_types

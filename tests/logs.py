@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
+from logreader import LogReader
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages.message_types import nanoseconds
 
 

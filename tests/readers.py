@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 from growing import plain
+from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 from spliced import Result
 
@@ -26,7 +27,6 @@ from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.logs.follow import follow
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages import message_types
 
 Run = Callable[..., Result]

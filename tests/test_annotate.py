@@ -15,6 +15,7 @@ import pytest
 import soundfile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from logreader import LogReader
 from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
@@ -23,7 +24,6 @@ from hearthlog.analyzer.marks.formats import SUFFIXES
 from hearthlog.analyzer.marks.marks import LATEST, Mark, Span, read_marks, review_path, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.message_types import SEGMENT, duration_message, header, message
 from hearthlog.schemas.times import NANOSECONDS

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from logreader import LogReader
 from logs import features
 from spliced import small_disk
 
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.schemas.logs.reader import LogReader
 
 
 @pytest.fixture

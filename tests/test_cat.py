@@ -15,13 +15,13 @@ import typer
 from conftest import HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
+from logreader import LogReader
 from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.pieces import pieces
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import (

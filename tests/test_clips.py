@@ -18,6 +18,7 @@ from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kept import put_by_hand
+from logreader import LogReader
 from logs import read
 from lossy import LossySource
 from spliced import raw_messages, small_disk
@@ -41,7 +42,6 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages.message_types import nanoseconds
 
 SECOND = 1_000_000_000

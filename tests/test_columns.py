@@ -12,6 +12,7 @@ from threading import Event
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -23,7 +24,6 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter, StoredChunk
 from hearthlog.schemas.mcap.chunks import read_chunks

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import soundfile
+from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from spliced import raw_messages, run, small_disk, write_log
@@ -19,7 +20,6 @@ from spliced import raw_messages, run, small_disk, write_log
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds, time_message

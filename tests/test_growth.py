@@ -10,6 +10,7 @@ import pytest
 from growing import GROWN, NEXT, grown_definitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logreader import LogMessage, LogReader
 from mcap.records import Channel
 from rewriting import Log
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -22,7 +23,6 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, join, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.logs.provenance import provenance, read_provenance
-from hearthlog.schemas.logs.reader import LogMessage, LogReader
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows, encode_rows

@@ -7,6 +7,7 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
@@ -23,7 +24,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_370_123_456_789

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from logs import features
 
 from hearthlog.models.features.installed import DEFAULT
@@ -10,7 +11,6 @@ from hearthlog.recorder.pipeline import Pipeline, stream_info
 from hearthlog.recorder.service import Settings, describe_log
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 from conftest import HEARTHLOG
+from logreader import LogReader
 from logs import features, read
 
 from hearthlog.models.classifiers.classifier import Classifier
@@ -23,7 +24,6 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages.message_types import nanoseconds
 
 pytestmark = pytest.mark.fast

@@ -8,6 +8,7 @@ from threading import Event
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from logs import features
 
 from hearthlog.recorder.config import load_settings
@@ -17,7 +18,6 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import topics_of
 

@@ -17,6 +17,7 @@ import soundfile
 import typer
 from blobs import blobs
 from conftest import HEARTHLOG
+from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
 
@@ -36,7 +37,6 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import Attachment, LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import soundfile
 import zstandard
+from logreader import LogReader
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
@@ -27,7 +28,6 @@ from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recovery import NothingWholeError, recover_log
 from hearthlog.recorder.service import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
 

@@ -6,6 +6,7 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from lossy import LossySource
 from rewriting import Log
 
@@ -37,7 +38,6 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.messages.message_types import (
     LOG,
     SEGMENT,

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -14,7 +15,6 @@ from spliced import LOST, raw_messages, run, small_disk, write_log
 from hearthlog.analyzer.export.merge import splice
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import Attachment, LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import HEARTHLOG
+from logreader import LogReader
 from spliced import raw_messages, run
 from stores import account, put
 
@@ -28,7 +29,6 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import check_new, find_logs, new_file, replaced_file
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile, time_span, topic_counts
 from hearthlog.schemas.times import NANOSECONDS

@@ -8,6 +8,7 @@ from threading import Event
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from logs import read
 from lossy import LossySource
 from mcap.writer import CompressionType, IndexType
@@ -23,7 +24,6 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.files import active_path, find_logs
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (

@@ -13,6 +13,7 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 from kept import keep_models, put_by_hand
+from logreader import LogReader
 from logs import features, read
 from spliced import run
 
@@ -31,7 +32,6 @@ from hearthlog.recorder.service import _attend, describe_log
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.reader import LogReader
 
 SECOND = 1_000_000_000
 START = 1_772_348_400 * SECOND

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logreader import LogReader
 from mcap.reader import make_reader
 from test_interoperability import TOPICS, chunks, logs, plain, recorded
 
-from hearthlog.schemas.logs.reader import LogReader
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import (
     GAP,

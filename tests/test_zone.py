@@ -1,11 +1,11 @@
 """The log says in which time zone its home is."""
 
 import pytest
+from logreader import LogReader
 
 from hearthlog.recorder import timezone as zone
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.schemas.logs.reader import LogReader
 
 
 @pytest.fixture
