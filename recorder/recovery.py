@@ -16,7 +16,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.files import SUFFIX, check_new, is_layer, is_log, stem, sync_folder
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
-from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -27,7 +27,6 @@ from hearthlog.schemas.storage.regular_file import open_regular
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
 _ENCODING = "cdr"
-_READ_SIZE = 4 << 20  # bytes of chunks that are read at once
 
 
 @dataclass
@@ -308,10 +307,10 @@ def _check(path: Path, topics: dict[str, Topic]) -> None:
     with LogFile(path) as file:
         for place in file.record_locations:
             file.record(place)
-        groups = np.cumsum(file.chunks["size"]) // _READ_SIZE
-        for chunks in np.split(file.chunks, np.flatnonzero(np.diff(groups)) + 1):
-            for some in read_chunks(file, chunks, check=True):
-                found[some.channel.topic] = found.get(some.channel.topic, 0) + len(some)
+        for batch in read_in_batches(file, file.chunks, check=True):
+            for messages in batch:
+                topic = messages.channel.topic
+                found[topic] = found.get(topic, 0) + len(messages)
     if found != expected:
         raise LogError(
             f"{path}: holds {sum(found.values())} messages of {sum(expected.values())} that were "

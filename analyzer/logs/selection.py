@@ -6,14 +6,13 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from mcap.records import Channel, Schema
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.chunks import RawMessages, read_definitions, verify_chunks
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog import Catalog
 
 _LAST = (1 << 63) - 1  # log time
-_BATCH = 2 << 20  # bytes, stored and decompressed together, that are verified at once
 Described = tuple[Channel, Schema | None]
 
 
@@ -79,11 +77,9 @@ class Selection:
         for path in self.logs:
             with LogFile(path) as file:
                 ends, starts = file.chunks["end"], file.chunks["start"]
-                wanted = (ends >= (self.start or 0)) & (starts < (self.end or _LAST))
-                chunks = file.chunks[wanted]
-                batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH
-                for part in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
-                    read_chunks(file, part, topics=(), check=True)
+                verify_chunks(
+                    file, file.chunks[(ends >= (self.start or 0)) & (starts < (self.end or _LAST))]
+                )
 
     def only(self, topics: Collection[str]) -> "Selection":
         """Leave out all other topics."""
@@ -176,10 +172,7 @@ class _Content:
         self.path = path
         with LogFile(path) as file:
             self.complete = file.complete
-            for i, number in enumerate(file.chunks["channels"].tolist()):
-                ids = file.channel_sets[number]
-                if not ids or not ids <= file.channels.keys():  # they are defined in the chunks
-                    read_chunks(file, file.chunks[i : i + 1], topics=())
+            read_definitions(file)
             self.channels = [(c, file.schemas.get(c.schema_id)) for c in file.channels.values()]
             self.metadata = read_provenance(file)
 

@@ -17,7 +17,7 @@ from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.logs.provenance import read_provenance, version_text
-from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile, RecordLocation
 from hearthlog.schemas.mcap.records import HEAD
 from hearthlog.schemas.messages import message_types
@@ -38,7 +38,6 @@ _FIELDS = {
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     message_types.DIAGNOSTICS: ("status",),
 }
-_BATCH = 2 << 20  # bytes, before compression, that are read at once
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
 _TIMES = 16  # bytes of an attachment before its name
@@ -294,9 +293,7 @@ def _read_through(file: LogFile, summary: Summary) -> None:
     for about in _channels(file):
         _topic(summary, *about)
     frames: dict[str, Counter[str]] = {}
-    batches = np.cumsum(file.chunks["size"]) // _BATCH
-    for chunks in np.split(file.chunks, np.flatnonzero(np.diff(batches)) + 1):
-        batch = read_chunks(file, chunks, check=True)
+    for batch in read_in_batches(file, file.chunks, check=True):
         for raw in batch:
             times = raw.log_times
             topic = _topic(summary, raw.channel, raw.schema)

@@ -7,19 +7,15 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Event
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.chunks import RawMessages, read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 
 _POLL_SECONDS = 0.2
 _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change
-_BATCH = 2 << 20  # bytes, uncompressed, that are read at once
 
 
 def follow(
@@ -152,11 +148,10 @@ class _Growing:
         self, topics: Collection[str] | None, start: int | None
     ) -> Iterator[list[RawMessages]]:
         self._replaced = self._is_replaced()  # asked first, so that nothing comes in between
-        chunks = self.file.scan_new()
-        for part in _batches(chunks):
-            messages = [m.between(start, None) for m in read_chunks(self.file, part, topics)]
-            if any(map(len, messages)):
-                yield [m for m in messages if len(m)]
+        for batch in read_in_batches(self.file, self.file.scan_new(), topics):
+            messages = [m for m in (raw.between(start, None) for raw in batch) if len(m)]
+            if messages:
+                yield messages
 
     def is_open(self) -> bool:
         """Tell whether more may come; if not, close the log."""
@@ -181,12 +176,6 @@ def _open(path: Path) -> Iterator[_Growing]:
         with suppress(LogError):
             yield _Growing(LogFile(name, indexed=False))
             return
-
-
-def _batches(chunks: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
-    if len(chunks):
-        sizes = np.cumsum(chunks["size"]) // _BATCH
-        yield from np.split(chunks, np.flatnonzero(np.diff(sizes)) + 1)
 
 
 class _Folder:

@@ -1,7 +1,7 @@
 """The messages of many chunks at once, still encoded, found through the index behind each chunk."""
 
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -40,6 +40,7 @@ MESSAGE_HEAD = np.dtype(
 )
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _CHANNELS_LIMIT = 1 << 16
+_BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 _FIXED = MESSAGE_HEAD.itemsize - HEAD.size  # bytes of a message's content before its payload
 
 Entries = tuple[int, bytes | memoryview]  # of the index of a chunk, and which chunk that is
@@ -127,6 +128,39 @@ def read_chunks(
         indices.pop(identity, None)
     read = [batch.messages(identity, parts) for identity, parts in indices.items()]
     return [messages for messages in read if len(messages)]
+
+
+def read_in_batches(
+    file: LogFile,
+    chunks: NDArray[np.void],
+    topics: Collection[str] | None = None,
+    *,
+    check: bool = False,
+) -> Iterator[list[RawMessages]]:
+    """Read chunks as `read_chunks` does, a few megabytes at a time."""
+    batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH_SIZE
+    for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
+        yield read_chunks(file, batch, topics, check=check)
+
+
+def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
+    """Compare chunks with their checksums; raise LogError if one is damaged."""
+    for _ in read_in_batches(file, chunks, topics=(), check=True):
+        pass
+
+
+def read_definitions(file: LogFile) -> None:
+    """Add the schemas and channels to a file that only its chunks define.
+
+    Raises
+    ------
+    LogError
+        If one of these chunks is damaged.
+    """
+    for number, channels in enumerate(file.chunks["channels"].tolist()):
+        identities = file.channel_sets[channels]
+        if not identities or not identities <= file.channels.keys():
+            read_chunks(file, file.chunks[number : number + 1], topics=())
 
 
 def _unwanted(file: LogFile, topics: Collection[str] | None) -> list[int]:

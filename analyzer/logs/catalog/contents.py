@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import microphone_of
@@ -27,7 +27,6 @@ _EVENTS: dict[str, Sequence[str]] = {
 _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
     (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
 )
-_BATCH = 2 << 20  # bytes, before compression, that are read at once
 _MOST_CLASSES = 100
 _LONGEST = 1000  # characters of what a log says of itself
 
@@ -145,9 +144,7 @@ class _Reading:
         topics = None
         if self._file.statistics is not None:
             topics = {self._file.channels[i].topic for i in self.channels_of(wanted)}
-        batches = np.cumsum(chunks["size"]) // _BATCH
-        for part in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
-            batch = read_chunks(self._file, part, topics, check=True)
+        for batch in read_in_batches(self._file, chunks, topics, check=True):
             for columns in decode_known(self._file.path, batch, wanted):
                 self._note(columns)
 
