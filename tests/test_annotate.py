@@ -21,7 +21,14 @@ from spliced import run, small_disk, write_log
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, find_heard
 from hearthlog.analyzer.marks.formats import SUFFIXES
-from hearthlog.analyzer.marks.marks import LATEST, Mark, Span, read_marks, review_path, write_marks
+from hearthlog.analyzer.marks.marks import (
+    LATEST,
+    Mark,
+    MarkedSpan,
+    read_marks,
+    review_path,
+    write_marks,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -229,7 +236,7 @@ def test_marks_are_deleted_where_that_is_said_and_cut_around_it(log, zero):
     said = {"reviewer": "Ann", "made": SECOND, "corrects": "live"}
     old = [mark(zero, 1, 4)._replace(**said), mark(zero, 5, 6), mark(zero, 7, 8)]
     write_marks(log, old)
-    gaps = [Span(*mark(zero, *times)[:3]) for times in ((2, 3), (5, 7))]
+    gaps = [MarkedSpan(*mark(zero, *times)[:3]) for times in ((2, 3), (5, 7))]
     write_marks(log, [mark(zero, 5.5, 5.6, "speech")], gaps)
     assert read_marks(log) == [
         mark(zero, 1, 2)._replace(**said),
@@ -237,7 +244,7 @@ def test_marks_are_deleted_where_that_is_said_and_cut_around_it(log, zero):
         mark(zero, 5.5, 5.6, "speech"),
         mark(zero, 7, 8),
     ]
-    layer = write_marks(log, [], [Span("mic", zero, zero + 9 * SECOND)])
+    layer = write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
     assert not layer.exists()
 
 

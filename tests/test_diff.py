@@ -21,10 +21,10 @@ from hearthlog.analyzer.logs.channel_names import names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import Side, find_sources
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans, other_labels
 from hearthlog.analyzer.review.queue.ranking import make_queue
-from hearthlog.analyzer.review.queue.review_list import REASONS, Span, read_list, write_list
+from hearthlog.analyzer.review.queue.review_list import REASONS, ReviewSpan, read_list, write_list
 from hearthlog.analyzer.review.queue.uncertainty import uncertainty
-from hearthlog.analyzer.review.queue.windows import other_labels, windows_of
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -422,7 +422,7 @@ def test_of_a_long_segment_the_ten_worst_seconds_are_in_the_queue(tmp_path):
 def test_flicker_is_one_span_and_what_is_too_short_to_be_judged_is_none():
     edges = np.array([0.0, 25.0, 25.3, 25.9, 26.3, 30.0, 30.4, 35.0])
     times = (edges * 10).astype(np.int64) * (NANOSECONDS // 10)
-    windows = windows_of(Events(times[:-1], times[1:], np.array([0, 1, 2, 1, 0, 1, 0])))
+    windows = judgeable_spans(Events(times[:-1], times[1:], np.array([0, 1, 2, 1, 0, 1, 0])))
     third = 25 / 3
     assert (windows.starts / NANOSECONDS).tolist() == pytest.approx(
         [0.0, third, 2 * third, 25.0, 26.3, 30.4]
@@ -435,7 +435,7 @@ def test_flicker_is_one_span_and_what_is_too_short_to_be_judged_is_none():
 
 def test_disagreement_is_the_share_of_the_span_in_which_the_other_says_something_else():
     second = NANOSECONDS
-    windows = windows_of(events((0, 4 * second, 1), (4 * second, 8 * second, 1)))
+    windows = judgeable_spans(events((0, 4 * second, 1), (4 * second, 8 * second, 1)))
     others = events((0, second, 2), (second, 3 * second, 1), (3 * second, 4 * second, 1))
     labels, differing = other_labels(windows, others)
     assert labels.tolist() == [1, -1]
@@ -473,7 +473,7 @@ def spans():
     times = st.lists(TIMES, min_size=2, max_size=2, unique=True).map(sorted)
     reasons = st.sampled_from(REASONS)
     return st.builds(
-        lambda mic, time, a, label, b, score, why: Span(mic, *time, a, label, *b, score, why),
+        lambda mic, time, a, label, b, score, why: ReviewSpan(mic, *time, a, label, *b, score, why),
         *(microphones, times, names, labels, others, scores, reasons),
     )
 
@@ -511,13 +511,13 @@ GOOD = "mic,2026-03-01T08:00:00Z,2026-03-01T08:00:01Z,live,speech,,,0.5,uncertai
 )
 def test_a_list_that_cannot_be_is_refused_with_its_line(tmp_path, line, said):
     path = tmp_path / "list.csv"
-    path.write_text(",".join(Span._fields) + f"\n{GOOD}\n{line}\n")
+    path.write_text(",".join(ReviewSpan._fields) + f"\n{GOOD}\n{line}\n")
     with pytest.raises(DataError, match=rf"list\.csv:[34]: .*({said})") as error:
         read_list(path)
     assert len(str(error.value)) < 400 + len(str(path))
 
 
-@pytest.mark.parametrize("text", ["", "start,end\n", ",".join(Span._fields) + "\n"])
+@pytest.mark.parametrize("text", ["", "start,end\n", ",".join(ReviewSpan._fields) + "\n"])
 def test_what_is_no_list_of_spans_is_refused(tmp_path, text):
     path = tmp_path / "list.csv"
     path.write_text(text)

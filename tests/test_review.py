@@ -27,13 +27,13 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
 from hearthlog.analyzer.logs.labellings import find_sources
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
-from hearthlog.analyzer.review.queue.review_list import Span as Listed
+from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.queue.review_list import write_list
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.session.queue_items import queue_items
-from hearthlog.analyzer.review.session.session import Item, Session
+from hearthlog.analyzer.review.session.session import ReviewItem, Session
 from hearthlog.analyzer.review.session.sound import sound_of
-from hearthlog.analyzer.review.timeline.contents import Clip
+from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.recorder.config import Microphone, Settings
 from hearthlog.recorder.service import record
@@ -302,7 +302,7 @@ class Sitting:
 
 def items_of(count):
     return [
-        Item(START + k * 10 * SECOND, START + (k * 10 + 5) * SECOND, "music", f"item {k}")
+        ReviewItem(START + k * 10 * SECOND, START + (k * 10 + 5) * SECOND, "music", f"item {k}")
         for k in range(count)
     ]
 
@@ -477,9 +477,9 @@ def test_every_key_is_offered_once_with_what_it_does(home):
 
 def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
     clips = [
-        Clip(START, 100, np.arange(500, dtype=np.float32)),
-        Clip(START + 10 * SECOND, 100, np.arange(1000, 1500, dtype=np.float32)),
-        Clip(START + 11 * SECOND, 44_100, np.zeros(5, np.float32)),
+        SoundClip(START, 100, np.arange(500, dtype=np.float32)),
+        SoundClip(START + 10 * SECOND, 100, np.arange(1000, 1500, dtype=np.float32)),
+        SoundClip(START + 11 * SECOND, 44_100, np.zeros(5, np.float32)),
     ]
     rate, samples = sound_of(clips, START + 4 * SECOND, START + 12 * SECOND)
     assert rate == 100

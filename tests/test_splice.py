@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from spliced import LOST, raw_messages, run, small_disk, write_log
 
-from hearthlog.analyzer.export.merge import splice
+from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import Attachment, LogWriter, TopicBatch
@@ -277,7 +277,7 @@ def test_a_full_disk_leaves_no_output(recorded, refused, tmp_path):
 def test_messages_of_one_time_keep_the_order_of_their_log(tmp_path):
     topics = {f"/t{i}": [(5, message("std_msgs/msg/Int8", data=i))] * 3 for i in range(9, 0, -1)}
     log = write_log(tmp_path / "1.mcap", topics)
-    splice(select([log]), tmp_path / "2.mcap")
+    merge_logs(select([log]), tmp_path / "2.mcap")
     found = [(m.topic, m.data) for m in LogReader(tmp_path / "2.mcap").messages()]
     assert found == [(m.topic, m.data) for m in LogReader(log).messages()]
 
@@ -295,7 +295,7 @@ def test_logs_of_any_size_are_merged_in_little_memory(tmp_path):
             log.write_columns([TopicBatch(topic.name, times, fields | {"values": values})])
         logs.append(log.finish())
     tracemalloc.start()
-    splice(select(logs), tmp_path / "all.mcap")
+    merge_logs(select(logs), tmp_path / "all.mcap")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert (tmp_path / "all.mcap").stat().st_size > 40_000_000

@@ -25,14 +25,19 @@ from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
-from hearthlog.analyzer.review.timeline.contents import Labelling, Series, Spans, no_spans
-from hearthlog.analyzer.review.timeline.grid import Grid, Means, time_shares
+from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans, time_shares
 from hearthlog.analyzer.review.timeline.lanes import (
     BLOCKS,
     changes,
     clock,
     disagreements,
-    from_afar,
+    overview,
+)
+from hearthlog.analyzer.review.timeline.model import (
+    GridSeries,
+    LabelledSpans,
+    LabellingTimeline,
+    no_spans,
 )
 from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
@@ -502,7 +507,7 @@ def test_means_are_those_of_the_rows_in_each_share_however_they_come(grid, data)
     rows = data.draw(st.lists(finite, min_size=2 * len(times), max_size=2 * len(times)))
     values = np.array(rows, np.float32).reshape(-1, 2)
     cut = data.draw(st.integers(0, len(times)))
-    means = Means(grid, 2)
+    means = GridMeans(grid, 2)
     for part in (slice(0, cut), slice(cut, None)):
         if len(times[part]):
             means.add(times[part], values[part])
@@ -522,7 +527,7 @@ def labelled(draw, grid, names="abc"):
     pairs = [pair for pair in pairwise(edges) if draw(st.booleans())]
     texts = [draw(st.sampled_from(names)) for _ in pairs]
     columns = (np.array([pair[i] for pair in pairs], np.int64) for i in (0, 1))
-    return Spans(*columns, np.array(texts, object))
+    return LabelledSpans(*columns, np.array(texts, object))
 
 
 @given(grids(), st.data())
@@ -571,8 +576,10 @@ def test_labellings_differ_where_both_say_something_else(grid, data):
 
 def test_two_names_of_one_sound_are_no_difference():
     times = np.array([0, 10, 20, 30])
-    one = Spans(times[:-1], times[1:], np.array(["crying", "speech", "music"], object))
-    other = Spans(times[:-1], times[1:], np.array(["crying_sobbing", "shout", "music"], object))
+    one = LabelledSpans(times[:-1], times[1:], np.array(["crying", "speech", "music"], object))
+    other = LabelledSpans(
+        times[:-1], times[1:], np.array(["crying_sobbing", "shout", "music"], object)
+    )
     assert as_list(disagreements(one, other)) == [(10, 20, "speech / shout")]
 
 
@@ -583,8 +590,8 @@ def test_from_afar_a_block_says_what_was_heard_the_most_and_silence_counts_a_qua
     starts, ends = START + edges[:-1] * SECOND, START + edges[1:] * SECOND
     texts = rng.choice(["silence", "silence", "silence", "speech", "crying"], len(starts))
     heard = rng.random(len(starts)) < 0.8
-    spans = Spans(starts[heard], ends[heard], texts[heard].astype(object))
-    found = from_afar(Labelling("live", spans), grid)
+    spans = LabelledSpans(starts[heard], ends[heard], texts[heard].astype(object))
+    found = overview(LabellingTimeline("live", spans), grid)
     assert all(a[1] < b[0] or a[2] != b[2] for a, b in pairwise(as_list(found)))
     block = (grid.end - grid.start) // BLOCKS
     for i in range(BLOCKS):
@@ -608,7 +615,7 @@ def test_from_afar_a_labelling_without_spans_is_what_was_most_probable():
     values = np.full((2400, 2), np.nan)
     values[:600] = [0.2, 0.8]
     values[1200:] = [0.9, 0.1]
-    found = from_afar(Labelling("m", no_spans(), Series(("a", "b"), values)), grid)
+    found = overview(LabellingTimeline("m", no_spans(), GridSeries(("a", "b"), values)), grid)
     assert found.texts.tolist() == ["b", "a"]
     near = 2 * 2400 // BLOCKS * SECOND
     expected = [START, START + 600 * SECOND, START + 1200 * SECOND, grid.end]
@@ -708,7 +715,7 @@ def test_everything_is_in_the_recording_and_nothing_else(recording):
 @pytest.mark.parametrize("root", ["lanes", "exact"])
 def test_lanes_are_what_the_timeline_says_in_the_colours_of_the_classes(recording, timeline, root):
     live, review = timeline.microphones["mic"].labellings
-    spans = live.spans if root == "exact" else from_afar(live, timeline.grid)
+    spans = live.spans if root == "exact" else overview(live, timeline.grid)
     expected = changes(spans)
     found = lane(recording, f"/{root}/mic/1_live")
     assert found == list(zip(expected.times.tolist(), expected.states, strict=True))

@@ -21,7 +21,7 @@ from viewers import (
 
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.timeline.lanes import from_afar
+from hearthlog.analyzer.review.timeline.lanes import overview
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.review.viewer.web import open_page
@@ -79,7 +79,7 @@ class Picture:
 
 def blocks_of(timeline):
     """Long blocks of the lane seen from afar: their middles, and what they say."""
-    live = from_afar(timeline.microphones["mic"].labellings[0], timeline.grid)
+    live = overview(timeline.microphones["mic"].labellings[0], timeline.grid)
     rows = zip(live.starts.tolist(), live.ends.tolist(), live.texts, strict=True)
     return [((start + end) // 2, text) for start, end, text in rows if end - start > _LONG]
 

@@ -22,7 +22,6 @@ from rerun.experimental import ViewerClient
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import home_zone
-from hearthlog.analyzer.review.timeline.contents import Lines
 from hearthlog.analyzer.review.timeline.lanes import Changes
 from hearthlog.analyzer.review.timeline.live import (
     GAP_LANE,
@@ -33,8 +32,9 @@ from hearthlog.analyzer.review.timeline.live import (
     Means,
     last_time,
 )
+from hearthlog.analyzer.review.timeline.model import LogLines
 from hearthlog.analyzer.review.viewer.live import LiveServer
-from hearthlog.analyzer.review.viewer.process import Process, free_port
+from hearthlog.analyzer.review.viewer.process import ViewerProcess, free_port
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -81,7 +81,9 @@ def watching(folder, *options):
 @contextmanager
 def looking(url):
     """Run a viewer without a screen that connects to a server."""
-    with Process(["--headless", "--window-size", "1600x900", "--connect", url], free_port()) as run:
+    with ViewerProcess(
+        ["--headless", "--window-size", "1600x900", "--connect", url], free_port()
+    ) as run:
         try:
             run.wait_until_it_listens()
         except DataError as error:
@@ -274,7 +276,7 @@ def test_what_was_not_heard_is_a_hole_in_lanes_and_lines(recorded):
 
 
 def test_events_are_told_in_words(logs):
-    lines = [text for each in news(logs) if isinstance(each, Lines) for text in each.texts]
+    lines = [text for each in news(logs) if isinstance(each, LogLines) for text in each.texts]
     assert len(lines) == len(read_columns(find_logs(logs))["/rosout"])
 
 

@@ -30,7 +30,7 @@ _PROFILES_LIMIT = 64 << 10  # characters
 _FOREVER = (1 << 31) - 1  # seconds; ROS 2 has several ways to say it, and 0
 
 
-def splice(
+def merge_logs(
     selection: Selection,
     output: Path,
     progress: Progress = ignore_progress,
@@ -219,7 +219,7 @@ def _latched(selection: Selection) -> dict[str, RawMessages]:
     lasting = {
         topic
         for topic, same in selection.channels.items()
-        if any(lasts(channel) for channel, _ in same)
+        if any(is_latched(channel) for channel, _ in same)
     }
     found: dict[str, RawMessages] = {}
     for path in selection.earlier:
@@ -243,7 +243,7 @@ def _at(time: int, messages: RawMessages) -> RawMessages:
     return replace(messages, offsets=messages.offsets[-1:], heads=heads)
 
 
-def lasts(channel: Channel) -> bool:
+def is_latched(channel: Channel) -> bool:
     """Tell whether a late subscriber is still given the last message, however old it is."""
     return any(
         profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER

@@ -12,7 +12,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from hearthlog.analyzer.export.merge import lasts
+from hearthlog.analyzer.export.merge import is_latched
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
@@ -103,7 +103,11 @@ class _Bag:
             of_ros1.fielddefs.update({**types.fielddefs, _HEADER: header})
             text, digest = of_ros1.generate_msgdef(schema.name)
             connection = self._writer.add_connection(
-                channel.topic, schema.name, msgdef=text, md5sum=digest, latching=int(lasts(channel))
+                channel.topic,
+                schema.name,
+                msgdef=text,
+                md5sum=digest,
+                latching=int(is_latched(channel)),
             )
             self._topics[key] = _Topic(connection, types)
         return self._topics[key]

@@ -28,7 +28,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 
-class Format(StrEnum):
+class ExportFormat(StrEnum):
     """What logs can be exported as; for those that are files, also their suffix."""
 
     parquet = "parquet"
@@ -40,10 +40,16 @@ class Format(StrEnum):
     rosbag2 = "rosbag2"
 
 
-ONE_TOPIC = {Format.parquet, Format.csv, Format.npz, Format.txt, Format.wav}
+ONE_TOPIC = {
+    ExportFormat.parquet,
+    ExportFormat.csv,
+    ExportFormat.npz,
+    ExportFormat.txt,
+    ExportFormat.wav,
+}
 _TYPES = {
-    Format.txt: (message_types.SEGMENT, audacity.FIELDS),
-    Format.wav: (message_types.RAW_AUDIO, wav.FIELDS),
+    ExportFormat.txt: (message_types.SEGMENT, audacity.FIELDS),
+    ExportFormat.wav: (message_types.RAW_AUDIO, wav.FIELDS),
 }
 
 
@@ -57,14 +63,14 @@ class Sink(Protocol):
         """Complete what was written."""
 
 
-_TABLES: dict[Format, Callable[[BinaryIO, str, Selection], Sink]] = {
-    Format.parquet: ParquetFile,
-    Format.csv: CsvFile,
-    Format.txt: LabelTrack,
+_TABLES: dict[ExportFormat, Callable[[BinaryIO, str, Selection], Sink]] = {
+    ExportFormat.parquet: ParquetFile,
+    ExportFormat.csv: CsvFile,
+    ExportFormat.txt: LabelTrack,
 }
 
 
-def fitting(selection: Selection, form: Format) -> Selection:
+def fitting(selection: Selection, form: ExportFormat) -> Selection:
     """Leave out the topics that this format is not for: labels are segments, WAV is clips.
 
     Raises
@@ -88,7 +94,7 @@ def fitting(selection: Selection, form: Format) -> Selection:
 def export(
     selection: Selection,
     output: Path,
-    form: Format,
+    form: ExportFormat,
     progress: Progress = ignore_progress,
     *,
     folder: bool,
@@ -101,7 +107,7 @@ def export(
         As `fitting` returns it.
     output : Path
         Must not exist.
-    form : Format
+    form : ExportFormat
     progress : callable
         Is told the share that is done.
     folder : bool
@@ -114,10 +120,10 @@ def export(
         If a log is damaged, if there is no message, or one that the format has no place for, or
         if the output cannot be written; there is no output then.
     """
-    if form is Format.rosbag2:
+    if form is ExportFormat.rosbag2:
         with new_folder(output) as made:
             save_rosbag2(made, output.name, selection, progress)
-    elif form is Format.bag:
+    elif form is ExportFormat.bag:
         with new_file(output) as made:
             selection.verify()
             save_rosbag1(made, selection, progress)
@@ -137,11 +143,11 @@ def _once(path: Path, output: Path) -> Path:
 
 
 def _save(
-    selection: Selection, form: Format, progress: Progress, name: Callable[[str], Path]
+    selection: Selection, form: ExportFormat, progress: Progress, name: Callable[[str], Path]
 ) -> None:
     """Write one file for each topic, or more, under names made from what they hold."""
     selection.verify()
-    if form is Format.npz:
+    if form is ExportFormat.npz:
         saved = [save_npz(topic, selection, name) for topic in selection.channels]
         if not any(saved):
             raise selection.nothing()
@@ -160,12 +166,12 @@ def _save(
 
 @contextmanager
 def _sink(
-    form: Format, topic: str, selection: Selection, name: Callable[[str], Path]
+    form: ExportFormat, topic: str, selection: Selection, name: Callable[[str], Path]
 ) -> Iterator[Sink]:
     stem = file_stem(topic)
     with ExitStack() as stack:
         sink: Sink
-        if form is Format.wav:
+        if form is ExportFormat.wav:
             sink = WavFiles(lambda start: name(f"{stem}_{_moment(start)}"))
         else:
             stream = stack.enter_context(name(stem).open("xb"))

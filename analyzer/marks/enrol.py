@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.export.merge import splice
+from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.channel_names import names_of
 from hearthlog.analyzer.logs.coverage import find_heard
 from hearthlog.analyzer.logs.selection import select
@@ -149,7 +149,7 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
     path = path.with_stem(f"{path.stem}_cut")
     path.parent.mkdir(parents=True, exist_ok=True)
     topics = {topic(microphone, "features"), topic(microphone, "info")}
-    splice(selection.only(topics), path, latched=True)
+    merge_logs(selection.only(topics), path, latched=True)
     return _marked(path, microphone, label, stamps)
 
 

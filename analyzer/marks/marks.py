@@ -29,7 +29,7 @@ from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topi
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
-NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
+PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
 _KINDS = {message_types.SEGMENT: "review/segment", message_types.MARK: "review/mark"}
 _SPAN = ("header.stamp", "duration", "label")
 _SAYS = ("reviewer", "made", "corrects")
@@ -58,7 +58,7 @@ class Mark(NamedTuple):
     corrects: str = ""
 
 
-class Span(NamedTuple):
+class MarkedSpan(NamedTuple):
     """A span of time that a microphone heard, in nanoseconds of UTC."""
 
     microphone: str
@@ -111,7 +111,7 @@ def read_marks(log: Path) -> list[Mark]:
         raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
 
 
-def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) -> Path:
+def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] = ()) -> Path:
     """Add marks to the review layer of a log; where they overlap older marks, they win.
 
     The layer is replaced in one step: whatever happens, the old or the new one is there. One
@@ -121,7 +121,7 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[Span] = ()) 
     ----------
     log : Path
     marks : iterable of Mark
-    deleted : iterable of Span
+    deleted : iterable of MarkedSpan
         Where older marks are deleted, or cut off.
 
     Returns
@@ -184,7 +184,7 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
             raise DataError(f"a mark from {mark.start} to {mark.end} ns is no span of time")
         if not CLASS_NAME.fullmatch(mark.label):
             raise DataError(f"{mark.label[:64]!r} cannot be the name of a class")
-        names = NAME.fullmatch(mark.reviewer) and NAME.fullmatch(mark.corrects)
+        names = PERSON_NAME.fullmatch(mark.reviewer) and PERSON_NAME.fullmatch(mark.corrects)
         if not (0 <= mark.made <= LATEST and names):
             raise DataError(f"a mark cannot be made by {mark.reviewer[:64]!r} at {mark.made} ns")
     for microphone in {mark.microphone for mark in ordered}:
@@ -195,7 +195,7 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
     return ordered
 
 
-def _left(old: Sequence[Mark], new: Sequence[Mark | Span]) -> Iterator[Mark]:
+def _left(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
     """Yield what new marks leave of the old ones."""
     for microphone in {mark.microphone for mark in old}:
         own = [mark for mark in new if mark.microphone == microphone]

@@ -29,13 +29,13 @@ def cut(
     It begins with what describes the streams (`/mic/info`) as it was at the start of the span.
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from hearthlog.analyzer.export.merge import splice
+    from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
     check_log_name(output)
     selection = select(logs, topics or [], *parse_span(start, end))
     with share_done("cutting") as progress:
-        splice(selection, output, progress, latched=True)
+        merge_logs(selection, output, progress, latched=True)
     print(output)
     report_unfinished(selection)

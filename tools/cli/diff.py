@@ -16,7 +16,7 @@ from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.labellings import Side, Sources
-    from hearthlog.analyzer.review.queue.review_list import Span
+    from hearthlog.analyzer.review.queue.review_list import ReviewSpan
 
 _SHOWN, _QUEUED = 10, 60
 
@@ -86,7 +86,7 @@ def diff(
 
 class _Result(NamedTuple):
     about: dict[str, Any]
-    spans: "Callable[[], list[Span]]"
+    spans: "Callable[[], list[ReviewSpan]]"
     table: Iterable[str]
 
 
@@ -137,7 +137,7 @@ def _queue(
     return _Result(about, partial(queued, found, microphone, *names), queue_table(found))
 
 
-def _write_list(path: Path, spans: "list[Span]") -> None:
+def _write_list(path: Path, spans: "list[ReviewSpan]") -> None:
     from hearthlog.analyzer.review.queue.review_list import write_list
 
     write_list(path, spans)

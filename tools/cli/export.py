@@ -39,7 +39,7 @@ def export(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from hearthlog.analyzer.export.save import ONE_TOPIC, Format, fitting
+    from hearthlog.analyzer.export.save import ONE_TOPIC, ExportFormat, fitting
     from hearthlog.analyzer.export.save import export as save
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
@@ -52,7 +52,7 @@ def export(
         wrong_use(f"--output {output} is not --format {name}")
     if name == "bag" and not one_file:
         wrong_use(f"--output {output}: a bag is one file, *.bag")
-    form = Format(name)
+    form = ExportFormat(name)
     selection = fitting(select(logs, topics or [], *parse_span(start, end)), form)
     if one_file and form in ONE_TOPIC and len(selection.channels) > 1:
         names = ", ".join(sorted(selection.channels))

@@ -17,13 +17,13 @@ def merge(
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
     """
-    from hearthlog.analyzer.export.merge import splice
+    from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
     check_log_name(output)
     selection = select(logs)
     with share_done("merging") as progress:
-        splice(selection, output, progress)
+        merge_logs(selection, output, progress)
     print(output)
     report_unfinished(selection)

@@ -21,8 +21,8 @@ from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.review.session.marking import Marking
-    from hearthlog.analyzer.review.session.session import Item
-    from hearthlog.analyzer.review.timeline.contents import Timeline
+    from hearthlog.analyzer.review.session.session import ReviewItem
+    from hearthlog.analyzer.review.timeline.model import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _SPANS = 60
@@ -207,12 +207,12 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
 
 def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
-) -> "tuple[list[Item], Marking]":
+) -> "tuple[list[ReviewItem], Marking]":
     """Find what is to be gone through, and what is corrected."""
     from hearthlog.analyzer.logs.labellings import find_sources
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import queue_items
-    from hearthlog.analyzer.review.timeline.contents import LIVE, no_spans
+    from hearthlog.analyzer.review.timeline.model import LIVE, no_spans
 
     known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []

@@ -7,15 +7,15 @@ from hearthlog.tools.cli.selection import wrong_use
 
 def reviewer_name(given: str | None) -> str:
     """Name the reviewer; empty if nobody is named, and the login has no name."""
-    from hearthlog.analyzer.marks.marks import NAME
+    from hearthlog.analyzer.marks.marks import PERSON_NAME
 
     if given is not None:
         name = given.strip()
-        if not name or not NAME.fullmatch(name):
+        if not name or not PERSON_NAME.fullmatch(name):
             wrong_use(f"--reviewer {given[:64]!r}: a name has 1 to 200 characters, in one line")
         return name
     try:
         name = getpass.getuser()
     except (KeyError, OSError):
         return ""
-    return name if NAME.fullmatch(name) else ""
+    return name if PERSON_NAME.fullmatch(name) else ""

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.formats.labels import Label, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the labels of a track."""
     for number, line in enumerate(text.split("\n"), 1):
         if not line.strip() or line.startswith("\\"):  # the pitch of a spectral selection
@@ -17,7 +17,7 @@ def read(path: Path, text: str) -> Iterator[Label]:
         fields = [field.strip() for field in line.rstrip("\r").split("\t")]
         if len(fields) != 3:
             raise DataError(f"{path}:{number}: is not start, end and label with tabs between them")
-        yield Label(number, *fields)
+        yield FileLabel(number, *fields)
 
 
 def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:

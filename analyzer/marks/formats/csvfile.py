@@ -8,7 +8,7 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
 from hearthlog.analyzer.logs.text_files import csv_records
-from hearthlog.analyzer.marks.formats.labels import Label, made_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import time_text
 
@@ -16,7 +16,7 @@ _REQUIRED = ("start", "end", "label")
 _COLUMNS = (*_REQUIRED, "microphone", "reviewer", "made", "corrects")
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the labels of a table."""
     columns: list[str] = []
     for number, record in csv_records(path, text):
@@ -29,7 +29,7 @@ def read(path: Path, text: str) -> Iterator[Label]:
                 f"{path}:{number}: has {len(values)} fields, the first line names {len(columns)}"
             )
         row = dict(zip(columns, values, strict=True))
-        yield Label(number, *(row.get(name, "") for name in _COLUMNS))
+        yield FileLabel(number, *(row.get(name, "") for name in _COLUMNS))
 
 
 def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001

@@ -18,7 +18,7 @@ from defusedxml.sax import parseString
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import time_text
 
@@ -112,7 +112,7 @@ class _Document(ContentHandler):
             self._text.clear()
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the annotations of the tiers that depend on no other."""
     document = _Document()
     endless = _ENDLESS.search(text)
@@ -129,7 +129,7 @@ def read(path: Path, text: str) -> Iterator[Label]:
     except _Wrong as error:
         raise DataError(f"{path}:{document.line}: {error}") from error
     for identity, found in document.annotations.items():
-        yield Label(
+        yield FileLabel(
             found.line,
             _seconds(path, found, document.slots.get(found.start)),
             _seconds(path, found, document.slots.get(found.end)),

@@ -8,7 +8,13 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
 from hearthlog.analyzer.logs.text_files import read_text
 from hearthlog.analyzer.marks.formats import audacity, csvfile, elan, labelstudio, raven, rttm
-from hearthlog.analyzer.marks.formats.labels import Label, LabelLine, at, check_overlaps, mark_of
+from hearthlog.analyzer.marks.formats.labels import (
+    FileLabel,
+    PlacedMark,
+    check_overlaps,
+    make_mark,
+    place_text,
+)
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.logs.files import new_file
 
@@ -18,7 +24,7 @@ _OBEYED = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # by terminals; names have
 
 
 class _Form(NamedTuple):
-    read: Callable[[Path, str], Iterator[Label]]
+    read: Callable[[Path, str], Iterator[FileLabel]]
     write: Callable[[Path, Sequence[Mark], Mapping[str, Heard]], str]
     size_limit: int = _SIZE_LIMIT
 
@@ -68,8 +74,8 @@ def read_labels(
         pieces = heard[mark.microphone].split(mark.start, mark.end)
         if not pieces:
             raise DataError(
-                f"{at(path, place)}: {mark.label} lies outside of what {mark.microphone} heard; "
-                "`hearthlog info` shows when that was"
+                f"{place_text(path, place)}: {mark.label} lies outside of what {mark.microphone} "
+                "heard; `hearthlog info` shows when that was"
             )
         for log, start, end in pieces:
             by_log.setdefault(log, []).append(mark._replace(start=start, end=end))
@@ -78,7 +84,7 @@ def read_labels(
 
 def read_lines(
     path: Path, heard: Mapping[str, Heard], microphone: str | None = None
-) -> list[LabelLine]:
+) -> list[PlacedMark]:
     """Read a label file whose labels may overlap, and may lie where nothing was heard.
 
     Parameters and errors are otherwise those of `read_labels`.
@@ -92,7 +98,7 @@ def read_lines(
     text = read_text(path, "label file", form.size_limit)
     if form is _AUDACITY and raven.is_table(text):
         form = _RAVEN
-    found = [mark_of(path, label, heard, microphone) for label in form.read(path, text)]
+    found = [make_mark(path, label, heard, microphone) for label in form.read(path, text)]
     if not found:
         raise DataError(f"{path}: holds no labels")
     return found

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.marks import LATEST, NAME, Mark
+from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
 
@@ -17,7 +17,7 @@ _SECONDS = re.compile(r"[-+]?[0-9]{1,10}(\.[0-9]{0,18})?([eE][-+]?[0-9]{1,2})?")
 _OTHER_SOUND = NANOSECONDS  # what a recording and the logs of it may differ in length
 
 
-class Label(NamedTuple):
+class FileLabel(NamedTuple):
     """A label as it is in a file, all of it text.
 
     Attributes
@@ -44,21 +44,21 @@ class Label(NamedTuple):
     length: str = ""
 
 
-class LabelLine(NamedTuple):
+class PlacedMark(NamedTuple):
     """A mark, and the place in the file where it is."""
 
     place: int | str
     mark: Mark
 
 
-def at(path: Path, place: int | str) -> str:
+def place_text(path: Path, place: int | str) -> str:
     """Name a place in a file, for a message."""
     return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
-def mark_of(
-    path: Path, label: Label, heard: Mapping[str, Heard], microphone: str | None
-) -> LabelLine:
+def make_mark(
+    path: Path, label: FileLabel, heard: Mapping[str, Heard], microphone: str | None
+) -> PlacedMark:
     """Make a mark of a label.
 
     Raises
@@ -66,7 +66,7 @@ def mark_of(
     DataError
         With file and place, if it cannot be one.
     """
-    where = at(path, label.place)
+    where = place_text(path, label.place)
     name = label.microphone or microphone or (next(iter(heard)) if len(heard) == 1 else "")
     if name not in heard:
         known = ", ".join(sorted(heard))
@@ -86,10 +86,10 @@ def mark_of(
         raise DataError(f"{where}: {label.label} ends before it starts")
     if start < zero and label.start.startswith("-"):
         raise DataError(f"{where}: {label.label} starts at {label.start} s, before the first frame")
-    return LabelLine(label.place, Mark(name, start, end, label.label, *_says(where, label)))
+    return PlacedMark(label.place, Mark(name, start, end, label.label, *_says(where, label)))
 
 
-def check_overlaps(path: Path, found: Sequence[LabelLine]) -> None:
+def check_overlaps(path: Path, found: Sequence[PlacedMark]) -> None:
     """Raise DataError if labels of a microphone overlap."""
     order = sorted(range(len(found)), key=lambda i: found[i].mark)
     for one, other in pairwise(order):
@@ -97,7 +97,7 @@ def check_overlaps(path: Path, found: Sequence[LabelLine]) -> None:
         if earlier.microphone == later.microphone and later.start < earlier.end:
             first, last = (found[i].place for i in sorted((one, other)))
             name = f"line {first}" if isinstance(first, int) else first
-            raise DataError(f"{at(path, last)}: overlaps the label in {name}")
+            raise DataError(f"{place_text(path, last)}: overlaps the label in {name}")
 
 
 def read_seconds(where: str, text: str) -> Decimal:
@@ -124,7 +124,7 @@ def made_text(mark: Mark) -> str:
     return time_text(mark.made) if mark.made else ""
 
 
-def _zero(where: str, label: Label, heard: Heard) -> int:
+def _zero(where: str, label: FileLabel, heard: Heard) -> int:
     """Return the time that seconds are counted from."""
     if label.zero:
         return _time(where, label.zero, 0)
@@ -139,11 +139,11 @@ def _zero(where: str, label: Label, heard: Heard) -> int:
     return heard.starts[0]
 
 
-def _says(where: str, label: Label) -> tuple[str, int, str]:
+def _says(where: str, label: FileLabel) -> tuple[str, int, str]:
     """Return who says so, when, and what is corrected."""
     reviewer, corrects = label.reviewer.strip(), label.corrects.strip()
     for text in (reviewer, corrects):
-        if not NAME.fullmatch(text):
+        if not PERSON_NAME.fullmatch(text):
             raise DataError(f"{where}: {text[:64]!r} cannot be a name: use up to 200 characters")
     made = _time(where, label.made, -1) if label.made else 0
     if not 0 <= made <= LATEST:

@@ -8,14 +8,14 @@ from typing import Any
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import time_text
 
 _TYPE = "labels"
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the items of a file that Label Studio exports as JSON, or that it would import."""
     try:
         # Numbers stay text: nothing is lost, and none is too long.
@@ -62,7 +62,7 @@ def _item(number: int, mark: Mark, zero: int, length: str) -> str:
     return f'{dumps(about)[:-1]}, "original_length": {length}, "value": {value}}}'
 
 
-def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[Label]:
+def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLabel]:
     """Yield the items of a task: what was annotated or, where it never could be, predicted."""
     kind = next((kind for kind in ("annotations", "predictions") if kind in task), None)
     if kind is None or not isinstance(task[kind], list):
@@ -86,7 +86,7 @@ def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[Label]
                 )
 
 
-def _of_item(path: Path, place: str, item: Any) -> Label | None:
+def _of_item(path: Path, place: str, item: Any) -> FileLabel | None:
     """Read an item, None if it is none that labels (a rating, a remark, a relation)."""
     kind = item.get("type") if isinstance(item, dict) else None
     if not isinstance(kind, str) or not kind.endswith(_TYPE):
@@ -99,7 +99,7 @@ def _of_item(path: Path, place: str, item: Any) -> Label | None:
         raise DataError(f"{path}: {place}: has {len(names)} labels; choose one")
     meta = item.get("meta")
     says = meta if isinstance(meta, dict) else {}
-    return Label(
+    return FileLabel(
         place,
         _text(value["start"]),
         _text(value["end"]),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.formats.labels import Label, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
 SUFFIX = ".selections.txt"
@@ -34,7 +34,7 @@ def is_table(text: str) -> bool:
     return set(_TIMES) <= set(_names(text.lstrip().split("\n", 1)[0]))
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the selections of a table, each once: Raven may list it for every view and channel."""
     columns: list[str] = []
     seen: set[tuple[str, ...]] = set()
@@ -55,7 +55,7 @@ def read(path: Path, text: str) -> Iterator[Label]:
         identity = (selection, *fields)
         if not selection or identity not in seen:
             seen.add(identity)
-            yield Label(number, *fields)
+            yield FileLabel(number, *fields)
 
 
 def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001

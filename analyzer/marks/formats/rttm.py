@@ -5,14 +5,14 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.formats.labels import Label, read_seconds, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, read_seconds, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
 _TYPE = "SPEAKER"
 _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
 
 
-def read(path: Path, text: str) -> Iterator[Label]:
+def read(path: Path, text: str) -> Iterator[FileLabel]:
     """Yield the labels; lines of other types, and comments, are left out."""
     for number, line in enumerate(text.split("\n"), 1):
         fields = line.split()
@@ -25,7 +25,7 @@ def read(path: Path, text: str) -> Iterator[Label]:
         _, microphone, _, onset, duration, _, _, label, *_ = fields
         where = f"{path}:{number}"
         end = read_seconds(where, onset) + read_seconds(where, duration)
-        yield Label(number, onset, f"{end:f}", label, microphone)
+        yield FileLabel(number, onset, f"{end:f}", label, microphone)
 
 
 def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001

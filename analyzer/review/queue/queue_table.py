@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from hearthlog.analyzer.evaluation.difference_table import NAME_WIDTH as _NAME
 from hearthlog.analyzer.evaluation.difference_table import span_text
 from hearthlog.analyzer.evaluation.table import shown
-from hearthlog.analyzer.review.queue.ranking import Queue
+from hearthlog.analyzer.review.queue.ranking import ReviewQueue
 
 
-def queue_table(queue: Queue) -> Iterator[str]:
+def queue_table(queue: ReviewQueue) -> Iterator[str]:
     """Yield a line for each span."""
     yield (
         f"{'start':24} {'seconds':>7}  {'label':{_NAME}} {'other label':{_NAME}} {'score':>5} "

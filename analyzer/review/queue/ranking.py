@@ -8,8 +8,13 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY, events_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources, label_topic
-from hearthlog.analyzer.review.queue.uncertainty import Doubt
-from hearthlog.analyzer.review.queue.windows import Windows, other_labels, windows_of, without
+from hearthlog.analyzer.review.queue.judgeable_spans import (
+    JudgeableSpans,
+    judgeable_spans,
+    other_labels,
+    without,
+)
+from hearthlog.analyzer.review.queue.uncertainty import ModelUncertainty
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
@@ -23,12 +28,12 @@ RANKINGS = (*_ALONE, RANDOM)
 
 
 @dataclass(frozen=True)
-class Queue:
+class ReviewQueue:
     """Windows to be reviewed, the most useful first.
 
     Attributes
     ----------
-    windows : Windows
+    windows : JudgeableSpans
     labels, others : list of str
         What the labelling says, and what the other one says; that is empty where it says nothing.
     uncertainty, disagreement, novelty : np.ndarray [shape=(n,)], float64
@@ -39,7 +44,7 @@ class Queue:
         False if the logs do not say how sure the model was.
     """
 
-    windows: Windows
+    windows: JudgeableSpans
     labels: list[str]
     others: list[str]
     uncertainty: Float64
@@ -69,7 +74,7 @@ def make_queue(  # noqa: PLR0913
     count: int,
     ranking: str | None = None,
     progress: Progress = ignore_progress,
-) -> Queue:
+) -> ReviewQueue:
     """Choose spans whose labels are likely to be wrong, of many days and classes.
 
     Parameters
@@ -99,10 +104,10 @@ def make_queue(  # noqa: PLR0913
     segments = events_of(side, classes)
     if marks is not None:
         segments = without(segments, marks.starts, marks.ends)
-    windows = windows_of(segments)
+    windows = judgeable_spans(segments)
     if not len(windows):
         raise DataError(f"{side.name}: nothing is left to review")
-    doubt = Doubt(windows, classes)
+    doubt = ModelUncertainty(windows, classes)
     _add_frames(doubt, sources, label_topic(microphone, side.name), windows, progress)
     if other is None and not (doubt.uncertainty.known or doubt.novelty.known):
         raise DataError(
@@ -120,7 +125,7 @@ def make_queue(  # noqa: PLR0913
     if ranking is not None:
         rows = rows[scores[rows] > 0.0]
     rows = rows[_spread(scores[rows], windows.taken(rows), count)]
-    return Queue(
+    return ReviewQueue(
         windows.taken(rows),
         [classes[i] for i in windows.labels[rows].tolist()],
         [classes[i] if i >= 0 else "" for i in labels[rows].tolist()],
@@ -142,7 +147,11 @@ def _scores(parts: Float64, ranking: str | None) -> Float64:
 
 
 def _add_frames(
-    doubt: Doubt, sources: Sources, topic: str, windows: Windows, progress: Progress
+    doubt: ModelUncertainty,
+    sources: Sources,
+    topic: str,
+    windows: JudgeableSpans,
+    progress: Progress,
 ) -> None:
     start, end = int(windows.starts[0]), int(windows.ends[-1])
     logs = sources.with_topic(topic, start, end)
@@ -162,7 +171,7 @@ def _best_of_each(scores: Float64, sources: Int64) -> Int64:
     return order[np.flatnonzero(np.diff(sources[order], prepend=-1))]
 
 
-def _spread(scores: Float64, windows: Windows, count: int) -> Int64:
+def _spread(scores: Float64, windows: JudgeableSpans, count: int) -> Int64:
     """Choose the best, of many days and classes rather than of one.
 
     Each time it is the one of the highest score divided by the square root of one more than were

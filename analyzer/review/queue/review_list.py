@@ -10,7 +10,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import Difference
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.review.queue.ranking import Queue
+from hearthlog.analyzer.review.queue.ranking import ReviewQueue
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import new_file
@@ -25,7 +25,7 @@ _LABELLING = re.compile(r"live|review|relabel/\w{1,200}", re.ASCII)
 _NUMBER = re.compile(r"[0-9]{1,3}(\.[0-9]{1,20})?")
 
 
-class Span(NamedTuple):
+class ReviewSpan(NamedTuple):
     """A span of time to be reviewed, and why.
 
     Attributes
@@ -58,17 +58,17 @@ class Span(NamedTuple):
         return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
 
 
-def disagreements(difference: Difference, microphone: str) -> list[Span]:
+def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
     """List where two labellings differ: the longest first, at most `MOST_SPANS`."""
     a, b, classes = difference.a, difference.b, difference.classes
     rows = zip(*(column[:MOST_SPANS].tolist() for column in difference.disagreements), strict=True)
     return [
-        Span(microphone, start, end, a, classes[i], b, classes[j], None, "disagreement")
+        ReviewSpan(microphone, start, end, a, classes[i], b, classes[j], None, "disagreement")
         for start, end, i, j in rows
     ]
 
 
-def queued(queue: Queue, microphone: str, a: str, b: str = "") -> list[Span]:
+def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[ReviewSpan]:
     """List what is to be reviewed of labelling a, in that order; the reason is what weighs most."""
     most = np.argmax(queue.weighted, axis=0).tolist()
     columns = queue.windows.starts, queue.windows.ends, queue.scores.round(3)
@@ -76,19 +76,19 @@ def queued(queue: Queue, microphone: str, a: str, b: str = "") -> list[Span]:
         *(column.tolist() for column in columns), queue.labels, queue.others, most, strict=True
     )
     return [
-        Span(microphone, start, end, a, label, b, other, score, REASONS[reason])
+        ReviewSpan(microphone, start, end, a, label, b, other, score, REASONS[reason])
         for start, end, score, label, other, reason in rows
     ]
 
 
-def write_list(path: Path, spans: Sequence[Span]) -> None:
+def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
     """Write spans as CSV that `read_list` reads again, in the same order.
 
     Parameters
     ----------
     path : Path
         Must not exist.
-    spans : sequence of Span
+    spans : sequence of ReviewSpan
         At most `MOST_SPANS`.
 
     Raises
@@ -97,7 +97,7 @@ def write_list(path: Path, spans: Sequence[Span]) -> None:
         If the file exists, or cannot be written.
     """
     assert len(spans) <= MOST_SPANS
-    lines = [",".join(Span._fields)]
+    lines = [",".join(ReviewSpan._fields)]
     for span in spans:
         fields = span.as_text().values()
         lines.append(",".join("" if value is None else str(value) for value in fields))
@@ -105,7 +105,7 @@ def write_list(path: Path, spans: Sequence[Span]) -> None:
         temporary.write_text("".join(f"{line}\n" for line in lines), "utf-8", newline="\n")
 
 
-def read_list(path: Path) -> list[Span]:
+def read_list(path: Path) -> list[ReviewSpan]:
     """Read a list of spans.
 
     Raises
@@ -114,13 +114,13 @@ def read_list(path: Path) -> list[Span]:
         With file and line, if it is none.
     """
     header: list[str] = []
-    spans: list[Span] = []
+    spans: list[ReviewSpan] = []
     for number, record in csv_records(path, read_text(path, "list of spans", _SIZE_LIMIT)):
         where = f"{path}:{number}"
         if not header:
             header = [name.strip() for name in record]
-            if header != list(Span._fields):
-                names = ",".join(Span._fields)
+            if header != list(ReviewSpan._fields):
+                names = ",".join(ReviewSpan._fields)
                 raise DataError(f"{where}: the first line must name the columns: {names}")
         elif len(record) != len(header):
             raise DataError(f"{where}: has {len(record)} fields, not {len(header)}")
@@ -133,7 +133,7 @@ def read_list(path: Path) -> list[Span]:
     return spans
 
 
-def _span(where: str, fields: Sequence[str]) -> Span:
+def _span(where: str, fields: Sequence[str]) -> ReviewSpan:
     microphone, start, end, a, label_a, b, label_b, score, reason = fields
     try:
         check_microphone_name(microphone if len(microphone) <= 100 else f"{microphone[:64]}…")
@@ -151,7 +151,7 @@ def _span(where: str, fields: Sequence[str]) -> Span:
     first, last = _time(where, start), _time(where, end)
     if not 0 <= first < last <= _LATEST:
         raise DataError(f"{where}: {start[:40]} to {end[:40]} is no span of time")
-    return Span(
+    return ReviewSpan(
         microphone, first, last, a, label_a, b, label_b, float(score) if score else None, reason
     )
 

@@ -6,29 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import names_of
-from hearthlog.analyzer.review.queue.windows import Windows
+from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
 
 
-class Doubt:
+class ModelUncertainty:
     """Means over windows, of labels that come batch by batch.
 
     Parameters
     ----------
-    windows : Windows
+    windows : JudgeableSpans
         At least one.
     classes : sequence of str
         What their labels stand for.
 
     Attributes
     ----------
-    uncertainty, novelty : Mean
+    uncertainty, novelty : SpanMeans
     """
 
-    def __init__(self, windows: Windows, classes: Sequence[str]) -> None:
+    def __init__(self, windows: JudgeableSpans, classes: Sequence[str]) -> None:
         self._windows, self._classes = windows, classes
-        self.uncertainty, self.novelty = Mean(len(windows)), Mean(len(windows))
+        self.uncertainty, self.novelty = SpanMeans(len(windows)), SpanMeans(len(windows))
 
     def add(self, frames: Columns) -> None:
         """Add frames; probabilities without names say nothing."""
@@ -70,7 +70,7 @@ def uncertainty(probabilities: NDArray[np.floating], said: Int64) -> Float64:
     return np.clip((1.0 - own + others.max(axis=1, initial=0.0)) / 2.0, 0.0, 1.0)
 
 
-class Mean:
+class SpanMeans:
     """Means by window, of what is finite."""
 
     def __init__(self, count: int) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Heard
-from hearthlog.analyzer.marks.marks import Mark, Span, read_marks, write_marks
-from hearthlog.analyzer.review.timeline.contents import Spans
+from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
+from hearthlog.analyzer.review.timeline.model import LabelledSpans
 
 
 @dataclass
@@ -18,7 +18,7 @@ class _Change:
     """What was in a layer where something was marked, for undoing."""
 
     log: Path
-    span: Span
+    span: MarkedSpan
     before: list[Mark]
 
 
@@ -34,7 +34,7 @@ class Marking:
     reviewer : str
     corrects : str
         The labelling that is reviewed: `live`, or the name of a model.
-    labelled : Spans
+    labelled : LabelledSpans
         What it says.
     """
 
@@ -42,7 +42,7 @@ class Marking:
     heard: Heard
     reviewer: str
     corrects: str
-    labelled: Spans
+    labelled: LabelledSpans
     _done: list[list[_Change]] = field(default_factory=list)
     _known: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
 
@@ -99,14 +99,14 @@ class Marking:
         self._done.pop()
         return changes[0].span.start, changes[-1].span.end
 
-    def marks(self) -> Spans:
+    def marks(self) -> LabelledSpans:
         """Return all marks of the microphone in these logs."""
         for log in self.heard.logs:
             if log not in self._known:
                 self._known[log] = read_marks(log)
         marks = (mark for known in self._known.values() for mark in known)
         found = sorted(mark for mark in marks if mark.microphone == self.microphone)
-        return Spans(
+        return LabelledSpans(
             np.array([mark.start for mark in found], np.int64),
             np.array([mark.end for mark in found], np.int64),
             np.array([mark.label for mark in found], object),
@@ -129,11 +129,11 @@ class Marking:
         changes = [self._change(log, first, last) for log, first, last in pieces]
         for (log, first, last), _ in zip(pieces, changes, strict=True):
             own = [mark for mark in made if first <= mark.start < last]
-            self._change_layer(log, own, Span(self.microphone, first, last))
+            self._change_layer(log, own, MarkedSpan(self.microphone, first, last))
         self._done.append(changes)
         return made
 
-    def _change_layer(self, log: Path, marks: Sequence[Mark], instead_of: Span) -> None:
+    def _change_layer(self, log: Path, marks: Sequence[Mark], instead_of: MarkedSpan) -> None:
         write_marks(log, marks, [instead_of])
         self._known[log] = read_marks(log)
 
@@ -146,4 +146,4 @@ class Marking:
         ]
         first = min([start, *(mark.start for mark in touched)])
         last = max([end, *(mark.end for mark in touched)])
-        return _Change(log, Span(self.microphone, first, last), touched)
+        return _Change(log, MarkedSpan(self.microphone, first, last), touched)

@@ -6,15 +6,15 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labellings import REVIEW, Sources
 from hearthlog.analyzer.review.queue.ranking import RANKINGS, make_queue
-from hearthlog.analyzer.review.queue.review_list import Span, queued, read_list
-from hearthlog.analyzer.review.session.session import Item
+from hearthlog.analyzer.review.queue.review_list import ReviewSpan, queued, read_list
+from hearthlog.analyzer.review.session.session import ReviewItem
 
 Limits = tuple[int | None, int | None]
 
 
 def queue_items(
     wanted: str, sources: Sources, labelled: tuple[str, str], limits: Limits, count: int
-) -> list[Item]:
+) -> list[ReviewItem]:
     """Choose spans of a labelling that are to be reviewed.
 
     Parameters
@@ -57,7 +57,7 @@ def queue_items(
     return _items(queued(found, microphone, labelling, "" if other is None else other.name))
 
 
-def _listed(path: Path, microphone: str, limits: Limits) -> list[Span]:
+def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
     start, end = limits
     found = [
         span
@@ -71,10 +71,10 @@ def _listed(path: Path, microphone: str, limits: Limits) -> list[Span]:
     return found
 
 
-def _items(spans: Iterable[Span]) -> list[Item]:
-    return [Item(span.start, span.end, span.label_a, _text(span)) for span in spans]
+def _items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
+    return [ReviewItem(span.start, span.end, span.label_a, _text(span)) for span in spans]
 
 
-def _text(span: Span) -> str:
+def _text(span: ReviewSpan) -> str:
     other = f", {span.b}: {span.label_b or 'nothing'}" if span.b else ""
     return f"{span.a}: {span.label_a}{other} ({span.reason})"

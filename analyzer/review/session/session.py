@@ -12,7 +12,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.timeline.contents import Spans
+from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
@@ -24,7 +24,7 @@ _CLASS_KEYS = "1234567890eghijklmorstvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
 
-class Item(NamedTuple):
+class ReviewItem(NamedTuple):
     """A span that is to be reviewed.
 
     Attributes
@@ -61,7 +61,7 @@ class Screen(Protocol):
     def play(self, start: int) -> None:
         """Let the time cursor run from a time on."""
 
-    def redraw_marks(self, microphone: str, marks: Spans) -> None:
+    def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
         """Show marks as they are now."""
 
 
@@ -83,7 +83,7 @@ class Session:
         Draws a span (start, end) at the resolution of its frames.
     listen : callable
         Plays the sound of a span, if it was kept; returns what there is to say about it.
-    items : sequence of Item
+    items : sequence of ReviewItem
         What is to be gone through; empty where the reviewer chooses spans.
     """
 
@@ -94,7 +94,7 @@ class Session:
     say: Callable[[str], None]
     look_closely: Callable[[int, int], None]
     listen: Callable[[int, int], str]
-    items: Sequence[Item] = ()
+    items: Sequence[ReviewItem] = ()
     _at: int = -1
     _marked: int = 0
     _began: float = 0.0

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hearthlog.analyzer.review.timeline.contents import Clip
+from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
 
-def listen(clips: Sequence[Clip], start: int, end: int) -> str:
+def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
     """Play what was kept of a span of time, without waiting for its end.
 
     Returns
@@ -29,7 +29,7 @@ def listen(clips: Sequence[Clip], start: int, end: int) -> str:
     return f"playing {len(samples) / rate:.1f} s"
 
 
-def sound_of(clips: Sequence[Clip], start: int, end: int) -> tuple[int, Float32]:
+def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
     """Return the rate and the samples of what was kept of a span of time, one after the other.
 
     What is of another rate than the first is left out.

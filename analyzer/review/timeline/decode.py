@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.analyzer.review.timeline.contents import Clip, Frames, Spans, no_spans
+from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans, SoundClip, no_spans
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -53,13 +53,13 @@ def decibel(energy: Any) -> Any:
     return 10 * np.log10(np.maximum(energy, _QUIETEST))
 
 
-def spans_of(columns: Columns, text: str) -> Spans:
+def spans_of(columns: Columns, text: str) -> LabelledSpans:
     """Return the spans that segments or gaps are about; `text` is the field that is shown."""
     starts = columns["header.stamp"]
-    return Spans(starts, starts + columns["duration"], columns[text])
+    return LabelledSpans(starts, starts + columns["duration"], columns[text])
 
 
-def runs(parts: Sequence[Frames], after: int) -> Iterator[Spans]:
+def runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
     """Join successive frames whose most probable class is the same, from some time on."""
     for names, all_times, all_values in parts:
         later = all_times >= after
@@ -71,10 +71,10 @@ def runs(parts: Sequence[Frames], after: int) -> Iterator[Spans]:
         first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
         last = np.append(first[1:], len(times)) - 1
         texts = np.array(names, object)[best[first]]
-        yield Spans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+        yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
 
 
-def lasting(troubles: Sequence[tuple[int, str]], end: int) -> Spans:
+def lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
     """Let a trouble last until the next message says that it is over, or that it is another."""
     changes = [
         (stamp, text)
@@ -86,12 +86,12 @@ def lasting(troubles: Sequence[tuple[int, str]], end: int) -> Spans:
     if not spans:
         return no_spans()
     starts, ends, texts = zip(*spans, strict=True)
-    return Spans(np.array(starts), np.array(ends), np.array(texts, object))
+    return LabelledSpans(np.array(starts), np.array(ends), np.array(texts, object))
 
 
-def chained(parts: Sequence[Clip]) -> list[Clip]:
+def chained(parts: Sequence[SoundClip]) -> list[SoundClip]:
     """Join what follows each other."""
-    clips: list[list[Clip]] = []
+    clips: list[list[SoundClip]] = []
     for part in sorted(parts, key=lambda clip: clip.start):
         last = clips[-1][-1] if clips else None
         if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
@@ -99,6 +99,6 @@ def chained(parts: Sequence[Clip]) -> list[Clip]:
         else:
             clips.append([part])
     return [
-        Clip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
+        SoundClip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
         for run in clips
     ]

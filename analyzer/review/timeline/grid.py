@@ -36,7 +36,7 @@ class Grid:
         return np.clip(found.astype(np.int64), 0, self.count - 1)
 
 
-class Means:
+class GridMeans:
     """Means of what falls into the shares of a grid, value by value.
 
     Parameters

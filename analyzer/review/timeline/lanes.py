@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.review.timeline.contents import Labelling, Spans, no_spans
 from hearthlog.analyzer.review.timeline.grid import Grid, time_shares
+from hearthlog.analyzer.review.timeline.model import LabelledSpans, LabellingTimeline, no_spans
 from hearthlog.models.classes import SILENCE, class_name, translation
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.times import NANOSECONDS
@@ -34,7 +34,7 @@ class Changes(NamedTuple):
     states: list[str | None]
 
 
-def changes(spans: Spans) -> Changes:
+def changes(spans: LabelledSpans) -> Changes:
     """Begin each span with its text, and end it with None unless the next one follows at once."""
     followed = np.append(spans.starts[1:], np.iinfo(np.int64).max)
     last = np.flatnonzero(spans.ends < followed)
@@ -44,14 +44,14 @@ def changes(spans: Spans) -> Changes:
     return Changes(times[order], [states[i] for i in order])
 
 
-def from_afar(labelling: Labelling, grid: Grid) -> Spans:
+def overview(labelling: LabellingTimeline, grid: Grid) -> LabelledSpans:
     """Show a labelling in blocks: what was heard the most in each, silence counting a quarter.
 
     A block in which nothing was heard is empty.
 
     Returns
     -------
-    Spans
+    LabelledSpans
         Successive blocks that say the same are one.
     """
     coarse = Grid(grid.start, grid.end, BLOCKS)
@@ -66,10 +66,10 @@ def from_afar(labelling: Labelling, grid: Grid) -> Spans:
     ends = edges[np.append(first[1:], coarse.count)]
     said = best[first] >= 0
     texts = np.array([*names, None], object)[best[first]]
-    return Spans(edges[first][said], ends[said], texts[said])
+    return LabelledSpans(edges[first][said], ends[said], texts[said])
 
 
-def _shares(labelling: Labelling, grid: Grid) -> tuple[list[str], Float64]:
+def _shares(labelling: LabellingTimeline, grid: Grid) -> tuple[list[str], Float64]:
     """Measure how much of each block each label takes, or how probable it was if none is there."""
     spans = labelling.spans
     if len(spans):
@@ -82,7 +82,7 @@ def _shares(labelling: Labelling, grid: Grid) -> tuple[list[str], Float64]:
     return list(labelling.probabilities.names), np.add.reduceat(values, parts, axis=0)
 
 
-def disagreements(one: Spans, other: Spans) -> Spans:
+def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     """Find where two labellings say different things; the text is what both say.
 
     Two names of one sound (see `hearthlog.models.classes`) are the same thing.
@@ -104,16 +104,16 @@ def disagreements(one: Spans, other: Spans) -> Spans:
     texts = [
         f"{x} / {y}" for x, y in zip(one.texts[a[places]], other.texts[b[places]], strict=True)
     ]
-    return Spans(starts[places], np.minimum(stops, ends[-1]), np.array(texts, object))
+    return LabelledSpans(starts[places], np.minimum(stops, ends[-1]), np.array(texts, object))
 
 
-def _at(spans: Spans, times: Int64) -> Int64:
+def _at(spans: LabelledSpans, times: Int64) -> Int64:
     """Find the span that each time lies in; -1 for none."""
     found = np.searchsorted(spans.starts, times, side="right") - 1
     return np.where((found >= 0) & (times < spans.ends[np.maximum(found, 0)]), found, -1)
 
 
-def clock(grid: Grid, zone: tzinfo) -> Spans:
+def clock(grid: Grid, zone: tzinfo) -> LabelledSpans:
     """Show the home's own time: blocks that say when they begin.
 
     They are as long as gives at most thirty of them.
@@ -123,7 +123,7 @@ def clock(grid: Grid, zone: tzinfo) -> Spans:
     starts = np.unique(list(_ticks(grid, tick, zone)))  # no hour is twice, nor missing, in it
     ends = np.append(starts[1:], grid.end)
     texts = [_clock_text(int(start), tick, zone) for start in starts]
-    return Spans(starts, ends, np.array(texts, object))
+    return LabelledSpans(starts, ends, np.array(texts, object))
 
 
 def _ticks(grid: Grid, tick: int, zone: tzinfo) -> Iterator[int]:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.typed_columns import decode_known
-from hearthlog.analyzer.review.timeline.contents import Lines, Spans
 from hearthlog.analyzer.review.timeline.decode import FIELDS, TOPIC, decibel, spans_of, value_names
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.lanes import Changes, changes, clock
+from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -64,7 +64,7 @@ class Lane(NamedTuple):
     changes: Changes
 
 
-News = Means | Lane | Lines
+News = Means | Lane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
@@ -124,7 +124,7 @@ class Live:
 
     def _take(self, path: Path, columns: Columns) -> Iterator[News]:
         if columns.type == message_types.LOG:
-            yield Lines(columns["stamp"], columns["level"], columns["msg"])
+            yield LogLines(columns["stamp"], columns["level"], columns["msg"])
         elif columns.type == message_types.DIAGNOSTICS:
             yield from _health(columns)
         elif (match := TOPIC.fullmatch(columns.topic)) and not match["labelling"]:
@@ -176,7 +176,7 @@ class Live:
         known = self._open.get(microphone, np.empty(0, np.int64))
         self._open[microphone] = np.append(known, starts[heard])[-_MOST_OPEN:]
 
-    def _segments(self, microphone: str, spans: Spans) -> Iterator[Lane]:
+    def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
         """Say again what was heard in the seconds that segments settle: now it is smoothed."""
         seconds = self._open.get(microphone, np.empty(0, np.int64))
         times = np.unique(np.append(seconds, spans.starts))
@@ -234,9 +234,11 @@ class _Scale:
         return np.clip(scaled + 0.5, 0.0, 1.0)
 
 
-def _gaps(microphone: str, spans: Spans) -> Iterator[Lane]:
+def _gaps(microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
     later = spans.ends > spans.starts  # where the clock was set back nothing is missing
-    spans = Spans(spans.starts[later], spans.ends[later], np.full(later.sum(), NOT_HEARD, object))
+    spans = LabelledSpans(
+        spans.starts[later], spans.ends[later], np.full(later.sum(), NOT_HEARD, object)
+    )
     yield Lane(microphone, GAP_LANE, changes(spans))
 
 

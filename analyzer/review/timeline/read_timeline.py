@@ -16,19 +16,6 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.timeline_files import File, find_files, records_of
 from hearthlog.analyzer.logs.typed_columns import decode_known
 from hearthlog.analyzer.marks.marks import read_marks
-from hearthlog.analyzer.review.timeline.contents import (
-    LIVE,
-    REVIEW,
-    Clip,
-    Frames,
-    Labelling,
-    Lines,
-    Microphone,
-    Series,
-    Spans,
-    Timeline,
-    no_spans,
-)
 from hearthlog.analyzer.review.timeline.decode import (
     FIELDS,
     TOPIC,
@@ -39,7 +26,20 @@ from hearthlog.analyzer.review.timeline.decode import (
     spans_of,
     value_names,
 )
-from hearthlog.analyzer.review.timeline.grid import Grid, Means
+from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
+from hearthlog.analyzer.review.timeline.model import (
+    LIVE,
+    REVIEW,
+    FrameValues,
+    GridSeries,
+    LabelledSpans,
+    LabellingTimeline,
+    LogLines,
+    MicrophoneTimeline,
+    SoundClip,
+    Timeline,
+    no_spans,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -133,13 +133,13 @@ class _Growing:
 
     grid: Grid
     keep: bool
-    means: dict[tuple[str, ...], Means] = field(default_factory=dict)
-    frames: list[Frames] = field(default_factory=list)
+    means: dict[tuple[str, ...], GridMeans] = field(default_factory=dict)
+    frames: list[FrameValues] = field(default_factory=list)
 
     def add(self, names: tuple[str, ...], times: Any, values: Any) -> None:
-        self.means.setdefault(names, Means(self.grid, len(names))).add(times, values)
+        self.means.setdefault(names, GridMeans(self.grid, len(names))).add(times, values)
 
-    def series(self) -> Series | None:
+    def series(self) -> GridSeries | None:
         """Bring all to the same columns."""
         if not self.means:
             return None
@@ -150,7 +150,7 @@ class _Growing:
             heard = ~np.isnan(part[:, 0])
             columns = [names.index(name) for name in own]
             values[np.flatnonzero(heard)[:, np.newaxis], columns] = part[heard]
-        return Series(names, values)
+        return GridSeries(names, values)
 
 
 @dataclass
@@ -158,13 +158,13 @@ class _Heard:
     """What was read of a microphone so far."""
 
     features: _Growing
-    level_frames: list[Frames] = field(default_factory=list)
+    level_frames: list[FrameValues] = field(default_factory=list)
     labels: dict[str, _Growing] = field(default_factory=dict)
-    novelty: dict[str, Means] = field(default_factory=dict)
-    spans: dict[str, list[Spans]] = field(default_factory=dict)
-    gaps: list[Spans] = field(default_factory=list)
+    novelty: dict[str, GridMeans] = field(default_factory=dict)
+    spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
+    gaps: list[LabelledSpans] = field(default_factory=list)
     troubles: list[tuple[int, str]] = field(default_factory=list)
-    clips: list[Clip] = field(default_factory=list)
+    clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
 
 
@@ -175,7 +175,7 @@ class _Reader:
         self.every = every
         self._grid = grid
         self._heard: dict[str, _Heard] = {}
-        self._lines: list[Lines] = []
+        self._lines: list[LogLines] = []
         self._clip_seconds = 0.0
         self._layers: dict[tuple[Path, str], Path] = {}
 
@@ -262,7 +262,7 @@ class _Reader:
         heard.features.add(names, times, values)
         if self.every == 1 and _ENERGY in names:
             level = decibel(values[:, names.index(_ENERGY)])
-            heard.level_frames.append(Frames(("level",), times, level[:, np.newaxis]))
+            heard.level_frames.append(FrameValues(("level",), times, level[:, np.newaxis]))
 
     def _take_labels(self, path: Path, columns: Columns, heard: _Heard, name: str) -> None:
         columns = self._within(columns)
@@ -273,16 +273,16 @@ class _Reader:
         growing = heard.labels.setdefault(name, _Growing(self._grid, keep=self.every == 1))
         growing.add(names, times, values)
         if growing.keep:
-            growing.frames.append(Frames(names, times, values))
+            growing.frames.append(FrameValues(names, times, values))
         novelty = columns["novelty"]
         known = np.isfinite(novelty)
         if known.any():
-            means = heard.novelty.setdefault(name, Means(self._grid, 1))
+            means = heard.novelty.setdefault(name, GridMeans(self._grid, 1))
             means.add(times[known], novelty[known, np.newaxis])
 
     def _take_lines(self, columns: Columns) -> None:
         columns = self._within(columns)
-        self._lines.append(Lines(columns["stamp"], columns["level"], columns["msg"]))
+        self._lines.append(LogLines(columns["stamp"], columns["level"], columns["msg"]))
 
     def _take_health(self, columns: Columns) -> None:
         columns = self._within(columns)
@@ -302,7 +302,7 @@ class _Reader:
             if mark.start < self._grid.end and mark.end > self._grid.start:
                 spans = self._microphone(mark.microphone).spans.setdefault(REVIEW, [])
                 texts = np.array([mark.label], object)
-                spans.append(Spans(np.array([mark.start]), np.array([mark.end]), texts))
+                spans.append(LabelledSpans(np.array([mark.start]), np.array([mark.end]), texts))
 
     def _read_clips(self, path: Path) -> None:
         with LogFile(path) as file:
@@ -318,9 +318,9 @@ class _Reader:
                         f"{path}: more than {MOST_CLIP_SECONDS // 60} minutes of sound: what comes "
                         "later is not shown; name a shorter span with --start and --end"
                     )
-                clips.append(Clip(start, rate, samples))
+                clips.append(SoundClip(start, rate, samples))
 
-    def microphones(self) -> dict[str, Microphone]:
+    def microphones(self) -> dict[str, MicrophoneTimeline]:
         """Return what was heard by those microphones that have something to show."""
         return {
             name: self._finished(name, heard)
@@ -332,23 +332,23 @@ class _Reader:
         """Return the logs and layers that have something of a microphone."""
         return self._heard[microphone].logs
 
-    def lines(self) -> Lines:
+    def lines(self) -> LogLines:
         """Return the events, in the order of time."""
         if not self._lines:
-            return Lines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+            return LogLines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
         times = np.concatenate([lines.times for lines in self._lines])
         levels = np.concatenate([lines.levels for lines in self._lines])
         texts = np.concatenate([lines.texts for lines in self._lines])
         order = np.argsort(times, kind="stable")
-        return Lines(times[order], levels[order], texts[order])
+        return LogLines(times[order], levels[order], texts[order])
 
-    def _finished(self, name: str, heard: _Heard) -> Microphone:
+    def _finished(self, name: str, heard: _Heard) -> MicrophoneTimeline:
         labellings = [self._labelling(heard, each) for each in _ordered(heard)]
         features = heard.features.series()
         level = None
         if features is not None and _ENERGY in features.names:
             level = decibel(features.values[:, features.names.index(_ENERGY)])
-        return Microphone(
+        return MicrophoneTimeline(
             name=name,
             labellings=labellings,
             features=features,
@@ -359,7 +359,7 @@ class _Reader:
             clips=chained(heard.clips),
         )
 
-    def _labelling(self, heard: _Heard, name: str) -> Labelling:
+    def _labelling(self, heard: _Heard, name: str) -> LabellingTimeline:
         growing = heard.labels.get(name)
         parts = heard.spans.get(name, [])
         if name == LIVE and self.every > 1 and growing is not None:
@@ -370,7 +370,7 @@ class _Reader:
                 *runs(growing.frames, max((int(s.ends.max()) for s in parts), default=0)),
             ]
         spans = self._joined(parts)
-        return Labelling(
+        return LabellingTimeline(
             name,
             spans,
             None if growing is None else growing.series(),
@@ -378,16 +378,16 @@ class _Reader:
             [] if growing is None else growing.frames,
         )
 
-    def _joined(self, parts: Sequence[Spans]) -> Spans:
+    def _joined(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
         """Chain spans, in the order of time, cut off to the grid."""
         if not parts:
             return no_spans()
-        spans = Spans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        spans = LabelledSpans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
         starts = np.maximum(spans.starts, self._grid.start)
         ends = np.minimum(spans.ends, self._grid.end)
         left = np.flatnonzero(starts < ends)
         order = left[np.argsort(starts[left], kind="stable")]
-        return Spans(starts[order], ends[order], spans.texts[order])
+        return LabelledSpans(starts[order], ends[order], spans.texts[order])
 
 
 def _ordered(heard: _Heard) -> list[str]:

@@ -10,7 +10,7 @@ import soundfile
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import Colour
-from hearthlog.analyzer.review.timeline.contents import Clip, Frames, Lines
+from hearthlog.analyzer.review.timeline.model import FrameValues, LogLines, SoundClip
 from hearthlog.schemas.arrays import Float64, Int64
 
 TIMELINE = "time"
@@ -102,7 +102,7 @@ class Canvas:
             stamps = _time_column(times[first : first + _ROWS_AT_ONCE])
             self.recording.send_columns(entity, [stamps], column)
 
-    def draw_frames(self, entity: str, names: Sequence[str], parts: Sequence[Frames]) -> None:
+    def draw_frames(self, entity: str, names: Sequence[str], parts: Sequence[FrameValues]) -> None:
         """Draw frames as lines that end where frames are missing."""
         for part in parts:
             self.draw_lines(entity, *_with_holes(part, names))
@@ -142,14 +142,14 @@ class Canvas:
         ]  # fmt: skip
         self.recording.send_columns(entity, [_time_column(times)], columns)
 
-    def write_lines(self, entity: str, lines: Lines) -> None:
+    def write_lines(self, entity: str, lines: LogLines) -> None:
         """List events in words."""
         if len(lines.times):
             levels = [_LEVELS.get(level, "INFO") for level in lines.levels.tolist()]
             column = rr.TextLog.columns(text=lines.texts.tolist(), level=levels)
             self.recording.send_columns(entity, [_time_column(lines.times)], column)
 
-    def show_clip(self, entity: str, clip: Clip) -> None:
+    def show_clip(self, entity: str, clip: SoundClip) -> None:
         """Let a clip be heard and seen from its start on."""
         stream = io.BytesIO()
         soundfile.write(stream, clip.samples, clip.rate, format="FLAC", subtype="PCM_16")
@@ -172,7 +172,7 @@ def _thinned(times: Int64, values: Float64) -> tuple[Int64, Float64]:
     return times[first + sizes // 2], np.add.reduceat(values, first) / sizes[:, np.newaxis]
 
 
-def _with_holes(part: Frames, names: Sequence[str]) -> tuple[Int64, Float64]:
+def _with_holes(part: FrameValues, names: Sequence[str]) -> tuple[Int64, Float64]:
     """Bring frames to some columns, and put a row of NaN where frames are missing."""
     values = np.full((len(part.times), len(names)), np.nan)
     values[:, [names.index(name) for name in part.names]] = part.values

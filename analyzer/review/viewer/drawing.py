@@ -9,19 +9,19 @@ import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import GAP, Colour, colour
 from hearthlog.analyzer.logs.local_time import home_zone
-from hearthlog.analyzer.review.timeline.contents import (
+from hearthlog.analyzer.review.timeline.lanes import changes, clock, disagreements, overview
+from hearthlog.analyzer.review.timeline.model import (
     REVIEW,
-    Frames,
-    Microphone,
+    FrameValues,
+    MicrophoneTimeline,
     Timeline,
     no_spans,
 )
-from hearthlog.analyzer.review.timeline.lanes import changes, clock, disagreements, from_afar
 from hearthlog.analyzer.review.viewer.canvas import TIMELINE, Canvas
 from hearthlog.schemas.arrays import Int64
 
 APPLICATION = "hearthlog"
-AFAR, EXACT = "lanes", "exact"
+OVERVIEW, DETAIL = "lanes", "exact"
 _LINES, _CLIP = "events", "clip"
 _CLOSE = "/close_up"
 Rows = list[tuple[int, rrb.View | rrb.Container]]
@@ -37,7 +37,7 @@ SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 
 def draw(timeline: Timeline, canvas: Canvas) -> None:
     """Draw all but the single frames."""
-    for root in (AFAR, EXACT):
+    for root in (OVERVIEW, DETAIL):
         _draw_clock(timeline, canvas, root)
     for microphone in timeline.microphones.values():
         _draw_lanes(timeline, microphone, canvas)
@@ -64,14 +64,14 @@ def draw_frames(
             canvas.draw_frames(entity, ["level"], _between(microphone.level_frames, start, end))
 
 
-def _between(parts: Sequence[Frames], start: int | None, end: int | None) -> list[Frames]:
+def _between(parts: Sequence[FrameValues], start: int | None, end: int | None) -> list[FrameValues]:
     """Return the frames that begin in a span of time."""
     found = []
     for names, times, values in parts:
         first = 0 if start is None else int(np.searchsorted(times, start))
         last = len(times) if end is None else int(np.searchsorted(times, end))
         if first < last:
-            found.append(Frames(names, times[first:last], values[first:last]))
+            found.append(FrameValues(names, times[first:last], values[first:last]))
     return found
 
 
@@ -88,7 +88,7 @@ def lane(root: str, microphone: str, place: int, name: str) -> str:
 
 def review_lanes(microphone: str) -> list[str]:
     """Name the lanes that show a reviewer's marks."""
-    return [lane(root, microphone, 8, REVIEW) for root in (AFAR, EXACT)]
+    return [lane(root, microphone, 8, REVIEW) for root in (OVERVIEW, DETAIL)]
 
 
 def _draw_clock(timeline: Timeline, canvas: Canvas, root: str) -> None:
@@ -99,18 +99,18 @@ def _draw_clock(timeline: Timeline, canvas: Canvas, root: str) -> None:
     canvas.change_states(entity, *changes(hours))
 
 
-def _draw_lanes(timeline: Timeline, microphone: Microphone, canvas: Canvas) -> None:
+def _draw_lanes(timeline: Timeline, microphone: MicrophoneTimeline, canvas: Canvas) -> None:
     classes = _classes(microphone)
     colours = {name: colour(name) for name in classes}
     for place, labelling in enumerate(microphone.labellings, 1):
         place_ = 8 if labelling.name == REVIEW else min(place, 7)
-        for root in (AFAR, EXACT):
+        for root in (OVERVIEW, DETAIL):
             entity = lane(root, microphone.name, place_, labelling.name)
             canvas.configure_lane(entity, colours)
-            exact = root == EXACT or labelling.name == REVIEW
+            exact = root == DETAIL or labelling.name == REVIEW
             spans = labelling.spans if exact else no_spans()
             if not len(spans) and labelling.name != REVIEW:
-                spans = from_afar(labelling, timeline.grid)
+                spans = overview(labelling, timeline.grid)
             canvas.change_states(entity, *changes(spans))
     if all(labelling.name != REVIEW for labelling in microphone.labellings):
         start = np.array([timeline.grid.start])
@@ -123,13 +123,13 @@ def _draw_lanes(timeline: Timeline, microphone: Microphone, canvas: Canvas) -> N
         (9, "trouble", microphone.troubles, _TROUBLE),
     ):
         if len(spans):
-            for root in (AFAR, EXACT):
+            for root in (OVERVIEW, DETAIL):
                 entity = lane(root, microphone.name, place, name)
                 canvas.configure_lane(entity, dict.fromkeys(spans.texts, tint))
                 canvas.change_states(entity, *changes(spans))
 
 
-def _draw_differences(timeline: Timeline, microphone: Microphone, canvas: Canvas) -> None:
+def _draw_differences(timeline: Timeline, microphone: MicrophoneTimeline, canvas: Canvas) -> None:
     """Show where a model says something else than the recorder did."""
     first = microphone.labellings[0] if microphone.labellings else None
     if first is None or first.name == REVIEW:
@@ -138,8 +138,8 @@ def _draw_differences(timeline: Timeline, microphone: Microphone, canvas: Canvas
     for other in others:
         exact = disagreements(first.spans, other.spans)
         spans = {
-            EXACT: exact,
-            AFAR: disagreements(*(from_afar(one, timeline.grid) for one in (first, other))),
+            DETAIL: exact,
+            OVERVIEW: disagreements(*(overview(one, timeline.grid) for one in (first, other))),
         }
         for root, found in spans.items():
             entity = lane(root, microphone.name, 9, f"differs {other.name}")
@@ -148,7 +148,7 @@ def _draw_differences(timeline: Timeline, microphone: Microphone, canvas: Canvas
 
 
 def _draw_plots(
-    timeline: Timeline, microphone: Microphone, canvas: Canvas, scale: str = ""
+    timeline: Timeline, microphone: MicrophoneTimeline, canvas: Canvas, scale: str = ""
 ) -> None:
     times = _middles(timeline)
     name = f"{microphone.name}{scale}"
@@ -174,7 +174,7 @@ def _middles(timeline: Timeline) -> Int64:
     return edges[:-1] + (edges[1:] - edges[:-1]) // 2
 
 
-def _classes(microphone: Microphone) -> list[str]:
+def _classes(microphone: MicrophoneTimeline) -> list[str]:
     names = [
         n for one in microphone.labellings if one.probabilities for n in one.probabilities.names
     ]
@@ -219,8 +219,8 @@ def _views(timeline: Timeline, *, close_up: bool) -> rrb.Vertical:
     microphones = list(timeline.microphones.values())
     sampled = "" if timeline.every == 1 else f" (a sample: one part in {timeline.every})"
     lanes = rrb.Tabs(
-        _lane_view(AFAR, f"What was heard, from afar{sampled}: clock of the home, axes in UTC"),
-        _lane_view(EXACT, "What was heard, exactly"),
+        _lane_view(OVERVIEW, f"What was heard, from afar{sampled}: clock of the home, axes in UTC"),
+        _lane_view(DETAIL, "What was heard, exactly"),
         active_tab=1 if close_up else 0,
     )
     count = sum(_lanes(microphone) for microphone in microphones) + 1
@@ -239,7 +239,7 @@ def _stacked(rows: Rows, name: str | None = None) -> rrb.Vertical:
     )
 
 
-def _lanes(microphone: Microphone) -> int:
+def _lanes(microphone: MicrophoneTimeline) -> int:
     names = [labelling.name for labelling in microphone.labellings if labelling.name != REVIEW]
     more = [microphone.gaps, microphone.troubles]
     return len(names) + 1 + max(len(names) - 1, 0) + sum(1 for spans in more if len(spans))
@@ -253,7 +253,7 @@ def _lane_view(root: str, name: str) -> rrb.View:
     return rrb.StateTimelineView(origin=root, name=name, time_view=_axis())
 
 
-def _plots(microphone: Microphone, sampled: str, *, close_up: bool) -> rrb.Vertical:
+def _plots(microphone: MicrophoneTimeline, sampled: str, *, close_up: bool) -> rrb.Vertical:
     """Show what a microphone heard; where spans are marked there is room for them, close up."""
     probable = [one.name for one in microphone.labellings if one.probabilities is not None]
     rows: Rows = []
@@ -269,7 +269,7 @@ def _plots(microphone: Microphone, sampled: str, *, close_up: bool) -> rrb.Verti
     return _stacked(rows, microphone.name)
 
 
-def _rest(microphone: Microphone) -> Rows:
+def _rest(microphone: MicrophoneTimeline) -> Rows:
     """Show what is not a label: level, novelty, features."""
     rows: Rows = []
     if microphone.level is not None:
@@ -294,7 +294,7 @@ def _tabs(views: Iterable[rrb.View]) -> rrb.View | rrb.Container:
     return found[0] if len(found) == 1 else rrb.Tabs(*found)
 
 
-def _share_view(microphone: Microphone, name: str, note: str, scale: str = "") -> rrb.View:
+def _share_view(microphone: MicrophoneTimeline, name: str, note: str, scale: str = "") -> rrb.View:
     return _plot(
         f"{microphone.name}{scale}/{_word(name)}/shares",
         f"How probable each class is: {name}{note}",
@@ -336,7 +336,7 @@ def _details(timeline: Timeline, *, close_up: bool) -> rrb.Tabs:
     return rrb.Tabs(events, *views) if clips or not close_up else rrb.Tabs(*views, events)
 
 
-def _more(microphone: Microphone, *, close_up: bool) -> list[rrb.View]:
+def _more(microphone: MicrophoneTimeline, *, close_up: bool) -> list[rrb.View]:
     if close_up:
         rest: list[Any] = [view for _, view in _rest(microphone)]
         if microphone.level is not None:

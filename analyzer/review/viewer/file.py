@@ -5,7 +5,7 @@ from pathlib import Path
 import rerun as rr
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.contents import Timeline
+from hearthlog.analyzer.review.timeline.model import Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import APPLICATION, Layout, draw, draw_frames
 from hearthlog.schemas.errors import LogError

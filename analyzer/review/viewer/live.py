@@ -10,7 +10,6 @@ import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import GAP, Colour, colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.contents import Lines
 from hearthlog.analyzer.review.timeline.live import (
     GAP_LANE,
     LIVE_LANE,
@@ -21,8 +20,9 @@ from hearthlog.analyzer.review.timeline.live import (
     Means,
     News,
 )
+from hearthlog.analyzer.review.timeline.model import LogLines
 from hearthlog.analyzer.review.viewer.canvas import TIMELINE, Canvas
-from hearthlog.analyzer.review.viewer.drawing import AFAR, SHARED_AXIS, lane
+from hearthlog.analyzer.review.viewer.drawing import OVERVIEW, SHARED_AXIS, lane
 from hearthlog.analyzer.review.viewer.process import HOST
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
@@ -86,7 +86,7 @@ class LiveServer:
     def show(self, news: Iterable[News]) -> None:
         """Draw what is new."""
         for each in news:
-            if isinstance(each, Lines):
+            if isinstance(each, LogLines):
                 self._canvas.write_lines(_LINES, each)
             elif isinstance(each, Lane):
                 self._show_lane(each)
@@ -99,9 +99,9 @@ class LiveServer:
 
     def _show_lane(self, news: Lane) -> None:
         if news.microphone:
-            entity = lane(AFAR, news.microphone, _PLACES[news.name], news.name)
+            entity = lane(OVERVIEW, news.microphone, _PLACES[news.name], news.name)
         else:
-            entity = f"{AFAR}/0_{news.name.replace('/', '-')}"
+            entity = f"{OVERVIEW}/0_{news.name.replace('/', '-')}"
         states = {state for state in news.changes.states if state is not None}
         if entity not in self._lanes and not states:
             return  # a lane is there once it has something to show
@@ -206,7 +206,7 @@ def _axis() -> rrb.TimeAxis:
 
 
 def _lanes() -> rrb.View:
-    return rrb.StateTimelineView(origin=AFAR, name="What is heard", time_view=_axis())
+    return rrb.StateTimelineView(origin=OVERVIEW, name="What is heard", time_view=_axis())
 
 
 def _plots(microphone: str, kinds: dict[str, list[tuple[str, ...]]]) -> rrb.Container:

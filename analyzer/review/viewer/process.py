@@ -63,7 +63,7 @@ def check_display(instead: str) -> None:
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
 
 
-class Process:
+class ViewerProcess:
     """A run of the program.
 
     Parameters

@@ -9,8 +9,8 @@ import rerun as rr
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.contents import Spans, Timeline
 from hearthlog.analyzer.review.timeline.lanes import changes
+from hearthlog.analyzer.review.timeline.model import LabelledSpans, Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     APPLICATION,
@@ -22,7 +22,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     review_lanes,
 )
 from hearthlog.analyzer.review.viewer.file import name_recording
-from hearthlog.analyzer.review.viewer.process import Process
+from hearthlog.analyzer.review.viewer.process import ViewerProcess
 
 _PANEL = "/time_panel"
 _WAIT_SECONDS = 60
@@ -31,7 +31,7 @@ _FLUSH_SECONDS = 30.0
 Blueprint = dict[str, Any]
 
 
-class State(NamedTuple):
+class ViewerState(NamedTuple):
     """What a viewer says of itself.
 
     Attributes
@@ -51,12 +51,12 @@ class State(NamedTuple):
     cursor: int | None
 
 
-class Control(Protocol):
+class ViewerControl(Protocol):
     """How to speak with one kind of viewer; all raise ConnectionError or TimeoutError."""
 
-    process: Process
+    process: ViewerProcess
 
-    def state(self) -> State:
+    def state(self) -> ViewerState:
         """Ask what it shows."""
 
     def blueprint(self) -> Blueprint:
@@ -83,12 +83,12 @@ class Viewer:
 
     Parameters
     ----------
-    control : Control
+    control : ViewerControl
     address : str
         What is to be opened to see it; empty if it opens itself.
     """
 
-    def __init__(self, control: Control, address: str = "") -> None:
+    def __init__(self, control: ViewerControl, address: str = "") -> None:
         self.address = address
         self._control = control
         self._recording = rr.RecordingStream(APPLICATION)
@@ -146,7 +146,7 @@ class Viewer:
         draw_close_up(timeline, self._canvas)
         self._flush()
 
-    def redraw_marks(self, microphone: str, marks: Spans) -> None:
+    def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
         """Show marks as they are now."""
         times, states = changes(marks)
         known = self._times.setdefault(microphone, set())
@@ -163,7 +163,7 @@ class Viewer:
             self._canvas.change_states(entity, every, now)
         self._flush()
 
-    def wait_until_drawn(self) -> State:
+    def wait_until_drawn(self) -> ViewerState:
         """Wait until it shows what was sent to it; for a page, until somebody opens it.
 
         Raises
@@ -186,7 +186,7 @@ class Viewer:
             time.sleep(0.05)
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
 
-    def state(self) -> State:
+    def state(self) -> ViewerState:
         """Ask what it shows; raises ConnectionError or TimeoutError."""
         return self._control.state()
 

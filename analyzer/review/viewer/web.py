@@ -15,8 +15,8 @@ from importlib.resources import files
 from typing import Any, cast
 
 from hearthlog.analyzer.review.viewer import messages
-from hearthlog.analyzer.review.viewer.process import HOST, Process, free_port
-from hearthlog.analyzer.review.viewer.viewer import Blueprint, State, Viewer
+from hearthlog.analyzer.review.viewer.process import HOST, ViewerProcess, free_port
+from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
 _POLL_SECONDS = 20.0
 _ANSWER_SECONDS = 15.0
@@ -205,22 +205,22 @@ class WebControl:
 
     Parameters
     ----------
-    process : Process
+    process : ViewerProcess
         Which hands out data and the files of the viewer.
     server : _Server
     """
 
-    def __init__(self, process: Process, server: _Server) -> None:
+    def __init__(self, process: ViewerProcess, server: _Server) -> None:
         self.process = process
         self.address = server.url
         self._relay = server.relay
         self._server = server
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    def state(self) -> State:
+    def state(self) -> ViewerState:
         """Ask what it shows."""
         version, reports, cursor = messages.read_state(self._relay.ask(messages.get_state()))
-        return State(version, len(reports), [text for one in reports for text in one], cursor)
+        return ViewerState(version, len(reports), [text for one in reports for text in one], cursor)
 
     def blueprint(self) -> Blueprint:
         """Ask for its blueprint."""
@@ -265,6 +265,6 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
         If the port is in use.
     """
     page, viewer_files = free_port(port), free_port()
-    process = Process(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())
+    process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())
     server = _Server(page, Relay(), f"http://{HOST}:{viewer_files}", data or process.url)
     return Viewer(WebControl(process, server), server.url)

@@ -6,8 +6,8 @@ import numpy as np
 from rerun.experimental import ViewerClient
 
 from hearthlog.analyzer.review.viewer.canvas import TIMELINE
-from hearthlog.analyzer.review.viewer.process import Process, check_display, free_port
-from hearthlog.analyzer.review.viewer.viewer import Blueprint, State, Viewer
+from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display, free_port
+from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
 _MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
 
@@ -17,10 +17,10 @@ class WindowControl:
 
     Parameters
     ----------
-    process : Process
+    process : ViewerProcess
     """
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: ViewerProcess) -> None:
         self.process = process
         self._client: ViewerClient | None = None
 
@@ -31,7 +31,7 @@ class WindowControl:
             self._client = ViewerClient.connect(self.process.url)
         return self._client
 
-    def state(self) -> State:
+    def state(self) -> ViewerState:
         """Ask what it shows."""
         found = self.client.get_state()
         errors = [
@@ -43,7 +43,7 @@ class WindowControl:
             if each.store_id == found.active_recording
         ]
         cursor = cursors[0] if cursors else None
-        return State(found.viewer_version or "", len(found.views), errors, cursor)
+        return ViewerState(found.viewer_version or "", len(found.views), errors, cursor)
 
     def blueprint(self) -> Blueprint:
         """Ask for its blueprint."""
@@ -72,15 +72,15 @@ class WindowControl:
         self.process.close()
 
 
-class Window(Viewer):
+class WindowViewer(Viewer):
     """A viewer in a window.
 
     Parameters
     ----------
-    process : Process
+    process : ViewerProcess
     """
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: ViewerProcess) -> None:
         self._window = WindowControl(process)
         super().__init__(self._window)
 
@@ -89,7 +89,7 @@ class Window(Viewer):
         return self._window.client.take_screenshot()
 
 
-def open_window(port: int | None = None, data: str | None = None) -> Window:
+def open_window(port: int | None = None, data: str | None = None) -> WindowViewer:
     """Open Rerun's viewer in a window.
 
     Parameters
@@ -115,11 +115,11 @@ def _source(data: str) -> list[str]:
     return ["--connect", data, "--memory-limit", _MEMORY]
 
 
-def open_hidden(port: int | None = None) -> Window:
+def open_hidden(port: int | None = None) -> WindowViewer:
     """Run the same viewer without a window, for pictures of it; raises as `open_window`."""
     return _opened(port, "--expect-data-soon", "--headless")
 
 
-def _opened(port: int | None, *more: str) -> Window:
+def _opened(port: int | None, *more: str) -> WindowViewer:
     limit = ["--server-memory-limit", "32MB"]  # nobody comes later to see what was sent
-    return Window(Process(["--hide-welcome-screen", *limit, *more], free_port(port)))
+    return WindowViewer(ViewerProcess(["--hide-welcome-screen", *limit, *more], free_port(port)))

@@ -18,7 +18,7 @@ _MOST = 5_000_000
 
 
 @dataclass(frozen=True)
-class Windows:
+class JudgeableSpans:
     """Spans of time, in its order, that do not overlap.
 
     Attributes
@@ -38,12 +38,14 @@ class Windows:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def taken(self, rows: Int64) -> "Windows":
+    def taken(self, rows: Int64) -> "JudgeableSpans":
         """Return some of them."""
-        return Windows(self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows])
+        return JudgeableSpans(
+            self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
+        )
 
 
-def windows_of(segments: Events) -> Windows:
+def judgeable_spans(segments: Events) -> JudgeableSpans:
     """Join segments that flicker, and cut long ones.
 
     Successive segments of less than a second each are one stretch, labelled as the longest of
@@ -77,7 +79,7 @@ def windows_of(segments: Events) -> Windows:
         starts[source] + (ends - starts)[source] * number // parts[source]
         for number in (part, part + 1)
     )
-    return Windows(begins, stops, segments.labels[longest][source], source)
+    return JudgeableSpans(begins, stops, segments.labels[longest][source], source)
 
 
 def without(segments: Events, starts: Int64, ends: Int64) -> Events:
@@ -87,7 +89,7 @@ def without(segments: Events, starts: Int64, ends: Int64) -> Events:
     return Events(pieces.starts, pieces.ends, segments.labels[pieces.rows[0]])
 
 
-def other_labels(windows: Windows, others: Events) -> tuple[Int64, NDArray[np.float64]]:
+def other_labels(windows: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
     """Tell what another labelling says in each window.
 
     Returns

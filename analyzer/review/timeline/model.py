@@ -14,7 +14,7 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 LIVE, REVIEW = "live", "review"
 
 
-class Spans(NamedTuple):
+class LabelledSpans(NamedTuple):
     """Spans of time that say something.
 
     Attributes
@@ -32,7 +32,7 @@ class Spans(NamedTuple):
         return len(self.starts)
 
 
-class Series(NamedTuple):
+class GridSeries(NamedTuple):
     """Means on the grid of a timeline.
 
     Attributes
@@ -47,7 +47,7 @@ class Series(NamedTuple):
     values: Float64
 
 
-class Frames(NamedTuple):
+class FrameValues(NamedTuple):
     """Successive frames, 20 a second, as they are in a log.
 
     Attributes
@@ -63,7 +63,7 @@ class Frames(NamedTuple):
     values: Float32
 
 
-class Lines(NamedTuple):
+class LogLines(NamedTuple):
     """Events in words, in the order of time.
 
     Attributes
@@ -79,7 +79,7 @@ class Lines(NamedTuple):
     texts: NDArray[np.object_]
 
 
-class Clip(NamedTuple):
+class SoundClip(NamedTuple):
     """Sound that was kept: `samples` at `rate` a second, from `start` on, in -1 to 1."""
 
     start: int
@@ -93,52 +93,52 @@ class Clip(NamedTuple):
 
 
 @dataclass
-class Labelling:
+class LabellingTimeline:
     """What somebody says that was heard: the recorder (`live`), a model, a reviewer.
 
     Attributes
     ----------
-    spans : Spans
-    probabilities : Series or None
+    spans : LabelledSpans
+    probabilities : GridSeries or None
         Of each class.
     novelty : np.ndarray [shape=(count,)], float64, or None
-    frames : list of Frames
+    frames : list of FrameValues
         The probabilities, frame by frame.
     """
 
     name: str
-    spans: Spans
-    probabilities: Series | None = None
+    spans: LabelledSpans
+    probabilities: GridSeries | None = None
     novelty: Float64 | None = None
-    frames: Sequence[Frames] = ()
+    frames: Sequence[FrameValues] = ()
 
 
 @dataclass
-class Microphone:
+class MicrophoneTimeline:
     """What a microphone heard.
 
     Attributes
     ----------
-    labellings : list of Labelling
+    labellings : list of LabellingTimeline
         The recorder's first, the reviewer's last.
-    features : Series or None
+    features : GridSeries or None
     level : np.ndarray [shape=(count,)], float64, or None
         Of the mean energy, in dB relative to full scale (a square wave of full scale has 0).
-    level_frames : list of Frames
+    level_frames : list of FrameValues
         The level, frame by frame.
-    gaps, troubles : Spans
+    gaps, troubles : LabelledSpans
         What was not heard, and what was not well, each with the reason.
-    clips : list of Clip
+    clips : list of SoundClip
     """
 
     name: str
-    labellings: list[Labelling]
-    features: Series | None
+    labellings: list[LabellingTimeline]
+    features: GridSeries | None
     level: Float64 | None
-    level_frames: Sequence[Frames]
-    gaps: Spans
-    troubles: Spans
-    clips: list[Clip]
+    level_frames: Sequence[FrameValues]
+    gaps: LabelledSpans
+    troubles: LabelledSpans
+    clips: list[SoundClip]
 
 
 @dataclass
@@ -149,8 +149,8 @@ class Timeline:
     ----------
     grid : Grid
         The whole span, in shares as wide as a pixel or two.
-    microphones : dict of str to Microphone
-    lines : Lines
+    microphones : dict of str to MicrophoneTimeline
+    lines : LogLines
     zone : str
         IANA name of the home's time zone.
     heard : dict of str to Heard
@@ -162,14 +162,14 @@ class Timeline:
     """
 
     grid: Grid
-    microphones: dict[str, Microphone]
-    lines: Lines
+    microphones: dict[str, MicrophoneTimeline]
+    lines: LogLines
     zone: str
     heard: dict[str, Heard]
     every: int = 1
     losses: list[str] = field(default_factory=list)
 
 
-def no_spans() -> Spans:
+def no_spans() -> LabelledSpans:
     """Make spans of which there is none."""
-    return Spans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+    return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
