@@ -14,7 +14,7 @@ from mcap.records import Message
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.logs.files import SUFFIX, check_new, is_layer, is_log, stem, sync_folder
+from hearthlog.schemas.logs.files import SUFFIX, is_layer, is_log, stem
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
@@ -23,6 +23,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.record_verifier import WholeAttachment, WholeChunk
 from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
+from hearthlog.schemas.storage.new_files import check_new, sync_folder
 from hearthlog.schemas.storage.regular_file import open_regular
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2

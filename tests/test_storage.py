@@ -27,10 +27,11 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import check_new, find_logs, new_file, replaced_file
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile, time_span, topic_counts
+from hearthlog.schemas.storage.new_files import check_new, new_file, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_352_000 * NANOSECONDS

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from hearthlog.analyzer.evaluation.table import shown
 from hearthlog.analyzer.training.scores import Bin, Scores
-from hearthlog.schemas.logs.files import new_file
+from hearthlog.schemas.storage.new_files import new_file
 
 
 def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:

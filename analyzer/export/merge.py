@@ -17,13 +17,13 @@ from hearthlog.analyzer.logs.channel_names import unused
 from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.logs.files import new_file
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.storage.new_files import new_file
 
 _CHANNELS_LIMIT = (1 << 16) - 1
 _PROFILES_LIMIT = 64 << 10  # characters

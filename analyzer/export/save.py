@@ -22,9 +22,9 @@ from hearthlog.analyzer.logs.pieces import Piece, pieces
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import is_of_type
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import check_new, new_file, sync_folder
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.storage.new_files import check_new, new_file, sync_folder
 from hearthlog.schemas.times import NANOSECONDS
 
 

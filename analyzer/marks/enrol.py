@@ -30,9 +30,10 @@ from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, log_path, new_file
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, log_path
 from hearthlog.schemas.mcap.logfile import time_span
 from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS
 
 SECONDS = 5.0  # of a microphone, unless it is said

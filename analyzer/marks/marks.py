@@ -20,12 +20,13 @@ from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.files import SUFFIX, replaced_file, stem
+from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topic
+from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold

@@ -35,10 +35,11 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import new_file, replaced_file, stem
+from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.cdr_codec import Column
+from hearthlog.schemas.storage.new_files import new_file, replaced_file
 
 
 class Job(NamedTuple):

@@ -18,8 +18,8 @@ from hearthlog.analyzer.report.read_home import LIVE, Heard, read_heard
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import check_new, new_file
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.storage.new_files import check_new, new_file
 
 WEEK = 7
 

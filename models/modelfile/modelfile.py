@@ -24,7 +24,7 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import check_new, new_file
+from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.storage.small_file import read_whole
 
 SUFFIX = ".safetensors"

@@ -16,7 +16,7 @@ from pathlib import Path
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
-from hearthlog.schemas.logs.files import sync_folder
+from hearthlog.schemas.storage.new_files import sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 _HISTORY = "history"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import active_path, sync_folder
+from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.log_stream import (
     ENCODING,
     PROFILE,
@@ -19,6 +19,7 @@ from hearthlog.schemas.logs.log_stream import (
 )
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.storage.new_files import sync_folder
 
 __all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "TopicBatch"]
 

@@ -75,7 +75,7 @@ def export_labels(
     from hearthlog.analyzer.logs.coverage import find_heard
     from hearthlog.analyzer.marks.formats import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
-    from hearthlog.schemas.logs.files import check_new
+    from hearthlog.schemas.storage.new_files import check_new
 
     _check_suffix(output)
     check_new(output)

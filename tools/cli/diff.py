@@ -157,7 +157,7 @@ def _report_losses(sources: "Sources", topics: list[str]) -> None:
 
 
 def _check_list(path: Path | None) -> None:
-    from hearthlog.schemas.logs.files import check_new
+    from hearthlog.schemas.storage.new_files import check_new
 
     if path is None:
         return

@@ -331,7 +331,7 @@ def _print_json(result: dict[str, Any]) -> None:
 
 
 def _check_plot(path: Path | None) -> None:
-    from hearthlog.schemas.logs.files import check_new
+    from hearthlog.schemas.storage.new_files import check_new
 
     if path is None:
         return

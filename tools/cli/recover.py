@@ -61,7 +61,8 @@ def recover(
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
     from hearthlog.recorder.recovery import recover_in_place, recover_log
-    from hearthlog.schemas.logs.files import SUFFIX, new_file, stem
+    from hearthlog.schemas.logs.files import SUFFIX, stem
+    from hearthlog.schemas.storage.new_files import new_file
     from hearthlog.tools.cli.progress import share_done
 
     with share_done(f"recovering {log.name}") as progress:

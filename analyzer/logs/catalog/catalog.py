@@ -20,9 +20,10 @@ from hearthlog.analyzer.logs.catalog.file import (
     write_table,
 )
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import CATALOG, SUFFIX, find_logs, replaced_file, stem
+from hearthlog.schemas.logs.files import CATALOG, SUFFIX, find_logs, stem
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
+from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LOG, RELABEL, REVIEW = "log", "relabel", "review"

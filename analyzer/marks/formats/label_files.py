@@ -16,7 +16,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     place_text,
 )
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.logs.files import new_file
+from hearthlog.schemas.storage.new_files import new_file
 
 _SIZE_LIMIT = 16 << 20  # a hundred thousand labels, or more; what is larger is something else
 _XML_LIMIT = 64 << 20  # as many

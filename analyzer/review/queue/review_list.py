@@ -13,8 +13,8 @@ from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.review.queue.ranking import ReviewQueue
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import new_file
 from hearthlog.schemas.messages.topics import check_microphone_name
+from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import read_time, time_text
 
 MOST_SPANS = 100_000

@@ -9,7 +9,7 @@ from hearthlog.analyzer.review.timeline.model import Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import APPLICATION, Layout, draw, draw_frames
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import check_new, new_file
+from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.times import time_text
 
 SUFFIX = ".rrd"

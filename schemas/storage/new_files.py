@@ -1,0 +1,133 @@
+"""New files: whole or not there at all, on this machine and in a store."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a file's creation or renaming in this folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def check_new(path: Path) -> None:
+    """Raise LogError unless a file or folder can be made under this name.
+
+    Whether a store lets us write is known only when we do.
+    """
+    if not is_local(path):
+        _check_new_stored(path)
+        return
+    if os.path.lexists(path):
+        raise _exists(path)
+    if not path.parent.is_dir():
+        raise LogError(f"{path}: there is no folder {path.parent}; create it first")
+    if not os.access(path.parent, os.W_OK):
+        raise LogError(f"{path}: the folder cannot be written to")
+
+
+def _check_new_stored(path: Any) -> None:
+    with store_errors(path):
+        exists = path.fs.exists(path.path)
+    if exists:
+        raise _exists(path)
+
+
+def _exists(path: Path) -> LogError:
+    return LogError(f"{path}: exists already; choose another name, or delete it first")
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Make a file: yield a temporary name to write to, and give it its own when that went well.
+
+    For a path in a store the temporary file is one of this machine, and is put there at the end.
+    S3 shows it whole or not at all, and refuses to put it over another one. That is not sure of
+    every store: between a last look and the end of putting, another file of this name may be
+    replaced, and a store that has real folders may keep a part of a file when it is cut off.
+
+    Raises
+    ------
+    LogError
+        If there is such a file already, or if it cannot be written.
+    """
+    check_new(path)
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=True) as temporary:
+        yield temporary
+
+
+@contextmanager
+def replaced_file(path: Path) -> Iterator[Path]:
+    """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
+
+    Raises
+    ------
+    LogError
+        If it cannot be written.
+    """
+    put = _put_in_place if is_local(path) else _put_in_store
+    with put(path, new=False) as temporary:
+        yield temporary
+
+
+@contextmanager
+def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
+    temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        if new:
+            _name(temporary, path)
+        else:
+            temporary.replace(path)
+        sync_folder(path.parent)
+    except FileExistsError as error:
+        raise _exists(path) from error
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _name(temporary: Path, path: Path) -> None:
+    """Give a file its name, which unlike a rename never takes it from another file."""
+    try:
+        path.hardlink_to(temporary)
+    except FileExistsError:
+        raise
+    except OSError:  # an SD card without links
+        path.open("xb").close()
+        temporary.replace(path)
+
+
+@contextmanager
+def _put_in_store(path: Any, *, new: bool) -> Iterator[Path]:
+    try:
+        with tempfile.TemporaryDirectory(prefix="hearthlog-") as folder:
+            temporary = Path(folder) / path.name
+            yield temporary
+            with store_errors(path):
+                _put(temporary, path, new=new)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def _put(file: Path, path: Any, *, new: bool) -> None:
+    if new:
+        check_new(path)  # again: not every store minds `create`
+    try:
+        path.fs.put_file(str(file), path.path, mode="create" if new else "overwrite")
+    except FileExistsError as error:
+        raise _exists(path) from error
