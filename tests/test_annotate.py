@@ -19,7 +19,7 @@ from logreader import LogReader
 from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import ROUNDING, find_heard
+from hearthlog.analyzer.logs.coverage import ROUNDING, find_coverage
 from hearthlog.analyzer.marks.formats import SUFFIXES
 from hearthlog.analyzer.marks.marks import (
     LATEST,
@@ -60,7 +60,7 @@ def log(logs):
 @pytest.fixture
 def zero(log):
     """Time of the first frame."""
-    return find_heard(log)["mic"].starts[0]
+    return find_coverage(log)["mic"].starts[0]
 
 
 def mark(zero, start, end, label="coughing"):
@@ -153,7 +153,7 @@ def test_what_a_file_cannot_say_of_a_mark_is_not_lost_and_what_it_changes_is_tak
 
 
 def test_a_label_that_crosses_into_the_next_log_is_split_there(logs, hearthlog, tmp_path):
-    heard = find_heard(logs)["mic"]
+    heard = find_coverage(logs)["mic"]
     border = (heard.starts[1] - heard.starts[0]) / SECOND
     labels = tmp_path / "labels.csv"
     labels.write_text(f"start,end,label\n{border - 2:.3f},{border + 3:.3f},speech\n")
@@ -317,7 +317,7 @@ def test_logs_of_a_clock_that_drifts_have_one_border(hearthlog, tmp_path, begins
     labels = tmp_path / "labels.txt"
     labels.write_text("1.0\t5.0\tspeech\n5.0\t5.5\tcoughing\n")
     assert hearthlog("annotate", "import", tmp_path / "logs", labels).returncode == 0
-    heard = find_heard(tmp_path / "logs")["mic"]
+    heard = find_coverage(tmp_path / "logs")["mic"]
     assert heard.starts[1] - heard.starts[0] == round((3 + begins_late) * SECOND)
     (before,), (after, _) = (read_marks(log) for log in heard.logs)
     assert before.end == after.start == heard.starts[1]
@@ -325,7 +325,7 @@ def test_logs_of_a_clock_that_drifts_have_one_border(hearthlog, tmp_path, begins
 
 
 def test_where_nothing_was_recorded_nothing_can_be_marked(logs, hearthlog, tmp_path):
-    heard = find_heard(logs)["mic"]
+    heard = find_coverage(logs)["mic"]
     assert len(heard.logs) > 2
     heard.logs[1].unlink()
     labels = tmp_path / "labels.txt"
@@ -355,7 +355,7 @@ def test_wrong_use_is_told_from_what_failed(logs, log, hearthlog, tmp_path):
     (tmp_path / "a.txt").write_text("1\t2\tspeech\n")
     result = hearthlog("annotate", "import", missing, tmp_path / "a.txt")
     assert (result.returncode, result.stderr) == (1, f"hearthlog: {missing}: no such log\n")
-    write_marks(log, [mark(find_heard(log)["mic"].starts[0], 1, 2)])
+    write_marks(log, [mark(find_coverage(log)["mic"].starts[0], 1, 2)])
     result = hearthlog("annotate", "import", review_path(log), tmp_path / "a.txt")
     assert "no features of a microphone; name a log" in result.stderr
     result = hearthlog("annotate", "export", logs, "-o", tmp_path / "b.txt", "--microphone", "x")

@@ -19,7 +19,7 @@ from logreader import LogReader
 from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import in_order, json_lines, quoted, text_lines
-from hearthlog.analyzer.logs.pieces import pieces
+from hearthlog.analyzer.logs.typed_columns import decode_all
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
@@ -131,7 +131,9 @@ def long(tmp_path_factory):
 
 
 def lines_of(path, lines):
-    return [line for batch in iterate_messages([path]) for line in in_order(pieces(batch), lines)]
+    return [
+        line for batch in iterate_messages([path]) for line in in_order(decode_all(batch), lines)
+    ]
 
 
 def plain(value):

@@ -17,7 +17,7 @@ from stores import put
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_sides
 from hearthlog.analyzer.evaluation.event_scores import Events
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import Side, find_sources
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
@@ -70,7 +70,9 @@ def write_layer(log, other, name, kinds=("label", "segment"), change=lambda _: {
     base = f"/mic/relabel/{name}"
     types = {"label": message_types.LABEL, "segment": message_types.SEGMENT}
     named = {
-        kind: {"probabilities": names_of(own.metadata, "probabilities")} if kind == "label" else {}
+        kind: {"probabilities": array_names(own.metadata, "probabilities")}
+        if kind == "label"
+        else {}
         for kind, own in columns.items()
     }
     topics = [Topic(f"{base}/{kind}", types[kind], array_names=named[kind]) for kind in kinds]
@@ -317,7 +319,7 @@ def doubtful(start, end, own, *, uncertain):
             unknown = np.full_like(columns["probabilities"], np.nan)
             return {"probabilities": unknown, "novelty": here.astype(np.float32)}
         sure = np.zeros_like(columns["probabilities"])
-        names = names_of(columns.metadata, "probabilities")
+        names = array_names(columns.metadata, "probabilities")
         for first, last, label in own:
             place = (names.index(label) + (first == start)) % len(names)
             sure[(stamps >= first) & (stamps < last), place] = 1.0

@@ -13,7 +13,7 @@ from conftest import HEARTHLOG
 from spliced import run
 from stores import put
 
-from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_data import home_recordings
@@ -65,7 +65,7 @@ def features_of(path, seconds):
 def check_marked(log, label, seconds):
     """All of the log has one mark."""
     (mark,) = read_marks(log)
-    heard = find_heard(log)["mic"]
+    heard = find_coverage(log)["mic"]
     assert (mark.label, mark.start, mark.end) == (label, heard.starts[0], heard.ends[0])
     assert mark.end - mark.start == pytest.approx(seconds * NANOSECONDS, abs=1e6)
 
@@ -113,7 +113,7 @@ def test_many_files_in_a_moment_become_logs_that_do_not_overlap(hearthlog, cough
 
 
 def test_a_span_of_logs_is_enrolled_as_it_was_recorded(hearthlog, recorded, home):
-    heard = find_heard(recorded)["mic"]
+    heard = find_coverage(recorded)["mic"]
     border = heard.starts[1]
     start, end = (np.datetime64(border + n * 10**9, "ns") for n in (-2, 3))
     command = ("enrol", "speech", "--home", home, "--log", recorded, "--start", start, "--end", end)
@@ -144,18 +144,18 @@ def test_enrolled_sounds_are_no_time_of_the_home(hearthlog, logs, cough):
         ("cat", logs, "--format", "ndjson", "--topics", "/mic/info"),
         ("evaluate", logs, "--reference", "review"),
     )
-    first = find_heard(logs)["mic"].starts[0]
+    first = find_coverage(logs)["mic"].starts[0]
     write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])
-    before = find_heard(logs), [hearthlog(*verb) for verb in verbs]
+    before = find_coverage(logs), [hearthlog(*verb) for verb in verbs]
     at = ("--start", "2026-03-01T06:59:40", "--end", "2026-03-01T06:59:42")
     assert hearthlog("enrol", "silence", "--home", logs, "--log", logs, *at).returncode == 0
     assert hearthlog("enrol", "coughing", "--home", logs, "--file", cough).returncode == 0
     assert len(enrolled(logs)) == 2
-    assert (find_heard(logs), [hearthlog(*verb) for verb in verbs]) == before
+    assert (find_coverage(logs), [hearthlog(*verb) for verb in verbs]) == before
 
 
 def test_a_home_is_learned_from_with_its_enrolled_sounds(logs, cough):
-    first = find_heard(logs)["mic"].starts[0]
+    first = find_coverage(logs)["mic"].starts[0]
     write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])
     enrol_file(logs, "coughing", cough)
     assert {recording.label for recording in home_recordings(logs)} == {"speech", "coughing"}

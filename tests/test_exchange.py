@@ -15,7 +15,7 @@ from pyannote.database.util import load_rttm
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import ROUNDING, Heard, find_heard
+from hearthlog.analyzer.logs.coverage import ROUNDING, Coverage, find_coverage
 from hearthlog.analyzer.marks.formats import SUFFIXES, new_marks, read_labels, write_labels
 from hearthlog.analyzer.marks.formats.labels import seconds_text
 from hearthlog.analyzer.marks.marks import LATEST, Mark, read_marks
@@ -53,7 +53,7 @@ def heard_in(log, microphones=MICROPHONES):
     """Microphones of which the second began to listen a little later."""
     starts = [START + i * 1_234_567 for i in range(len(microphones))]
     return {
-        name: Heard([log], [first], [START + HOUR])
+        name: Coverage([log], [first], [START + HOUR])
         for name, first in zip(microphones, starts, strict=True)
     }
 
@@ -121,7 +121,7 @@ def test_elan_rounds_marks_and_none_vanishes_overlaps_or_moves_an_older_one(
 
 @pytest.mark.parametrize("suffix", EXACT)
 def test_after_most_of_a_year_no_nanosecond_is_lost(tmp_path, suffix):
-    heard = {"hall": Heard([tmp_path], [START], [START + 24 * 365 * HOUR])}
+    heard = {"hall": Coverage([tmp_path], [START], [START + 24 * 365 * HOUR])}
     begin = START + 24 * 300 * HOUR + 123_456_789
     mark = Mark("hall", begin, begin + 987_654_321, "cry")
     assert there_and_back(tmp_path / f"labels{suffix}", [mark], heard) == [mark]
@@ -138,7 +138,7 @@ def test_many_marks_within_a_millisecond_stay_apart_in_elan(tmp_path):
 def test_a_file_that_says_when_it_begins_fits_when_older_logs_are_gone(tmp_path, suffix):
     path = tmp_path / f"labels{suffix}"
     earlier = {
-        name: Heard([tmp_path, tmp_path], [START - HOUR, one.starts[0]], [START, one.ends[0]])
+        name: Coverage([tmp_path, tmp_path], [START - HOUR, one.starts[0]], [START, one.ends[0]])
         for name, one in heard_in(tmp_path).items()
     }
     write_labels(path, SOME, earlier)
@@ -539,7 +539,7 @@ def test_labels_of_windows_and_of_spectral_selections_are_read(logs, hearthlog, 
     labels.write_bytes(b"\xef\xbb\xbf1.5\t2.5\tspeech\r\n\\\t100.0\t4000.0\r\n")
     assert hearthlog("annotate", "import", logs, labels).returncode == 0
     log = find_logs(logs)[0]
-    zero = find_heard(log)["mic"].starts[0]
+    zero = find_coverage(log)["mic"].starts[0]
     span = zero + SECOND * 3 // 2, zero + SECOND * 5 // 2
     assert [mark[:4] for mark in read_marks(log)] == [("mic", *span, "speech")]
 
@@ -663,7 +663,7 @@ def test_whatever_is_in_a_label_file_it_is_read_or_refused_in_one_line(
     path.write_bytes(b"".join(parts))
     refused = ""
     try:
-        read_labels(path, {"mic": Heard([path], [SECOND], [9 * SECOND])})
+        read_labels(path, {"mic": Coverage([path], [SECOND], [9 * SECOND])})
     except DataError as error:
         refused = str(error)
     assert "\n" not in refused

@@ -13,7 +13,7 @@ from mcap.records import Metadata
 from rewriting import Log
 from spliced import run
 
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.models.classifiers.description import Collection
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
@@ -120,7 +120,7 @@ def test_the_card_of_a_model_does_not_steer_the_terminal(hearthlog, model_file, 
 
 @pytest.mark.parametrize("name", ['"\\ud800"', '"\\u001b"', '"\\u009b"', "1", "null"])
 def test_names_that_cannot_be_printed_are_none(name):
-    assert names_of({"values_names": f'["energy", {name}]'}, "values") == []
+    assert array_names({"values_names": f'["energy", {name}]'}, "values") == []
 
 
 @pytest.mark.parametrize("names", ["\ud800", "\x1b", DEEP, "{}", ""])

@@ -24,7 +24,7 @@ from spliced import run
 from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labellings import find_sources
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
@@ -183,7 +183,7 @@ def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
 
 def test_what_was_not_recorded_cannot_be_marked_and_nothing_changes(home):
     whole = marking_of(home)
-    hole = Heard(*(list(column[:1]) + list(column[2:]) for column in vars(whole.heard).values()))
+    hole = Coverage(*(list(column[:1]) + list(column[2:]) for column in vars(whole.heard).values()))
     marking = Marking("mic", hole, "Ann", "live", whole.labelled)
     for start, end in (
         (hole.ends[0] - SECOND, hole.starts[1] + SECOND),

@@ -17,7 +17,7 @@ from hearthlog.analyzer.evaluation.event_scores import (
     merged,
     total,
 )
-from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import REVIEW, Labelling
 from hearthlog.analyzer.marks.formats import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
@@ -195,7 +195,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
         marks = [mark for log in find_logs(path) for mark in read_marks(log)]
         where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
     else:
-        found = read_lines(Path(source), find_heard(path), microphone)
+        found = read_lines(Path(source), find_coverage(path), microphone)
         marks = [mark for _, mark in found]
         where = f"{source}: has no label of {microphone}"
     marks = [mark for mark in marks if mark.microphone == microphone]

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.pieces import Piece
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
@@ -52,7 +52,7 @@ def type_of(field: Field) -> pa.DataType:
     return pa.list_(element, field.size or -1)
 
 
-def batch_of(piece: Piece, schema: pa.Schema) -> pa.RecordBatch:
+def batch_of(piece: TypedColumns, schema: pa.Schema) -> pa.RecordBatch:
     """Turn messages into a record batch.
 
     Raises

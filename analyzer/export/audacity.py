@@ -2,8 +2,8 @@
 
 from typing import BinaryIO
 
-from hearthlog.analyzer.logs.pieces import Piece
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.messages.topics import topic as topic_of
 from hearthlog.schemas.text import printable
@@ -23,7 +23,7 @@ class LabelTrack:
         self._stream = stream
         self._zero = _first_frame(topic, selection)
 
-    def write(self, piece: Piece) -> None:
+    def write(self, piece: TypedColumns) -> None:
         """Append segments; raise LogError if the messages are none."""
         columns = piece.columns
         starts = columns["header.stamp"]

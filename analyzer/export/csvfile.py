@@ -11,9 +11,9 @@ from pyarrow import csv
 
 from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
 from hearthlog.analyzer.export.text import json_texts
-from hearthlog.analyzer.logs.channel_names import names_of
-from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.fields import DURATION, Field
 from hearthlog.schemas.times import NANOSECONDS
@@ -37,7 +37,7 @@ class CsvFile:
         self._schema: pa.Schema | None = None
         self._writer: csv.CSVWriter | None = None
 
-    def write(self, piece: Piece) -> None:
+    def write(self, piece: TypedColumns) -> None:
         """Append messages.
 
         Raises
@@ -68,7 +68,7 @@ class CsvFile:
         if self._writer is not None:
             self._writer.close()
 
-    def _columns(self, piece: Piece) -> dict[str, pa.Array]:
+    def _columns(self, piece: TypedColumns) -> dict[str, pa.Array]:
         columns = piece.columns
         moment = pa.timestamp("ns", "UTC")
         found = {
@@ -89,15 +89,17 @@ class CsvFile:
                 found[name] = array_of(values, field)
         return found
 
-    def _spread(self, piece: Piece, path: str) -> dict[str, pa.Array]:
+    def _spread(self, piece: TypedColumns, path: str) -> dict[str, pa.Array]:
         """Make columns of the elements of an array, those that other logs name among them."""
         elements = _elements(piece.columns[path], piece.fields[path])
-        own = names_of(piece.columns.metadata, path)
+        own = array_names(piece.columns.metadata, path)
         if not own:
             return {f"{path}[{i}]": element for i, element in enumerate(elements)}
         if len(own) != len(elements):
             raise LogError(f"{piece.columns.topic}: {len(elements)} {path}, but {len(own)} names")
-        all_names = dict.fromkeys(name for each in self._metadata for name in names_of(each, path))
+        all_names = dict.fromkeys(
+            name for each in self._metadata for name in array_names(each, path)
+        )
         named = dict(zip(own, elements, strict=True))
         missing = pa.nulls(len(piece.columns), elements[0].type)
         return {f"{path}.{name}": named.get(name, missing) for name in all_names}

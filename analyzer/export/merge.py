@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
-from hearthlog.analyzer.logs.channel_names import unused
+from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
@@ -153,7 +153,7 @@ class _Log:
                     if isinstance(record, Metadata):
                         self._writer.add_metadata(record.name, record.metadata)
                     elif isinstance(record, Attachment):
-                        own = unused(record.name, names)
+                        own = unused_name(record.name, names)
                         times = record.create_time, record.log_time
                         self._writer.add_attachment(*times, own, record.media_type, record.data)
 

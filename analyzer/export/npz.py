@@ -8,8 +8,9 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.export.file_names import file_stem
 from hearthlog.analyzer.export.text import json_texts
-from hearthlog.analyzer.logs.channel_names import file_stem, names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -70,7 +71,7 @@ def _arrays(columns: Columns, fields: dict[str, Field]) -> dict[str, NDArray[Any
     arrays: dict[str, NDArray[Any]] = {}
     for path, values in columns.fields.items():
         arrays |= _column(path, values, fields[path])
-        names = names_of(columns.metadata, path)
+        names = array_names(columns.metadata, path)
         if names:
             arrays[f"{path}_names"] = np.array(names)
     return arrays | {

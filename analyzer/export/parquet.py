@@ -6,8 +6,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hearthlog.analyzer.export.arrow import batch_of, schema_of
-from hearthlog.analyzer.logs.pieces import Piece
 from hearthlog.analyzer.logs.selection import Selection
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 
 _ROW_GROUP = 32 << 20  # bytes
 
@@ -26,7 +26,7 @@ class ParquetFile:
         self._batches: list[pa.RecordBatch] = []
         self._size = 0
 
-    def write(self, piece: Piece) -> None:
+    def write(self, piece: TypedColumns) -> None:
         """Append messages."""
         if self._writer is None:
             schema = schema_of(self._topic, piece.fields, self._selection)

@@ -12,15 +12,14 @@ from typing import BinaryIO, Protocol
 from hearthlog.analyzer.export import audacity, wav
 from hearthlog.analyzer.export.audacity import LabelTrack
 from hearthlog.analyzer.export.csvfile import CsvFile
+from hearthlog.analyzer.export.file_names import file_stem, unused_name
 from hearthlog.analyzer.export.npz import save_npz
 from hearthlog.analyzer.export.parquet import ParquetFile
 from hearthlog.analyzer.export.rosbag1 import save_rosbag1
 from hearthlog.analyzer.export.rosbag2 import save_rosbag2
 from hearthlog.analyzer.export.wav import WavFiles
-from hearthlog.analyzer.logs.channel_names import file_stem, unused
-from hearthlog.analyzer.logs.pieces import Piece, pieces
 from hearthlog.analyzer.logs.selection import Selection
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -56,7 +55,7 @@ _TYPES = {
 class Sink(Protocol):
     """A file, or some, being written."""
 
-    def write(self, piece: Piece) -> None:
+    def write(self, piece: TypedColumns) -> None:
         """Append messages of the topic."""
 
     def finish(self) -> None:
@@ -84,7 +83,7 @@ def fitting(selection: Selection, form: ExportFormat) -> Selection:
     left = {
         topic
         for topic, same in selection.channels.items()
-        if any(is_of_type(*described, *wanted) for described in same)
+        if any(is_compatible(*described, *wanted) for described in same)
     }
     if selection.logs and not left:
         raise LogError(f"no topic of type {wanted[0]}; there are {', '.join(selection.channels)}")
@@ -130,7 +129,9 @@ def export(
     elif folder:
         names: set[str] = set()
         with new_folder(output) as made:
-            _save(selection, form, progress, lambda stem: made / unused(f"{stem}.{form}", names))
+            _save(
+                selection, form, progress, lambda stem: made / unused_name(f"{stem}.{form}", names)
+            )
     else:
         with new_file(output) as made:
             _save(selection, form, progress, lambda _: _once(made, output))
@@ -155,7 +156,7 @@ def _save(
     sinks: dict[str, Sink] = {}
     with ExitStack() as stack:
         for batch in selection.messages(progress):
-            for piece in pieces(batch):
+            for piece in decode_all(batch):
                 topic = piece.columns.topic
                 if topic not in sinks:
                     sinks[topic] = stack.enter_context(_sink(form, topic, selection, name))

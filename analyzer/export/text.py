@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 from hearthlog.schemas.times import NANOSECONDS
@@ -21,7 +21,9 @@ _NOT_FINITE = re.compile("-?inf|nan")
 _MINUS_ZERO = re.compile(r"(?<![\w])-0(?![.\d])")  # many readers take it for an integer
 
 
-def in_order(pieces: Iterable[Piece], lines: Callable[[Piece], list[str]]) -> list[str]:
+def in_order(
+    pieces: Iterable[TypedColumns], lines: Callable[[TypedColumns], list[str]]
+) -> list[str]:
     """Make a line of every message, in the order of their log times."""
     found: list[str] = []
     times: list[Int64] = []
@@ -32,7 +34,7 @@ def in_order(pieces: Iterable[Piece], lines: Callable[[Piece], list[str]]) -> li
     return [found[i] for i in order.tolist()]
 
 
-def json_lines(piece: Piece) -> list[str]:
+def json_lines(piece: TypedColumns) -> list[str]:
     """Make a JSON object of every message, in the form of `mcap cat --json`.
 
     Times are seconds with nine decimals, bytes are in base64, and what is not finite is null.
@@ -50,7 +52,7 @@ def json_lines(piece: Piece) -> list[str]:
     return [line % row for row in zip(*texts, strict=True)]
 
 
-def text_lines(piece: Piece) -> list[str]:
+def text_lines(piece: TypedColumns) -> list[str]:
     """Make a short line of every message: time, topic, fields."""
     columns = piece.columns
     fields = dict(columns.fields)

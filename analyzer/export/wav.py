@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.logs.pieces import Piece
+from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -47,7 +47,7 @@ class WavFiles:
         self._last: _Clip | None = None
         self._size = 0
 
-    def write(self, piece: Piece) -> None:
+    def write(self, piece: TypedColumns) -> None:
         """Append messages.
 
         Raises
@@ -80,7 +80,7 @@ class WavFiles:
         )
 
 
-def _clips(piece: Piece) -> Iterator[_Clip]:
+def _clips(piece: TypedColumns) -> Iterator[_Clip]:
     columns = piece.columns
     fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
     for start, data, form, rate, channels in zip(

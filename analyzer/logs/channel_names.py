@@ -1,35 +1,54 @@
-"""Names: of the elements of arrays, and of files."""
+"""The names that a channel gives to the elements of an array of its messages."""
 
 import json
-import re
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-_LENGTH = 100  # characters of a file name
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+
+_MOST_NAMES = 256
 
 
-def names_of(metadata: Mapping[str, str], path: str) -> list[str]:
+def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
     """Return the names that a channel has for the elements of an array; none if one is unfit."""
+    names = _names(metadata, field)
+    fit = all(name.isprintable() for name in names) and len(set(names)) == len(names)
+    return names if fit else []
+
+
+def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
+    """Return the names that a channel has for the elements of an array: one for each.
+
+    Parameters
+    ----------
+    path : Path
+        Of the log, for the message.
+    columns : Columns
+    field : str
+
+    Raises
+    ------
+    LogError
+        If there are no names, or too many, equal ones, or another number than elements.
+    """
+    where = f"{path}: {columns.topic}"
+    names = _names(columns.metadata, field)
+    if not names:
+        raise LogError(f"{where}: the channel does not name its values")
+    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
+        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
+    if columns[field].shape[1:] != (len(names),):
+        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
+    return tuple(names)
+
+
+def _names(metadata: Mapping[str, str], field: str) -> list[str]:
+    """Read a list of texts; none if it is anything else."""
     try:
-        names = json.loads(metadata.get(f"{path}_names", ""))
-    except (ValueError, RecursionError):
+        names: Any = json.loads(metadata.get(f"{field}_names", ""))
+        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
+    except (ValueError, TypeError, RecursionError):
         return []
-    fit = isinstance(names, list) and all(
-        isinstance(name, str) and name.isprintable() for name in names
-    )
-    return names if fit and len(set(names)) == len(names) else []
-
-
-def file_stem(topic: str) -> str:
-    """Make a part of a file name of a topic: `mic_features` of `/mic/features`."""
-    return re.sub(r"[^A-Za-z0-9]+", "_", topic).strip("_")[:_LENGTH] or "topic"
-
-
-def unused(name: str, names: set[str]) -> str:
-    """Return the name, or with `-2` and so on before its suffix if it is taken; it is taken now."""
-    stem, dot, suffix = name.rpartition(".")
-    before, behind = (stem, dot + suffix) if stem else (name, "")
-    own, number = name, 2
-    while own in names:
-        own, number = f"{before}-{number}{behind}", number + 1
-    names.add(own)
-    return own
+    return names if isinstance(names, list) else []

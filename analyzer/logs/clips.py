@@ -7,7 +7,7 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
@@ -132,7 +132,7 @@ def read_clips(
     """
     for batch in iterate_messages([path], [name], start, end):
         for raw in batch:
-            if not is_of_type(raw.channel, raw.schema, message_types.RAW_AUDIO, CLIP_FIELDS):
+            if not is_compatible(raw.channel, raw.schema, message_types.RAW_AUDIO, CLIP_FIELDS):
                 kind = "no messages of ROS 2" if raw.schema is None else raw.schema.name
                 raise LogError(f"{path}: {name}: holds {kind}, not clips")
         for columns in decode(batch, CLIP_FIELDS):

@@ -1,4 +1,4 @@
-"""When a microphone was heard, log by log."""
+"""Coverage: when a microphone was recording, log by log."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.mcap.logfile import time_span
@@ -22,15 +22,15 @@ _TAIL = 60 * NANOSECONDS
 
 
 @dataclass(frozen=True)
-class Heard:
-    """When a microphone was heard, by its frames.
+class Coverage:
+    """When a microphone was recording, by its frames.
 
     Attributes
     ----------
     logs : list of Path
         In the order of time.
     starts, ends : list of int
-        Of what was heard in each, in nanoseconds of UTC; they ascend, and do not overlap.
+        Of the frames of each, in nanoseconds of UTC; they ascend, and do not overlap.
     """
 
     logs: Sequence[Path]
@@ -45,24 +45,24 @@ class Heard:
         list of (Path, int, int)
             Empty if more of it than a frame is in none of them.
         """
-        found = []
+        parts: list[tuple[Path, int, int]] = []
         covered = start
         for i in range(bisect_right(self.ends, start), bisect_left(self.starts, end)):
-            piece = max(start, self.starts[i]), min(end, self.ends[i])
-            if piece[0] - covered > FRAME_NANOSECONDS:
+            part = max(start, self.starts[i]), min(end, self.ends[i])
+            if part[0] - covered > FRAME_NANOSECONDS:
                 return []
-            if piece == (start, end) or piece[1] - piece[0] > ROUNDING:
-                found.append((self.logs[i], *piece))
-            covered = piece[1]
-        return [] if end - covered > FRAME_NANOSECONDS else found
+            if part == (start, end) or part[1] - part[0] > ROUNDING:
+                parts.append((self.logs[i], *part))
+            covered = part[1]
+        return [] if end - covered > FRAME_NANOSECONDS else parts
 
 
-def find_heard(path: Path) -> dict[str, Heard]:
-    """Look when the microphones of a log, or of a folder of logs, were heard.
+def find_coverage(path: Path) -> dict[str, Coverage]:
+    """Find when the microphones of a log, or of a folder of logs, were recording.
 
     Returns
     -------
-    dict of str to Heard
+    dict of str to Coverage
         By microphone.
 
     Raises
@@ -73,28 +73,28 @@ def find_heard(path: Path) -> dict[str, Heard]:
         If there is no log, or one is damaged.
     """
     selection = select([path])
-    found: dict[str, Heard] = {}
-    for name, same in selection.channels.items():
+    coverage: dict[str, Coverage] = {}
+    for name, channels in selection.channels.items():
         microphone = name.removeprefix("/").removesuffix(f"/{_KIND}")
         if name == topic(microphone, _KIND) and all(
-            is_of_type(*described, message_types.FEATURES, _FIELDS) for described in same
+            is_compatible(*described, message_types.FEATURES, _FIELDS) for described in channels
         ):
             spans = sorted(_spans(selection.logs, name))
             if spans:
-                found[microphone] = heard_in(spans)
-    if not found:
+                coverage[microphone] = coverage_of(spans)
+    if not coverage:
         raise DataError(f"{path}: no features of a microphone; name a log, or a folder of logs")
-    return found
+    return coverage
 
 
-def heard_in(spans: Sequence[tuple[int, int, Path]]) -> Heard:
-    """Tell when a microphone was heard, by start, end and log, in the order of time."""
+def coverage_of(spans: Sequence[tuple[int, int, Path]]) -> Coverage:
+    """Make the coverage of spans (start, end, log) in the order of time."""
     starts = [start for start, _, _ in spans]
     ends = [end for _, end, _ in spans]
     for i, following in enumerate(starts[1:]):
         if following - ends[i] <= FRAME_NANOSECONDS:
             ends[i] = following
-    return Heard([log for _, _, log in spans], starts, ends)
+    return Coverage([log for _, _, log in spans], starts, ends)
 
 
 def _spans(logs: Sequence[Path], name: str) -> Iterator[tuple[int, int, Path]]:
@@ -111,7 +111,7 @@ def _spans(logs: Sequence[Path], name: str) -> Iterator[tuple[int, int, Path]]:
 
 
 def _stamps(log: Path, name: str, start: int | None = None) -> Iterator[int]:
-    """Yield the first and the last stamp of every piece of a log."""
+    """Yield the first and the last stamp of every batch of a log."""
     for batch in iterate_columns([log], {name}, start, fields=_FIELDS):
         for columns in batch:
             yield from columns["header.stamp"][[0, -1]].tolist()

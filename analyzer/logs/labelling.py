@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classes import translation
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
@@ -92,7 +92,7 @@ def read_labelled(path: Path, topic: str | None = None) -> Labelled:
         raise LogError(f"{path}: there is no segment on {topic}")
     labelling = labelling_of(columns)
     channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
-    named = [names_of(channel.metadata, "probabilities") for channel, _ in channels]
+    named = [array_names(channel.metadata, "probabilities") for channel, _ in channels]
     classes = all_classes(topic, named, labelling)
     return Labelled(topic, classes, labelling, tuple(selection.unfinished))
 
@@ -147,7 +147,7 @@ def _segment_topic(selection: Selection, wanted: str | None) -> str:
     known = sorted(
         topic
         for topic, channels in selection.channels.items()
-        if all(is_of_type(*described, message_types.SEGMENT, FIELDS) for described in channels)
+        if all(is_compatible(*described, message_types.SEGMENT, FIELDS) for described in channels)
     )
     recorded = [topic for topic in known if topic.count("/") == 2]
     if not known:

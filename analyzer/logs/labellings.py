@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import (
     FIELDS,
     Labelling,
@@ -18,7 +18,7 @@ from hearthlog.analyzer.logs.labelling import (
     with_layers,
 )
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
@@ -283,10 +283,12 @@ def _opened(path: Path) -> Log | LogError | None:
 def _log(path: Path, selection: Selection) -> Log:
     segments, classes = set(), {}
     for topic, same in selection.channels.items():
-        if all(is_of_type(*described, message_types.SEGMENT, FIELDS) for described in same):
+        if all(is_compatible(*described, message_types.SEGMENT, FIELDS) for described in same):
             segments.add(topic)
-        elif all(is_of_type(*described, message_types.LABEL, LABEL_FIELDS) for described in same):
-            names = [names_of(channel.metadata, "probabilities") for channel, _ in same]
+        elif all(
+            is_compatible(*described, message_types.LABEL, LABEL_FIELDS) for described in same
+        ):
+            names = [array_names(channel.metadata, "probabilities") for channel, _ in same]
             classes[topic] = [name for each in names for name in each]
     return Log(path, *selection.span, not selection.unfinished, frozenset(segments), classes)
 

@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS
-from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
@@ -173,7 +173,7 @@ def _microphones(file: LogFile, kind: str) -> set[str]:
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
         name = channel.topic.removeprefix("/").removesuffix("/" + kind)
-        if channel.topic == topic(name, kind) and is_of_type(channel, schema, *TYPES[kind]):
+        if channel.topic == topic(name, kind) and is_compatible(channel, schema, *TYPES[kind]):
             found.add(name)
     return found
 
@@ -185,7 +185,7 @@ def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict
         if file.channel_sets[number] and not file.channel_sets[number] & ids:
             continue
         found = read_chunks(file, file.chunks[i : i + 1], [name])
-        for columns in decode_known(file.path, found, {kind: fields}):
+        for columns in decode_types(file.path, found, {kind: fields}):
             return {field: values[0] for field, values in columns.fields.items()}
     return {}
 

@@ -11,7 +11,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -222,7 +222,7 @@ def _summarise(path: Path) -> Summary:
     with LogFile(path) as file:
         summary = _about(file)
         ours = any(
-            is_of_type(*channel, *wanted)
+            is_compatible(*channel, *wanted)
             for channel in _channels(file)
             for wanted in _FIELDS.items()
         )
@@ -298,7 +298,7 @@ def _read_through(file: LogFile, summary: Summary) -> None:
             times = raw.log_times
             topic = _topic(summary, raw.channel, raw.schema)
             topic.add(len(raw), int(raw.sizes.sum()), (int(times[0]), int(times[-1])))
-        for columns in decode_known(file.path, batch, _FIELDS):
+        for columns in decode_types(file.path, batch, _FIELDS):
             _note(summary, frames, columns)
     lengths = {stream["microphone"]: stream["frame_seconds"] for stream in summary.streams}
     for microphone, counts in frames.items():

@@ -1,9 +1,10 @@
-"""The messages of a log that are of types this version knows, as columns."""
+"""Messages as columns, of the types that a reader asks for or with what their fields are."""
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from mcap.records import Channel, Schema
 
@@ -12,11 +13,18 @@ from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.messages.cdr_layout import message_type
-from hearthlog.schemas.messages.fields import lacking
+from hearthlog.schemas.messages.fields import Field, fields_of, lacking
 
 
-def decode_known(
-    path: Path, batch: Iterable[RawMessages], wanted: Mapping[str, Collection[str]]
+class TypedColumns(NamedTuple):
+    """Messages of one topic, and their fields by path."""
+
+    columns: Columns
+    fields: Mapping[str, Field]
+
+
+def decode_types(
+    path: Path, batch: Iterable[RawMessages], types: Mapping[str, Collection[str]]
 ) -> list[Columns]:
     """Decode the messages of some types; all others are left out.
 
@@ -25,8 +33,8 @@ def decode_known(
     path : Path
         The log they are from.
     batch : iterable of RawMessages
-    wanted : mapping of str to collection of str
-        Paths of the fields that are wanted, by type; `is_of_type` says which they may be.
+    types : mapping of str to collection of str
+        Paths of the fields to decode, by type; `is_compatible` says which they may be.
 
     Raises
     ------
@@ -35,15 +43,39 @@ def decode_known(
     """
     decoded: list[Columns] = []
     try:
-        for kind, fields in wanted.items():
-            same = [raw for raw in batch if is_of_type(raw.channel, raw.schema, kind, fields)]
+        for type_, fields in types.items():
+            same = [raw for raw in batch if is_compatible(raw.channel, raw.schema, type_, fields)]
             decoded += decode(same, fields)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
     return decoded
 
 
-def is_of_type(channel: Channel, schema: Schema | None, kind: str, fields: Collection[str]) -> bool:
+def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
+    """Decode messages of any type, those of one topic and definition together.
+
+    Raises
+    ------
+    LogError
+        If they are not of the type that their channel says, or not encoded as CDR.
+    """
+    groups: dict[Any, list[RawMessages]] = {}
+    for raw in batch:
+        definition = None if raw.schema is None else (raw.schema.name, raw.schema.data)
+        groups.setdefault((raw.channel.topic, definition), []).append(raw)
+    decoded: list[TypedColumns] = []
+    for group in groups.values():
+        parts = decode(group)
+        schema = group[0].schema
+        assert schema is not None  # it was decoded
+        fields = fields_of(message_type(schema.name, schema.encoding, schema.data))
+        decoded += [TypedColumns(columns, fields) for columns in parts]
+    return decoded
+
+
+def is_compatible(
+    channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
+) -> bool:
     """Tell whether a channel has messages of a type, of which some fields can be read.
 
     Whatever version of a type of ours a log has, they can: there are defaults for those that were
@@ -53,23 +85,23 @@ def is_of_type(channel: Channel, schema: Schema | None, kind: str, fields: Colle
     ----------
     channel : Channel
     schema : Schema or None
-    kind : str
+    type_ : str
     fields : collection of str
         Paths of the fields that the reader needs.
     """
-    if schema is None or schema.name != kind or channel.message_encoding != ENCODING:
+    if schema is None or schema.name != type_ or channel.message_encoding != ENCODING:
         return False
-    missing = _lacking(kind, schema.encoding, schema.data, frozenset(fields))
+    missing = _lacking(type_, schema.encoding, schema.data, frozenset(fields))
     if missing:
-        text = f"{kind} is defined without {missing} as hearthlog has it: not read"
+        text = f"{type_} is defined without {missing} as hearthlog has it: not read"
         warnings.warn(HearthlogWarning(text, channel.topic), stacklevel=2)
     return not missing
 
 
 @lru_cache
-def _lacking(kind: str, encoding: str, text: bytes, fields: frozenset[str]) -> str:
+def _lacking(type_: str, encoding: str, text: bytes, fields: frozenset[str]) -> str:
     """Say which fields cannot be read; empty if all can."""
     try:
-        return ", ".join(lacking(message_type(kind, encoding, text), fields))
+        return ", ".join(lacking(message_type(type_, encoding, text), fields))
     except LogError:
         return "any field"

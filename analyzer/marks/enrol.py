@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
-from hearthlog.analyzer.logs.channel_names import names_of
-from hearthlog.analyzer.logs.coverage import find_heard
+from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import SILENCE, class_name
@@ -134,7 +134,7 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
         If there is no such log, if one is damaged, or if nothing can be written.
     """
     _check_label(label)
-    heard = find_heard(log)
+    heard = find_coverage(log)
     if len(heard) > 1:
         names = ", ".join(sorted(heard))
         raise DataError(
@@ -228,7 +228,7 @@ def _frames(
     found = read_columns(logs, {name}, start, end, {_STAMP, "values"}).get(name)
     if found is None:
         return np.empty(0, np.int64), np.empty(0)
-    names = names_of(found.metadata, "values")
+    names = array_names(found.metadata, "values")
     values = found["values"]
     if _ENERGY not in names or values.shape[1:] != (len(names),):
         raise DataError(f"{logs[0]}: {name} has no energy; it was not recorded by hearthlog")

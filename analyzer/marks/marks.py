@@ -16,7 +16,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
@@ -94,14 +94,14 @@ def read_marks(log: Path) -> list[Mark]:
     if not complete:
         raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
     for name, same in selection.channels.items():
-        kind = next((k for k in _KINDS if all(is_of_type(*d, k, _FIELDS[k]) for d in same)), "")
+        kind = next((k for k in _KINDS if all(is_compatible(*d, k, _FIELDS[k]) for d in same)), "")
         if not kind or not re.fullmatch(rf"/[^/]+/{_KINDS[kind]}", name):
             raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
     selection.verify()
     spans: list[Mark] = []
     said: dict[tuple[Any, ...], Mark] = {}
     for batch in selection.messages():
-        for columns in decode_known(path, batch, _FIELDS):
+        for columns in decode_types(path, batch, _FIELDS):
             if columns.type == message_types.SEGMENT:
                 spans += _marks(columns)
             else:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.recorder_info import Origin, features_of
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.recorder.events import Gap, Health
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
@@ -87,7 +87,7 @@ def read_recorded(
         found: _Found = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
-            if is_of_type(raw.channel, raw.schema, type_, _FIELDS[type_]):
+            if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
                 found[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
         try:

@@ -12,12 +12,12 @@ from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.logs.layers import RELABEL, REVIEW, Entry, Shelf
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, without
-from hearthlog.analyzer.logs.typed_columns import is_of_type
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.models.classes import class_name
 from hearthlog.models.classifiers.description import CLASS_NAME, class_metrics
@@ -213,7 +213,7 @@ def _read_late_gaps(heard: Heard, shelf: Shelf, end: int) -> None:
 
 def _topics_of(selection: Selection, kind: str, fields: Collection[str]) -> list[str]:
     channels = selection.channels.items()
-    return [t for t, same in channels if all(is_of_type(*d, kind, fields) for d in same)]
+    return [t for t, same in channels if all(is_compatible(*d, kind, fields) for d in same)]
 
 
 def _segments(
@@ -337,7 +337,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
         for node, microphone in heard.segments:
             topic = segment_topic(microphone, labelling).removesuffix("segment") + "label"
             for channel, _ in selection.channels.get(topic, ()) if node == entry.node else ():
-                said = names_of(channel.metadata, "probabilities")
+                said = array_names(channel.metadata, "probabilities")
                 names[node, microphone] |= dict.fromkeys(said)
     for source, segments in heard.segments.items():
         names[source] |= dict.fromkeys(sorted(set(segments.labels.tolist())))

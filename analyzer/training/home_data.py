@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.models.classes import translation
@@ -96,7 +96,7 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
 def _recordings(heard: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
     """Return what was heard during a mark; in pieces where there are gaps in it."""
     window, values = features.window_frames, heard["values"]
-    names = names_of(heard.metadata, "values")
+    names = array_names(heard.metadata, "values")
     if names and tuple(names) != features.feature_names:
         values = np.empty((len(values), 0), np.float32)
     stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)

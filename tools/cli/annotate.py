@@ -41,13 +41,13 @@ def import_labels(
 
     Where they overlap older marks, they win; what stands there already stays as it is.
     """
-    from hearthlog.analyzer.logs.coverage import find_heard
+    from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.marks.formats import new_marks, read_labels
     from hearthlog.analyzer.marks.marks import read_marks, write_marks
 
     _check_suffix(labels)
     name, now = reviewer_name(reviewer), time.time_ns()
-    by_log = read_labels(labels, find_heard(log), microphone)
+    by_log = read_labels(labels, find_coverage(log), microphone)
     taken: list[Mark] = []
     for path, marks in sorted(by_log.items()):
         new = [
@@ -72,14 +72,14 @@ def export_labels(
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.coverage import find_heard
+    from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.marks.formats import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
     from hearthlog.schemas.storage.new_files import check_new
 
     _check_suffix(output)
     check_new(output)
-    heard = find_heard(log)
+    heard = find_coverage(log)
     if microphone is not None and microphone not in heard:
         raise DataError(f"{log}: no microphone {microphone!r}; there is {', '.join(sorted(heard))}")
     marks = {

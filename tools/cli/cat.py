@@ -50,20 +50,20 @@ def cat(
 
 def _print_lines(selection: "Selection", output_format: Format) -> None:
     from hearthlog.analyzer.export.text import in_order, json_lines, text_lines
-    from hearthlog.analyzer.logs.pieces import pieces
+    from hearthlog.analyzer.logs.typed_columns import decode_all
 
     lines = json_lines if output_format is Format.ndjson else text_lines
     for batch in selection.messages():
-        sys.stdout.write("\n".join([*in_order(pieces(batch), lines), ""]))
+        sys.stdout.write("\n".join([*in_order(decode_all(batch), lines), ""]))
 
 
 def _print_table(selection: "Selection") -> None:
     from hearthlog.analyzer.export.csvfile import CsvFile
-    from hearthlog.analyzer.logs.pieces import pieces
+    from hearthlog.analyzer.logs.typed_columns import decode_all
 
     for topic in selection.channels:
         table = CsvFile(sys.stdout.buffer, topic, selection)
         for batch in selection.messages():
-            for piece in pieces(batch):
+            for piece in decode_all(batch):
                 table.write(piece)
         table.finish()

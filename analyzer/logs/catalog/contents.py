@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.typed_columns import decode_known, is_of_type
+from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.provenance import read_provenance
@@ -130,7 +130,9 @@ class _Reading:
         return {
             number
             for number, channel in self._file.channels.items()
-            if any(is_of_type(channel, schemas.get(channel.schema_id), *k) for k in kinds.items())
+            if any(
+                is_compatible(channel, schemas.get(channel.schema_id), *k) for k in kinds.items()
+            )
         }
 
     def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
@@ -145,7 +147,7 @@ class _Reading:
         if self._file.statistics is not None:
             topics = {self._file.channels[i].topic for i in self.channels_of(wanted)}
         for batch in read_in_batches(self._file, chunks, topics, check=True):
-            for columns in decode_known(self._file.path, batch, wanted):
+            for columns in decode_types(self._file.path, batch, wanted):
                 self._note(columns)
 
     def _note(self, columns: Columns) -> None:

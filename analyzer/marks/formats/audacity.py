@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
@@ -20,7 +20,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, *fields)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:
     """Write a track, which has no place for microphones and reviewers."""
     microphones = sorted({mark.microphone for mark in marks})
     if len(microphones) > 1:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.text_files import csv_records
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
 from hearthlog.analyzer.marks.marks import Mark
@@ -32,7 +32,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, *(row.get(name, "") for name in _COLUMNS))
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a table with all that marks say; its times are of UTC."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")

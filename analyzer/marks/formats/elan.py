@@ -17,7 +17,7 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.sax import parseString
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import time_text
@@ -150,7 +150,7 @@ def _seconds(path: Path, found: _Annotation, milliseconds: str | None) -> str:
     return seconds_text(int(milliseconds) * _MILLISECOND)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a document whose times begin with the first frame of all its microphones."""
     marks = [mark._replace(reviewer=mark.reviewer.translate(_NO_XML)) for mark in marks]
     zero = min(heard[mark.microphone].starts[0] for mark in marks)

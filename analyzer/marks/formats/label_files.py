@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.text_files import read_text
 from hearthlog.analyzer.marks.formats import audacity, csvfile, elan, labelstudio, raven, rttm
 from hearthlog.analyzer.marks.formats.labels import (
@@ -25,7 +25,7 @@ _OBEYED = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # by terminals; names have
 
 class _Form(NamedTuple):
     read: Callable[[Path, str], Iterator[FileLabel]]
-    write: Callable[[Path, Sequence[Mark], Mapping[str, Heard]], str]
+    write: Callable[[Path, Sequence[Mark], Mapping[str, Coverage]], str]
     size_limit: int = _SIZE_LIMIT
 
 
@@ -42,7 +42,7 @@ SUFFIXES = tuple(_FORMS)
 
 
 def read_labels(
-    path: Path, heard: Mapping[str, Heard], microphone: str | None = None
+    path: Path, heard: Mapping[str, Coverage], microphone: str | None = None
 ) -> dict[Path, list[Mark]]:
     """Read a label file.
 
@@ -51,7 +51,7 @@ def read_labels(
     path : Path
         `*.txt` (a label track of Audacity, or a selection table of Raven), `*.csv`, `*.eaf`
         (ELAN), `*.json` (Label Studio) or `*.rttm`.
-    heard : mapping of str to Heard
+    heard : mapping of str to Coverage
         By microphone: the logs, and when it was heard.
     microphone : str, optional
         Of the labels that do not name theirs; not needed if there is only one.
@@ -83,7 +83,7 @@ def read_labels(
 
 
 def read_lines(
-    path: Path, heard: Mapping[str, Heard], microphone: str | None = None
+    path: Path, heard: Mapping[str, Coverage], microphone: str | None = None
 ) -> list[PlacedMark]:
     """Read a label file whose labels may overlap, and may lie where nothing was heard.
 
@@ -104,7 +104,7 @@ def read_lines(
     return found
 
 
-def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> None:
+def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> None:
     """Write marks as a label file that `read_labels` reads again.
 
     Parameters
@@ -113,7 +113,7 @@ def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) 
         Named as for `read_labels`; `*.selections.txt` is a table of Raven. Must not exist.
     marks : sequence of Mark
         For a label track of Audacity those of one microphone.
-    heard : mapping of str to Heard
+    heard : mapping of str to Coverage
 
     Raises
     ------

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
@@ -57,7 +57,7 @@ def place_text(path: Path, place: int | str) -> str:
 
 
 def make_mark(
-    path: Path, label: FileLabel, heard: Mapping[str, Heard], microphone: str | None
+    path: Path, label: FileLabel, heard: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
     """Make a mark of a label.
 
@@ -124,7 +124,7 @@ def made_text(mark: Mark) -> str:
     return time_text(mark.made) if mark.made else ""
 
 
-def _zero(where: str, label: FileLabel, heard: Heard) -> int:
+def _zero(where: str, label: FileLabel, heard: Coverage) -> int:
     """Return the time that seconds are counted from."""
     if label.zero:
         return _time(where, label.zero, 0)

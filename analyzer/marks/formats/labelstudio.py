@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import time_text
@@ -29,14 +29,14 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield from _of_task(path, place, task)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a task for each microphone."""
     microphones = sorted({mark.microphone for mark in marks})
     tasks = [_task(name, [m for m in marks if m.microphone == name], heard) for name in microphones]
     return "[\n" + ",\n".join(tasks) + "\n]\n"
 
 
-def _task(microphone: str, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:
+def _task(microphone: str, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:
     zero = heard[microphone].starts[0]
     length = seconds_text(heard[microphone].ends[-1] - zero)
     data = {"audio": f"{microphone}.wav", "microphone": microphone, "start": time_text(zero)}

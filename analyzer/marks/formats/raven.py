@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
@@ -58,7 +58,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
             yield FileLabel(number, *fields)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a table; what Raven has no column for is in columns of our own, which it keeps."""
     channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
     lines = ["\t".join(_COLUMNS)]

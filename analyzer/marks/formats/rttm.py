@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, read_seconds, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
@@ -28,7 +28,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, onset, f"{end:f}", label, microphone)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Heard]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a line for each mark."""
     lines = []
     for mark in marks:

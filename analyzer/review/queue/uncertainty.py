@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.channel_names import names_of
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
@@ -37,7 +37,7 @@ class ModelUncertainty:
         inside = (window >= 0) & (stamps < self._windows.ends[window])
         window = window[inside]
         self.novelty.add(window, frames["novelty"][inside].astype(np.float64))
-        names = names_of(frames.metadata, "probabilities")
+        names = array_names(frames.metadata, "probabilities")
         if probabilities.ndim == 2 and probabilities.shape[1] == len(names) > 1:
             place = {name: i for i, name in enumerate(names)}
             columns = np.array([place.get(name, -1) for name in self._classes])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 
@@ -29,7 +29,7 @@ class Marking:
     Parameters
     ----------
     microphone : str
-    heard : Heard
+    heard : Coverage
         Which log has what.
     reviewer : str
     corrects : str
@@ -39,7 +39,7 @@ class Marking:
     """
 
     microphone: str
-    heard: Heard
+    heard: Coverage
     reviewer: str
     corrects: str
     labelled: LabelledSpans

@@ -1,15 +1,12 @@
 """What a timeline takes of logs: topics, fields, and what is made of them."""
 
-import json
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans, SoundClip, no_spans
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
@@ -27,25 +24,7 @@ FIELDS = {
     message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
     message_types.LOG: ("stamp", "level", "msg"),
 }
-_MOST_NAMES = 256
 _QUIETEST = 1e-10  # of a mean square: -100 dB
-
-
-def value_names(path: Path, columns: Columns, field_: str) -> tuple[str, ...]:
-    """Return the names behind an array, by the channel."""
-    where = f"{path}: {columns.topic}"
-    try:
-        names: Any = json.loads(columns.metadata.get(f"{field_}_names", ""))
-        "".join(names).encode()  # or JSON has other things than texts, or halves of characters
-    except (ValueError, TypeError, RecursionError):
-        names = None
-    if not isinstance(names, list) or not names:
-        raise LogError(f"{where}: the channel does not name its values")
-    if len(names) > _MOST_NAMES or len(set(names)) < len(names):
-        raise LogError(f"{where}: {len(names)} names, more than {_MOST_NAMES} or not all different")
-    if columns[field_].shape[1:] != (len(names),):
-        raise LogError(f"{where}: some messages do not have a value for each of {len(names)} names")
-    return tuple(names)
 
 
 def decibel(energy: Any) -> Any:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.typed_columns import decode_known
-from hearthlog.analyzer.review.timeline.decode import FIELDS, TOPIC, decibel, spans_of, value_names
+from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.typed_columns import decode_types
+from hearthlog.analyzer.review.timeline.decode import FIELDS, TOPIC, decibel, spans_of
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.lanes import Changes, changes, clock
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
@@ -118,7 +119,7 @@ class Live:
         LogError
             If its messages are not what they say.
         """
-        for columns in decode_known(path, batch, FIELDS):
+        for columns in decode_types(path, batch, FIELDS):
             if len(columns):
                 yield from self._take(path, columns)
 
@@ -148,7 +149,7 @@ class Live:
         self._newest = max(first, newest)
 
     def _features(self, path: Path, microphone: str, columns: Columns) -> Iterator[Means]:
-        names = value_names(path, columns, "values")
+        names = checked_array_names(path, columns, "values")
         _, times, values = self._by_second(
             (microphone, "features", *names), columns["header.stamp"], columns["values"]
         )
@@ -160,7 +161,7 @@ class Live:
         yield Means(microphone, "features", names, times[heard], scale(values[heard]))
 
     def _labels(self, path: Path, microphone: str, columns: Columns) -> Iterator[News]:
-        names = value_names(path, columns, "probabilities")
+        names = checked_array_names(path, columns, "probabilities")
         values = np.column_stack([columns["probabilities"], columns["novelty"]])
         starts, times, means = self._by_second(
             (microphone, "label", *names), columns["header.stamp"], values

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.coverage import Heard
+from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 
@@ -153,7 +153,7 @@ class Timeline:
     lines : LogLines
     zone : str
         IANA name of the home's time zone.
-    heard : dict of str to Heard
+    heard : dict of str to Coverage
         Which log has what of each microphone.
     every : int
         One of so many parts of the logs was read.
@@ -165,7 +165,7 @@ class Timeline:
     microphones: dict[str, MicrophoneTimeline]
     lines: LogLines
     zone: str
-    heard: dict[str, Heard]
+    heard: dict[str, Coverage]
     every: int = 1
     losses: list[str] = field(default_factory=list)
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.clips import read_clips
-from hearthlog.analyzer.logs.coverage import heard_in
+from hearthlog.analyzer.logs.coverage import coverage_of
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.timeline_files import File, find_files, records_of
-from hearthlog.analyzer.logs.typed_columns import decode_known
+from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.timeline.decode import (
     FIELDS,
@@ -24,7 +25,6 @@ from hearthlog.analyzer.review.timeline.decode import (
     lasting,
     runs,
     spans_of,
-    value_names,
 )
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.model import (
@@ -106,7 +106,7 @@ def read_timeline(
     known = home_zone(zone, records_of(file.path for file in found))
     microphones = reader.microphones()
     heard = {
-        name: heard_in(
+        name: coverage_of(
             [
                 (file.first, file.last + FRAME_NANOSECONDS, file.path)
                 for file in found
@@ -195,7 +195,7 @@ class _Reader:
 
     def _read_messages(self, file: File, kinds: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
-            decoded = partial(decode_known, file.path, wanted=kinds)
+            decoded = partial(decode_types, file.path, types=kinds)
             span = (self._grid.start, end)
             for batch in iterate_pieces([file.path], topics, *span, decoded, every=every):
                 for columns in batch:
@@ -257,7 +257,7 @@ class _Reader:
         columns = self._within(columns)
         if not len(columns):
             return
-        names = value_names(path, columns, "values")
+        names = checked_array_names(path, columns, "values")
         times, values = columns["header.stamp"], columns["values"]
         heard.features.add(names, times, values)
         if self.every == 1 and _ENERGY in names:
@@ -268,7 +268,7 @@ class _Reader:
         columns = self._within(columns)
         if not len(columns):
             return
-        names = value_names(path, columns, "probabilities")
+        names = checked_array_names(path, columns, "probabilities")
         times, values = columns["header.stamp"], columns["probabilities"]
         growing = heard.labels.setdefault(name, _Growing(self._grid, keep=self.every == 1))
         growing.add(names, times, values)
