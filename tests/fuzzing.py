@@ -108,8 +108,8 @@ def recovered(path: Path, folder: Path) -> None:
     from logreader import LogReader  # noqa: PLC0415
 
     from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
-    from hearthlog.recorder.recovery import recover_log  # noqa: PLC0415
     from hearthlog.schemas.errors import HearthlogError  # noqa: PLC0415
+    from hearthlog.schemas.salvage.recover import recover_log  # noqa: PLC0415
 
     copy = folder / "recovered.mcap"
     recover_log(path, copy, copy.name)

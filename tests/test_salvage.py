@@ -25,11 +25,11 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.recovery import NothingWholeError, recover_log
 from hearthlog.recorder.service import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.salvage.recover import NothingWholeError, recover_log
 
 HEADER, MESSAGE, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END = 1, 5, 6, 7, 9, 12, 15
 MAGIC = b"\x89MCAP0\r\n"

@@ -13,8 +13,8 @@ from hearthlog.analyzer.relabel.stream import Stream
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.recorder.events import Gap
-from hearthlog.recorder.recovery import recover_log
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.salvage.recover import recover_log
 from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.times import NANOSECONDS
 

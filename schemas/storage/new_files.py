@@ -11,6 +11,12 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 
 
+def sync_file(path: Path) -> None:
+    """Make what was written to a file survive a power cut."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+
+
 def sync_folder(folder: Path) -> None:
     """Make a file's creation or renaming in this folder survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -86,8 +92,7 @@ def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
     try:
         yield temporary
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
+        sync_file(temporary)
         if new:
             _name(temporary, path)
         else:

@@ -9,7 +9,7 @@ import typer
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.recorder.recovery import Recovery
+    from hearthlog.schemas.salvage.salvaged_copy import Recovery
 
 
 def recover(
@@ -60,8 +60,8 @@ def recover(
 
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
-    from hearthlog.recorder.recovery import recover_in_place, recover_log
     from hearthlog.schemas.logs.files import SUFFIX, stem
+    from hearthlog.schemas.salvage.recover import recover_in_place, recover_log
     from hearthlog.schemas.storage.new_files import new_file
     from hearthlog.tools.cli.progress import share_done
 

@@ -1,0 +1,141 @@
+"""Make a valid log of what is whole in one that was cut or damaged."""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import SUFFIX, stem
+from hearthlog.schemas.mcap.chunks import read_in_batches
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.salvage.salvage import Definition, Salvage
+from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, Topic
+from hearthlog.schemas.storage.new_files import check_new, sync_file, sync_folder
+from hearthlog.schemas.storage.regular_file import open_regular
+
+
+class NothingWholeError(LogError):
+    """Of a log nothing is left."""
+
+
+def recover_log(
+    source: Path, copy: Path, name: str, progress: Progress = ignore_progress
+) -> Recovery:
+    """Copy what is whole in a log to a new one, read that again and count it.
+
+    Parameters
+    ----------
+    source, copy : Path
+    name : str
+        Name that the copy will have in the end.
+    progress : callable, optional
+        Is given the share that is done, 0 to 1.
+
+    Raises
+    ------
+    NothingWholeError
+        If the source is no MCAP file, or nothing in it is whole.
+    LogError
+        If it cannot be read, or the copy does not hold what was written to it.
+    OSError
+        If the copy cannot be written.
+    """
+    known: list[Definition] = []
+    profile = ""
+    while True:
+        with Salvage(source, known) as salvage, copy.open("wb") as stream:
+            attempt = SalvagedCopy(stream, salvage, profile)
+            attempt.write(name, progress)
+        if not attempt.could_be_better():
+            break
+        known = [*salvage.definitions.schemas.values(), *salvage.definitions.channels.values()]
+        profile = attempt.profile()
+    if not attempt.pieces:
+        if not salvage.is_mcap:
+            raise NothingWholeError(f"{source}: is no MCAP file, and holds no whole piece of one")
+        raise NothingWholeError(f"{source}: holds nothing that could be saved")
+    recovery = attempt.recovery()
+    check_copy(copy, recovery.topics)
+    return recovery
+
+
+def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
+    """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
+
+    Returns
+    -------
+    path : Path
+        Its name: that of the damaged one, without `.active`.
+    recovery : Recovery
+
+    Raises
+    ------
+    LogError
+        As `recover_log`, or if the log is being written, or there is a file of a name needed here.
+    """
+    path = log.with_name(stem(log) + SUFFIX)
+    kept = path.with_name(path.name + ".damaged")
+    copy = path.with_name(f".{path.name}.{os.getpid()}.recovering")
+    check_new(kept)
+    if path != log:
+        check_new(path)
+    with lock_abandoned(log) as is_abandoned:
+        if not is_abandoned:
+            raise LogError(f"{log}: is being written; stop the recorder first")
+        try:
+            recovery = recover_log(log, copy, path.name, progress)
+            sync_file(copy)
+            _keep(log, kept)
+            copy.replace(path)
+            if path != log:
+                log.unlink(missing_ok=True)
+            sync_folder(path.parent)
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+        finally:
+            copy.unlink(missing_ok=True)
+    return path, recovery
+
+
+def _keep(log: Path, name: Path) -> None:
+    try:
+        name.hardlink_to(log)  # so that there is a file of its own name at any time
+    except OSError:  # FAT knows no links
+        log.rename(name)
+
+
+def check_copy(path: Path, topics: dict[str, Topic]) -> None:
+    """Raise LogError unless a log, read with all its checksums, holds what it should."""
+    expected = {name: topic.messages for name, topic in topics.items() if topic.messages}
+    found: dict[str, int] = {}
+    with LogFile(path) as file:
+        for place in file.record_locations:
+            file.record(place)
+        for batch in read_in_batches(file, file.chunks, check=True):
+            for messages in batch:
+                topic = messages.channel.topic
+                found[topic] = found.get(topic, 0) + len(messages)
+    if found != expected:
+        raise LogError(
+            f"{path}: holds {sum(found.values())} messages of {sum(expected.values())} that were "
+            "recovered"
+        )
+
+
+@contextmanager
+def lock_abandoned(path: Path) -> Iterator[bool]:
+    """Hold the file's lock, unless a recorder does."""
+    try:
+        stream = os.fdopen(open_regular(path), "rb")
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror})") from error
+    with stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+        else:
+            yield True

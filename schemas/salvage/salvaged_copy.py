@@ -1,0 +1,194 @@
+"""A new log of what is whole in a damaged one, and the count of what it holds."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+from mcap.records import Message
+
+from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.salvage.damage import Damage
+from hearthlog.schemas.salvage.record_verifier import WholeAttachment, WholeChunk
+from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
+
+_PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
+_ENCODING = "cdr"
+
+
+@dataclass
+class Topic:
+    """What was saved of a topic.
+
+    Attributes
+    ----------
+    type : str
+    messages : int
+    expected : int or None
+        How many there should be, if the log says so.
+    end : int
+        Log time of the last one.
+    """
+
+    type: str
+    messages: int = 0
+    expected: int | None = None
+    end: int = 0
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What became of a log.
+
+    Attributes
+    ----------
+    topics : dict of str to Topic
+    damages : list of Damage
+    complete : bool
+        Whether the log was finished, and its index whole.
+    """
+
+    topics: dict[str, Topic]
+    damages: list[Damage]
+    complete: bool
+
+    @property
+    def messages(self) -> int:
+        """How many were saved."""
+        return sum(topic.messages for topic in self.topics.values())
+
+    @property
+    def lossless(self) -> bool:
+        """Whether nothing was lost."""
+        return all(damage.lossless for damage in self.damages)
+
+
+class SalvagedCopy:
+    """The whole pieces of a log, on their way into another one."""
+
+    def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
+        self.pieces = 0
+        self._salvage = salvage
+        self._profile = profile
+        self._writer = ChunkWriter(stream)
+        self._begun = False
+        self._written: set[tuple[type, int]] = set()
+        self._counts: dict[int, int] = {}
+        self._ends: dict[int, int] = {}
+        self._span = (1 << 63, 0)
+
+    def write(self, name: str, progress: Progress) -> None:
+        """Write all, and complete the file, which will bear this name."""
+        for piece in self._salvage.pieces():
+            self._add(piece)
+            progress(self._salvage.offset / self._salvage.size)
+            del piece  # before the next is read, which may be as large
+        self._begin()
+        self._writer.flush()
+        used = self._salvage.definitions
+        channels = [c for c in used.channels.values() if c.schema_id in {0, *used.schemas}]
+        about = self._rosbag2(name)
+        if about is not None:
+            self._writer.add_metadata(rosbag2.METADATA, about)
+        self._writer.define(list(used.schemas.values()), channels)
+        self._writer.finish()
+
+    def could_be_better(self) -> bool:
+        """Whether another attempt would know what this one learned too late."""
+        defines = self._salvage.definitions.defines
+        late = any(defines(channel) for channel in self._salvage.unnamed)
+        return late or (self._salvage.header is None and self.profile() != self._profile)
+
+    def profile(self) -> str:
+        """Guess the profile from the channels."""
+        channels = self._salvage.definitions.channels.values()
+        return _PROFILE if any(c.message_encoding == _ENCODING for c in channels) else ""
+
+    def recovery(self) -> Recovery:
+        """Say what was saved and what was not."""
+        topics: dict[str, Topic] = {}
+        for number, channel in self._salvage.definitions.channels.items():
+            schema = self._salvage.definitions.schemas.get(channel.schema_id)
+            topic = topics.setdefault(channel.topic, Topic("" if schema is None else schema.name))
+            topic.messages += self._counts.get(number, 0)
+            topic.end = max(topic.end, self._ends.get(number, 0))
+            if self._salvage.expected is not None:
+                expected = self._salvage.expected.get(number, 0)
+                topic.expected = (topic.expected or 0) + expected
+        damages = self._salvage.damages()
+        return Recovery(topics, [*damages, *_untraced(topics, damages)], self._salvage.complete)
+
+    def _add(self, piece: Piece) -> None:
+        self._begin()
+        self.pieces += 1
+        if isinstance(piece, WholeChunk):
+            chunk = piece.stored
+            self._define(chunk.entries, piece.definitions)
+            self._writer.copy_chunk(chunk)
+            for number, entries in chunk.entries.items():
+                times = np.frombuffer(entries, np.int64)[::2]
+                self._count(number, len(times), int(times.min()), int(times.max()))
+        elif isinstance(piece, Message):
+            self._define([piece.channel_id])
+            number, time = piece.channel_id, piece.log_time
+            self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
+            self._count(number, 1, time, time)
+        elif isinstance(piece, WholeAttachment):
+            self._writer.copy_attachment(piece.record, piece.about)
+        elif piece.name != rosbag2.METADATA:
+            self._writer.add_metadata(piece.name, piece.metadata)
+
+    def _begin(self) -> None:
+        if not self._begun:
+            header = self._salvage.header
+            profile, library = (
+                (self._profile, "") if header is None else (header.profile, header.library)
+            )
+            self._writer.start(profile, library)
+            self._begun = True
+
+    def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
+        """Write what defines these channels before their first message, unless it is with them."""
+        self._written.update((type(record), record.id) for record in inside)
+        known = self._salvage.definitions
+        for number in numbers:
+            channel = known.channels[number]
+            schema = known.schemas.get(channel.schema_id)
+            for record in (schema, channel):
+                if record is not None and (type(record), record.id) not in self._written:
+                    self._writer.write_definition(record)
+                    self._written.add((type(record), record.id))
+
+    def _count(self, number: int, count: int, first: int, last: int) -> None:
+        self._counts[number] = self._counts.get(number, 0) + count
+        self._ends[number] = max(self._ends.get(number, 0), last)
+        self._span = min(self._span[0], first), max(self._span[1], last)
+
+    def _rosbag2(self, name: str) -> dict[str, str] | None:
+        """Make the record for rosbag2, which reads the index where there is none."""
+        definitions = self._salvage.definitions
+        topics: dict[str, rosbag2.TopicCount] = {}
+        for number, channel in definitions.channels.items():
+            schema = definitions.schemas.get(channel.schema_id)
+            kind = "" if schema is None else schema.name
+            topic = topics.setdefault(channel.topic, rosbag2.TopicCount(kind, channel.metadata))
+            topic.messages += self._counts.get(number, 0)
+        try:
+            return rosbag2.file_metadata(name, topics, self._span if self._counts else (0, 0))
+        except (KeyError, ValueError, RecursionError):  # other writers describe channels otherwise
+            return None
+
+
+def _untraced(topics: dict[str, Topic], damages: list[Damage]) -> list[Damage]:
+    """List messages that the log counts, while nothing shows where they were."""
+    if not all(damage.exact for damage in damages):
+        return []
+    missing = {
+        name: topic.expected - topic.messages - sum(d.messages.get(name, 0) for d in damages)
+        for name, topic in topics.items()
+        if topic.expected is not None
+    }
+    missing = {name: count for name, count in missing.items() if count > 0}
+    return [Damage(0, 0, "its statistics count more", missing)] if missing else []
