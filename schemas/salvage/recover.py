@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,13 +13,13 @@ from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.salvage.salvage import Definition, Salvage
-from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, Topic
+from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, TopicRecovery
 from hearthlog.schemas.storage.new_files import check_new, sync_file, sync_folder
 from hearthlog.schemas.storage.regular_file import open_regular
 
 
 class NothingWholeError(LogError):
-    """Of a log nothing is left."""
+    """A log of which nothing is whole."""
 
 
 def recover_log(
@@ -32,7 +33,12 @@ def recover_log(
     name : str
         Name that the copy will have in the end.
     progress : callable, optional
-        Is given the share that is done, 0 to 1.
+        Called with the share that is done, 0 to 1.
+
+    Returns
+    -------
+    Recovery
+        What was saved, and what was lost.
 
     Raises
     ------
@@ -43,15 +49,18 @@ def recover_log(
     OSError
         If the copy cannot be written.
     """
-    known: list[Definition] = []
+    definitions: list[Definition] = []
     profile = ""
     while True:
-        with Salvage(source, known) as salvage, copy.open("wb") as stream:
+        with Salvage(source, definitions) as salvage, copy.open("wb") as stream:
             attempt = SalvagedCopy(stream, salvage, profile)
             attempt.write(name, progress)
         if not attempt.could_be_better():
             break
-        known = [*salvage.definitions.schemas.values(), *salvage.definitions.channels.values()]
+        definitions = [
+            *salvage.definitions.schemas.values(),
+            *salvage.definitions.channels.values(),
+        ]
         profile = attempt.profile()
     if not attempt.pieces:
         if not salvage.is_mcap:
@@ -107,27 +116,31 @@ def _keep(log: Path, name: Path) -> None:
         log.rename(name)
 
 
-def check_copy(path: Path, topics: dict[str, Topic]) -> None:
-    """Raise LogError unless a log, read with all its checksums, holds what it should."""
-    expected = {name: topic.messages for name, topic in topics.items() if topic.messages}
-    found: dict[str, int] = {}
+def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
+    """Read a recovered log with all its checksums, and count its messages.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, or does not hold the messages that were recovered.
+    """
+    expected = Counter({name: topic.messages for name, topic in topics.items() if topic.messages})
+    counts: Counter[str] = Counter()
     with LogFile(path) as file:
-        for place in file.record_locations:
-            file.record(place)
+        for location in file.record_locations:
+            file.record(location)
         for batch in read_in_batches(file, file.chunks, check=True):
             for messages in batch:
-                topic = messages.channel.topic
-                found[topic] = found.get(topic, 0) + len(messages)
-    if found != expected:
+                counts[messages.channel.topic] += len(messages)
+    if counts != expected:
         raise LogError(
-            f"{path}: holds {sum(found.values())} messages of {sum(expected.values())} that were "
-            "recovered"
+            f"{path}: holds {counts.total()} messages of {expected.total()} that were recovered"
         )
 
 
 @contextmanager
 def lock_abandoned(path: Path) -> Iterator[bool]:
-    """Hold the file's lock, unless a recorder does."""
+    """Hold the lock of a log, unless a recorder that writes it does; yield whether it is held."""
     try:
         stream = os.fdopen(open_regular(path), "rb")
     except OSError as error:

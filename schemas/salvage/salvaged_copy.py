@@ -19,7 +19,7 @@ _ENCODING = "cdr"
 
 
 @dataclass
-class Topic:
+class TopicRecovery:
     """What was saved of a topic.
 
     Attributes
@@ -27,9 +27,9 @@ class Topic:
     type : str
     messages : int
     expected : int or None
-        How many there should be, if the log says so.
+        Messages that there should be, if the index of the log says so.
     end : int
-        Log time of the last one.
+        Log time of the last message, in nanoseconds.
     """
 
     type: str
@@ -40,23 +40,23 @@ class Topic:
 
 @dataclass(frozen=True)
 class Recovery:
-    """What became of a log.
+    """What was saved of a log, and what was lost.
 
     Attributes
     ----------
-    topics : dict of str to Topic
+    topics : dict of str to TopicRecovery
     damages : list of Damage
     complete : bool
-        Whether the log was finished, and its index whole.
+        Whether the log was finished, and its index is whole.
     """
 
-    topics: dict[str, Topic]
+    topics: dict[str, TopicRecovery]
     damages: list[Damage]
     complete: bool
 
     @property
     def messages(self) -> int:
-        """How many were saved."""
+        """Messages that were saved."""
         return sum(topic.messages for topic in self.topics.values())
 
     @property
@@ -66,7 +66,21 @@ class Recovery:
 
 
 class SalvagedCopy:
-    """The whole pieces of a log, on their way into another one."""
+    """Copies the whole pieces of a damaged log into a new one.
+
+    Parameters
+    ----------
+    stream : BinaryIO
+        Of the new log, at its start.
+    salvage : Salvage
+    profile : str
+        What the header of the new log says if that of the old one is lost.
+
+    Attributes
+    ----------
+    pieces : int
+        Pieces that were copied.
+    """
 
     def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
         self.pieces = 0
@@ -80,23 +94,24 @@ class SalvagedCopy:
         self._span = (1 << 63, 0)
 
     def write(self, name: str, progress: Progress) -> None:
-        """Write all, and complete the file, which will bear this name."""
+        """Write all pieces, and complete the file, which will have this name."""
         for piece in self._salvage.pieces():
             self._add(piece)
             progress(self._salvage.offset / self._salvage.size)
             del piece  # before the next is read, which may be as large
         self._begin()
         self._writer.flush()
-        used = self._salvage.definitions
-        channels = [c for c in used.channels.values() if c.schema_id in {0, *used.schemas}]
-        about = self._rosbag2(name)
-        if about is not None:
-            self._writer.add_metadata(rosbag2.METADATA, about)
-        self._writer.define(list(used.schemas.values()), channels)
+        definitions = self._salvage.definitions
+        schemas = definitions.schemas
+        channels = [c for c in definitions.channels.values() if c.schema_id in {0, *schemas}]
+        metadata = self._rosbag2(name)
+        if metadata is not None:
+            self._writer.add_metadata(rosbag2.METADATA, metadata)
+        self._writer.define(list(schemas.values()), channels)
         self._writer.finish()
 
     def could_be_better(self) -> bool:
-        """Whether another attempt would know what this one learned too late."""
+        """Tell whether another attempt would have definitions that this one met too late."""
         defines = self._salvage.definitions.defines
         late = any(defines(channel) for channel in self._salvage.unnamed)
         return late or (self._salvage.header is None and self.profile() != self._profile)
@@ -107,11 +122,12 @@ class SalvagedCopy:
         return _PROFILE if any(c.message_encoding == _ENCODING for c in channels) else ""
 
     def recovery(self) -> Recovery:
-        """Say what was saved and what was not."""
-        topics: dict[str, Topic] = {}
+        """Count what was saved, and list what was not."""
+        topics: dict[str, TopicRecovery] = {}
         for number, channel in self._salvage.definitions.channels.items():
             schema = self._salvage.definitions.schemas.get(channel.schema_id)
-            topic = topics.setdefault(channel.topic, Topic("" if schema is None else schema.name))
+            kind = "" if schema is None else schema.name
+            topic = topics.setdefault(channel.topic, TopicRecovery(kind))
             topic.messages += self._counts.get(number, 0)
             topic.end = max(topic.end, self._ends.get(number, 0))
             if self._salvage.expected is not None:
@@ -152,10 +168,10 @@ class SalvagedCopy:
     def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
         """Write what defines these channels before their first message, unless it is with them."""
         self._written.update((type(record), record.id) for record in inside)
-        known = self._salvage.definitions
+        definitions = self._salvage.definitions
         for number in numbers:
-            channel = known.channels[number]
-            schema = known.schemas.get(channel.schema_id)
+            channel = definitions.channels[number]
+            schema = definitions.schemas.get(channel.schema_id)
             for record in (schema, channel):
                 if record is not None and (type(record), record.id) not in self._written:
                     self._writer.write_definition(record)
@@ -167,7 +183,7 @@ class SalvagedCopy:
         self._span = min(self._span[0], first), max(self._span[1], last)
 
     def _rosbag2(self, name: str) -> dict[str, str] | None:
-        """Make the record for rosbag2, which reads the index where there is none."""
+        """Make the `rosbag2` record, by which rosbag2 lists topics; None if that is impossible."""
         definitions = self._salvage.definitions
         topics: dict[str, rosbag2.TopicCount] = {}
         for number, channel in definitions.channels.items():
@@ -181,7 +197,7 @@ class SalvagedCopy:
             return None
 
 
-def _untraced(topics: dict[str, Topic], damages: list[Damage]) -> list[Damage]:
+def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[Damage]:
     """List messages that the log counts, while nothing shows where they were."""
     if not all(damage.exact for damage in damages):
         return []
