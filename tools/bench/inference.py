@@ -36,7 +36,7 @@ def measure(work: Workload) -> Table:
     machine[-1].decision_function_shape = "ovr"
     expected = softmax(work.model.description.inverse_temperature * decision)
     difference = np.abs(ours(rows) - expected).max()
-    found = []
+    measured = []
     for count in (len(rows), _BLOCK):
         best = best_of(
             {
@@ -45,13 +45,13 @@ def measure(work: Workload) -> Table:
             }
         )
         mine, other = (1e6 * seconds / count for seconds in best.values())
-        found.append(Row(f"hearthlog, {count} rows a call", mine, "µs a row"))
+        measured.append(Row(f"hearthlog, {count} rows a call", mine, "µs a row"))
         target = _TEN_TIMES if count > _BLOCK else None
         row = Row(f"scikit-learn, {count} rows a call", other, "µs a row", other / mine, target)
-        found.append(row)
-    found.append(Row("largest difference", float(difference), "", target=_THE_SAME))
+        measured.append(row)
+    measured.append(Row("largest difference", float(difference), "", target=_THE_SAME))
     size, classes = SVM_RBF.summary(work.model), len(work.model.classes)
-    return Table(f"inference: {size}, {classes} classes, CPU time", found)
+    return Table(f"inference: {size}, {classes} classes, CPU time", measured)
 
 
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:

@@ -37,7 +37,7 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
         str(_SOURCE): _SOURCE.exists(),
         "setpriv": shutil.which("setpriv"),
     }
-    missing = [name for name, found in needed.items() if not found]
+    missing = [name for name, is_there in needed.items() if not is_there]
     if missing:
         raise BenchError(f"no microphone to record: {', '.join(missing)} missing")
     plugin = folder / "libasound_module_pcm_labmic.so"
@@ -55,12 +55,12 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     built = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if built.returncode != 0:
         raise BenchError("no microphone to record: building it needs libasound2-dev")
-    heard = folder / "labmic.s16"
-    heard.write_bytes(samples.astype("<i2").tobytes())
+    recording = folder / "labmic.s16"
+    recording.write_bytes(samples.astype("<i2").tobytes())
     configuration = folder / "asound.conf"
     configuration.write_text(
         f"<{_ALSA_CONFIGURATION}>\n"
         f'pcm_type.{DEVICE} {{ lib "{plugin}" }}\n'
-        f'pcm.{DEVICE} {{ type {DEVICE} rate {SAMPLE_RATE} data "{heard}" }}\n'
+        f'pcm.{DEVICE} {{ type {DEVICE} rate {SAMPLE_RATE} data "{recording}" }}\n'
     )
     return {**os.environ, "ALSA_CONFIG_PATH": str(configuration)}

@@ -118,24 +118,24 @@ def _peer(log: Path, model: Model, data: Dataset, output: Path) -> float:
     with AnyReader([log]) as reader:
         chosen = [c for c in reader.connections if c.topic == "/mic/features"]
         read = (reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen))
-        heard: list[Any] = [message for _, message in zip(range(_SAMPLE), read, strict=False)]
-    inputs = Classifier(model).inputs.stream()(np.array([m.values for m in heard]))
+        frames: list[Any] = [message for _, message in zip(range(_SAMPLE), read, strict=False)]
+    inputs = Classifier(model).inputs.stream()(np.array([m.values for m in frames]))
     rows = inputs.astype(np.float64)
     calls = [rows[first : first + _CALL] for first in range(0, len(rows), _CALL)]
-    found = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)
-    viterbi(found, model.transitions)
+    posteriors = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)
+    viterbi(posteriors, model.transitions)
     with output.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
         schema = writer.register_schema(LABEL, "ros2msg", definition(LABEL).encode())
         channel = writer.register_channel("/mic/label", "cdr", schema)
-        for said, probabilities in zip(heard[-len(found) :], found, strict=True):
+        for frame, probabilities in zip(frames[-len(posteriors) :], posteriors, strict=True):
             best = int(probabilities.argmax())
-            stamp = nanoseconds(said.header.stamp)
+            stamp = nanoseconds(frame.header.stamp)
             label = message(
                 LABEL,
                 header=header(stamp, "mic"),
-                frame=said.frame,
+                frame=frame.frame,
                 label=classes[best],
                 confidence=float(probabilities[best]),
                 novelty=float("nan"),

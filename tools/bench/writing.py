@@ -82,10 +82,10 @@ def _as_messages(path: Path, columns: Mapping[str, Columns]) -> None:
 
 def _encoded(columns: Columns) -> Iterator[tuple[int, str, bytes]]:
     names = [name for name in columns.fields if not name.startswith("header.")]
-    stamps, about = columns["header.stamp"].tolist(), columns["header.frame_id"]
+    stamps, frame_ids = columns["header.stamp"].tolist(), columns["header.frame_id"]
     values = zip(*(columns[name] for name in names), strict=True)
     for log_time, stamp, frame_id, row in zip(
-        columns.log_times.tolist(), stamps, about, values, strict=True
+        columns.log_times.tolist(), stamps, frame_ids, values, strict=True
     ):
         header = message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
         fields: dict[str, Any] = dict(zip(names, row, strict=True))
