@@ -21,16 +21,9 @@ from spliced import run, small_disk, write_log
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, find_coverage
 from hearthlog.analyzer.marks.formats import SUFFIXES
-from hearthlog.analyzer.marks.marks import (
-    LATEST,
-    Mark,
-    MarkedSpan,
-    read_marks,
-    review_path,
-    write_marks,
-)
+from hearthlog.analyzer.marks.marks import LATEST, Mark, MarkedSpan, read_marks, write_marks
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import find_logs, review_path
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.message_types import SEGMENT, duration_message, header, message
 from hearthlog.schemas.times import NANOSECONDS

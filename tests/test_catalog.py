@@ -23,8 +23,6 @@ from hearthlog.analyzer.logs.catalog import (
     DAMAGED,
     FINISHED,
     LOG,
-    RELABEL,
-    REVIEW,
     UNFINISHED,
     load_catalog,
     read_catalog,
@@ -43,7 +41,7 @@ from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import FOOTER_SIZE, time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
-from hearthlog.schemas.messages.topics import Topic
+from hearthlog.schemas.messages.topics import RELABEL, REVIEW, Topic
 from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS

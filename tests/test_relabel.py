@@ -22,8 +22,8 @@ from spliced import run, small_disk
 from stores import put
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.analyzer.logs.chains import find_chains
-from hearthlog.analyzer.relabel.layer import digest, layer_path, read_about
+from hearthlog.analyzer.logs.layers import find_chains
+from hearthlog.analyzer.relabel.layer import digest, read_about
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -32,7 +32,7 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.files import find_logs, is_layer, relabel_path
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.salvage.recover import recover_log
 from hearthlog.schemas.times import NANOSECONDS
@@ -213,7 +213,7 @@ def test_layers_stay_when_logs_beside_theirs_are_deleted(model, logs, layers):
     relabelled(model, logs)
     for log in recorded_logs(logs)[:2]:
         log.unlink()
-        layer_path(log, load_model(model).name).unlink()
+        relabel_path(log, load_model(model).name).unlink()
     kept = written(logs)
     again = relabelled(model, logs)
     assert (again.layers, len(again.current)) == ([], len(layers) - 2)
@@ -272,7 +272,7 @@ def test_a_layer_says_what_made_it(model, logs):
     relabelled(model, logs)
     log, behind = recorded_logs(logs)[:2]
     loaded = load_model(model)
-    about = read_about(layer_path(log, loaded.name))
+    about = read_about(relabel_path(log, loaded.name))
     assert about.source.model_sha256 == loaded.sha256
     assert about.source.input_sha256 == digest(log)
     assert (about.source.before, about.source.behind) == ("", behind.stem)
@@ -318,7 +318,7 @@ def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capf
 
 def labelled_frames(log, model):
     name = load_model(model).name
-    columns = read_columns([layer_path(log, name)])[f"/mic/relabel/{name}/label"]
+    columns = read_columns([relabel_path(log, name)])[f"/mic/relabel/{name}/label"]
     return columns["frame"].astype(np.int64)
 
 
@@ -391,7 +391,7 @@ def test_a_layer_of_another_log_of_that_name_is_kept(model, logs, capfd):
 
 def test_what_is_no_layer_is_kept(model, logs, capfd):
     log = recorded_logs(logs)[0]
-    layer = layer_path(log, load_model(model).name)
+    layer = relabel_path(log, load_model(model).name)
     shutil.copy(log, layer)
     data = layer.read_bytes()
     done = run(capfd, "relabel", log, "--model", model, "--workers", 1)
@@ -402,7 +402,7 @@ def test_what_is_no_layer_is_kept(model, logs, capfd):
 
 def test_a_layer_is_no_log_to_label(model, logs, capfd):
     relabelled(model, logs)
-    layer = layer_path(recorded_logs(logs)[0], load_model(model).name)
+    layer = relabel_path(recorded_logs(logs)[0], load_model(model).name)
     done = run(capfd, "relabel", layer, "--model", model, "--workers", 1)
     assert done.returncode == 1
     assert done.stderr.endswith(f"{layer}: is a layer; name the log that it speaks of\n")
@@ -413,7 +413,7 @@ def test_where_a_layer_cannot_be_made_those_behind_it_are_as_ever(model, logs, n
     for folder in (logs, Path(shutil.copytree(night, logs.parent / "night"))):
         whole = Path(shutil.copytree(folder, folder.parent / f"{folder.name}-whole"))
         relabelled(model, whole)
-        bad = layer_path(recorded_logs(folder)[1], name)
+        bad = relabel_path(recorded_logs(folder)[1], name)
         bad.write_bytes(b"no layer")
         found = relabelled(model, folder, workers=2)
         assert len(found.failed) == 1
@@ -464,7 +464,7 @@ def test_a_log_that_cannot_be_labelled_costs_nothing_but_its_own_layer(
     done = run(capfd, "relabel", logs, "--model", model, "--workers", 2)
     assert done.returncode == 3
     assert f"{log}: has no features" in done.stderr
-    assert set(written(logs)) == set(layers) - {layer_path(log, load_model(model).name).name}
+    assert set(written(logs)) == set(layers) - {relabel_path(log, load_model(model).name).name}
 
 
 def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, capfd):

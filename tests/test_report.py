@@ -18,7 +18,7 @@ from PIL import Image
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.layers import find_shelf
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -39,13 +39,13 @@ UTC = ZoneInfo("UTC")
 
 
 def look(root, day=DAY, zone=UTC, labelling="live"):
-    heard = read_heard(find_shelf([root]), labelling, 0, day_span(day, zone))
+    heard = read_heard(find_home_logs([root]), labelling, 0, day_span(day, zone))
     return day_of(whole_home(heard), day, zone)
 
 
 def page_of(root, tmp_path, first=DAY, days=1) -> str:
     output = tmp_path / f"page-{first}-{days}.html"
-    make_report(find_shelf([root]), Period(first, days, UTC), output)
+    make_report(find_home_logs([root]), Period(first, days, UTC), output)
     return output.read_text()
 
 
@@ -116,7 +116,7 @@ def test_names_that_a_report_puts_together_are_as_right_as_the_worst_of_them(tmp
     precisions = {"shout": 0.9, "yell": 0.4, "music": 0.8, "yelling": 0.7}
     monkeypatch.setattr(homelife, "PRECISIONS", precisions)
     write_day(tmp_path, DAY, [(at("10:00"), 60, "shout", 0.6)], hours=[10])
-    heard = read_heard(find_shelf([tmp_path]), "live", 0, day_span(DAY, UTC))
+    heard = read_heard(find_home_logs([tmp_path]), "live", 0, day_span(DAY, UTC))
     assert heard.precisions == {"yelling": 0.4, "music": 0.8}
 
 
@@ -187,7 +187,7 @@ def test_the_zone_is_that_of_the_option_or_the_logs_or_utc(tmp_path):
         with pytest.raises(DataError, match="is no time zone"):
             home_zone(name)
     write_day(tmp_path, DAY, hours=[20], timezone="Asia/Kolkata")
-    shelf = find_shelf([tmp_path])
+    shelf = find_home_logs([tmp_path])
     zone = home_zone(None, shelf.records())
     assert shelf.days(zone) == [DAY + timedelta(days=1)], "20:00 UTC is 01:30 there"
 
@@ -298,10 +298,10 @@ def test_the_last_whole_day_is_that_which_the_logs_reach_to_the_end_of(tmp_path)
     last = tmp_path / "2026/03/02/home_20260302T230000Z.mcap"
     start = midnight(DAY) + 47 * HOUR * NANOSECONDS
     one_segment(last, "/mic/segment", start, 1800, "speech")
-    assert find_shelf([tmp_path]).last_whole_day(UTC) == DAY
+    assert find_home_logs([tmp_path]).last_whole_day(UTC) == DAY
     last.unlink()
     one_segment(last, "/mic/segment", start, 3570, "speech")
-    assert find_shelf([tmp_path]).last_whole_day(UTC) == DAY + timedelta(days=1)
+    assert find_home_logs([tmp_path]).last_whole_day(UTC) == DAY + timedelta(days=1)
 
 
 # The page
@@ -389,7 +389,7 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
 
 
 def test_a_class_is_only_compared_on_days_on_which_it_would_have_been_heard(flat, flat_page):
-    shelf = find_shelf([flat])
+    shelf = find_home_logs([flat])
     heard = read_heard(shelf, "live", 0, day_span(DAY, UTC))
     day = day_of(whole_home(heard), DAY, UTC)
     assert day.comparable("coughing")
@@ -414,7 +414,7 @@ def test_a_week_has_its_seven_days_and_their_total(flat, tmp_path):
     assert "Week 9, 23 February 2026 to 1 March 2026" in text
     assert page.count('<th scope="row">Wed 25 Feb</th>') == 5
     assert page.count('<tr class="sum">') == 5
-    heard = read_heard(find_shelf([flat]), "live", 0, day_span(DAY, UTC))
+    heard = read_heard(find_home_logs([flat]), "live", 0, day_span(DAY, UTC))
     home = whole_home(heard)
     days = [day_of(home, DAY - timedelta(days=n), UTC) for n in range(7)]
     total = sum((day.count("shower") for day in days), Count())

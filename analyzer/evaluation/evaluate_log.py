@@ -18,13 +18,14 @@ from hearthlog.analyzer.evaluation.event_scores import (
     total,
 )
 from hearthlog.analyzer.logs.coverage import find_coverage
-from hearthlog.analyzer.logs.labelling import REVIEW, Labelling
+from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.marks.formats import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.times import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS

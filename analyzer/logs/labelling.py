@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classes import translation
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import SUFFIX, is_log, stem
 from hearthlog.schemas.messages import message_types
 
-REVIEW = "review"
 FIELDS = {"header.stamp", "duration", "label"}
 _MOST_CLASSES = 100
 
@@ -131,15 +130,6 @@ def all_classes(
     if len(classes) > _MOST_CLASSES:
         raise LogError(f"{topic}: has {len(classes)} different labels; no classifier has so many")
     return classes
-
-
-def with_layers(path: Path) -> list[Path]:
-    """List a log and the layers beside it."""
-    if not path.is_file():
-        return [path]
-    named = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
-    beside = (each for each in named if each.name.endswith(SUFFIX) and is_log(each))
-    return [path, *sorted(beside)]
 
 
 def _segment_topic(selection: Selection, wanted: str | None) -> str:

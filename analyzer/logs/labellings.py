@@ -1,6 +1,5 @@
 """The labellings that some logs have: what the recorder said, relabellings, a reviewer's marks."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,30 +9,29 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.labelling import (
-    FIELDS,
-    Labelling,
-    all_classes,
-    labelling_of,
-    with_layers,
-)
+from hearthlog.analyzer.logs.labelling import FIELDS, Labelling, all_classes, labelling_of
+from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
-from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    RELABEL,
+    REVIEW,
+    TopicName,
+    labelling_topic,
+    parse_topic,
+    relabelling,
+)
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
-LIVE, REVIEW, RELABEL = "live", "review", "relabel"
 LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
-_TOPIC = re.compile(
-    r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)(?:/(?P<name>review|relabel/\w+))?/segment", re.ASCII
-)
 
 
 class Log(NamedTuple):
@@ -100,7 +98,7 @@ class Sources:
 
     def microphone(self, wanted: str | None) -> str:
         """Return the only microphone, or check the one that is wanted."""
-        found = {match["microphone"] for match in self._matches()}
+        found = {topic.microphone for topic in self._topics()}
         known = ", ".join(sorted(found))
         if not found:
             raise LogError(
@@ -117,7 +115,7 @@ class Sources:
 
     def names(self, microphone: str) -> list[str]:
         """List the labellings of a microphone; what the recorder said comes first."""
-        found = {m["name"] or LIVE for m in self._matches() if m["microphone"] == microphone}
+        found = {t.labelling for t in self._topics() if t.microphone == microphone}
         return sorted(found, key=lambda name: (name != LIVE, name))
 
     def find(self, microphone: str, wanted: str) -> str:
@@ -138,8 +136,7 @@ class Sources:
         layers = [name for name in known if name.startswith(f"{RELABEL}/")]
         if wanted == RELABEL and len(layers) == 1:
             return layers[0]
-        model = re.sub(r"[^A-Za-z0-9_]", "_", wanted.removeprefix(f"{RELABEL}/"))
-        for name in (wanted, f"{RELABEL}/{model}"):
+        for name in (wanted, relabelling(wanted.removeprefix(f"{RELABEL}/"))):
             if name in known:
                 return name
         there = f"there is {', '.join(known)}{self._first_loss()}"
@@ -170,12 +167,13 @@ class Sources:
         LogError
             If there is none in this span of time, or if segments overlap or cannot be.
         """
-        topic = segment_topic(microphone, name)
+        topic = labelling_topic(microphone, name, "segment")
         labelling = self._labelling(topic, start, end, progress)
         if labelling is None:
             limited = "" if start is None and end is None else " in this span of time"
             raise LogError(f"{topic}: there is no segment{limited}{self._first_loss()}")
-        named = [log.classes.get(label_topic(microphone, name), ()) for log in self.logs]
+        labels = labelling_topic(microphone, name, "label")
+        named = [log.classes.get(labels, ()) for log in self.logs]
         classes = all_classes(topic, named, labelling)
         for label in classes:
             if not CLASS_NAME.fullmatch(label):
@@ -186,7 +184,8 @@ class Sources:
 
     def marks(self, microphone: str, start: int | None, end: int | None) -> Labelling | None:
         """Read what was reviewed in a span of time, if anything was; as `read` otherwise."""
-        return self._labelling(segment_topic(microphone, REVIEW), start, end, lambda _: None)
+        topic = labelling_topic(microphone, REVIEW, "segment")
+        return self._labelling(topic, start, end, lambda _: None)
 
     def with_topic(self, topic: str, start: int | None = None, end: int | None = None) -> list[Log]:
         """List the logs that have a topic, and messages at a span of time."""
@@ -233,10 +232,10 @@ class Sources:
                 if end is not None and columns.log_times[-1] >= end:
                     return  # not before: what begins in the span may end, and be logged, later
 
-    def _matches(self) -> Iterator[re.Match[str]]:
-        for topic in sorted({topic for log in self.logs for topic in log.segments}):
-            if match := _TOPIC.fullmatch(topic):
-                yield match
+    def _topics(self) -> list[TopicName]:
+        names = {name for log in self.logs for name in log.segments}
+        topics = [topic for name in names if (topic := parse_topic(name)) is not None]
+        return [topic for topic in topics if topic.kind == "segment"]
 
 
 def find_sources(*paths: Path) -> Sources:
@@ -247,24 +246,12 @@ def find_sources(*paths: Path) -> Sources:
     LogError
         If there is no log, or none that can be read.
     """
-    given = [log for path in paths for log in with_layers(path)]
-    found = {each.resolve(): each for log in given for each in find_logs(log)}
-    opened = list(map_logs(_opened, sorted(found.values())))
+    opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
     logs = [log for log in opened if isinstance(log, Log)]
     losses = [str(error) for error in opened if isinstance(error, LogError)]
     if not logs:
         raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
     return Sources(sorted(logs, key=lambda log: log.first), losses)
-
-
-def segment_topic(microphone: str, name: str) -> str:
-    """Name the topic of the segments of a labelling."""
-    return f"/{microphone}/segment" if name == LIVE else f"/{microphone}/{name}/segment"
-
-
-def label_topic(microphone: str, name: str) -> str:
-    """Name the topic of its labels, frame by frame."""
-    return segment_topic(microphone, name).removesuffix("segment") + "label"
 
 
 def _opened(path: Path) -> Log | LogError | None:

@@ -1,188 +1,184 @@
-"""Which logs there are of a home, and of which time each of them may speak, by their names."""
+"""Which logs there are, which layers lie beside them, and which logs follow each other."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, date, datetime, tzinfo
-from itertools import groupby
+from contextlib import suppress
+from datetime import tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labelling import with_layers
-from hearthlog.analyzer.logs.local_time import day_span, local_time
+from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import find_logs, is_layer, stem
+from hearthlog.schemas.logs.files import SUFFIX, find_logs, is_layer, is_log, log_name, stem
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
-from hearthlog.schemas.times import NANOSECONDS
 
-REVIEW, RELABEL = "review", "relabel-"
-_NAME = re.compile(
-    r"(?P<node>.+?)(?:_(?P<start>\d{8}T\d{6})Z)?(?:\.(?P<layer>relabel-.+|review))?", re.DOTALL
-)
-_NEVER = 1 << 62
-_TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one
+_DAY = re.compile(r"\d{4}/\d\d/\d\d")
+_DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
 
 
-class Entry(NamedTuple):
-    """A log or a layer.
+class TimedFile(NamedTuple):
+    """A log or a layer that has messages.
 
     Attributes
     ----------
     path : Path
-    node : str
+    first, last : int
+        Log times in nanoseconds.
+    size : int
+        Bytes, as stored.
     layer : str
-        Empty for a log, else `review` or `relabel-<model>`.
-    start, end : int
-        What it says is of this span (ns of UTC); what ends later may have begun in it.
+        As `LogName.layer`.
     """
 
     path: Path
-    node: str
+    first: int
+    last: int
+    size: int
     layer: str
-    start: int
-    end: int
 
 
-@dataclass(frozen=True)
-class Shelf:
-    """The logs of a home with their layers, in the order of time.
+class Chain(NamedTuple):
+    """The logs of a node of a home.
 
     Attributes
     ----------
-    entries : list of Entry
-    losses : list of str
-        What cannot be read, and why.
+    logs : list of Path
+        In the order of time; the last may still be being written.
+    asked : dict of int to Path
+        Those that were asked for, by their places.
     """
 
-    entries: Sequence[Entry]
-    losses: Sequence[str]
-
-    def between(self, start: int, end: int, layer: str = "") -> list[Entry]:
-        """List the logs, or the layers of one name, that may speak of a span of time."""
-        return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
-
-    @property
-    def layers(self) -> list[str]:
-        """Names of the models that have relabelled logs."""
-        found = {entry.layer for entry in self.entries}
-        return sorted(layer.removeprefix(RELABEL) for layer in found if layer.startswith(RELABEL))
-
-    def records(self) -> Iterator[Mapping[str, str]]:
-        """Go through the `hearthlog` records of the logs, the last log first."""
-        for entry in reversed(self.between(0, _NEVER)):
-            try:
-                found = _record(entry.path)
-            except LogError:
-                continue  # it is named when it is read
-            if found is not None:
-                yield found
-                return
-
-    def days(self, zone: tzinfo) -> list[date]:
-        """List the days on which there are logs."""
-        found = {local_time(entry.start, zone).date() for entry in self.between(0, _NEVER)}
-        end = self.end()
-        if end is not None:
-            found.add(local_time(end - 1, zone).date())
-        return sorted(found)
-
-    def last_whole_day(self, zone: tzinfo) -> date:
-        """Return the last day that the logs reach beyond, or the last one if there is none."""
-        days = self.days(zone)
-        if not days:
-            raise LogError(self.losses[0] if self.losses else "there is no message in these logs")
-        end = self.end() or 0
-        whole = [day for day in days if day_span(day, zone)[1] - _TAIL <= end]
-        return whole[-1] if whole else days[-1]
-
-    def end(self) -> int | None:
-        """Return the log time of the last message of the logs."""
-        for entry in reversed(self.between(0, _NEVER)):
-            try:
-                span = time_span(entry.path)
-            except LogError:
-                continue
-            if span is not None:
-                return span[1]
-        return None
+    logs: Sequence[Path]
+    asked: Mapping[int, Path]
 
 
-def find_shelf(paths: Iterable[Path]) -> Shelf:
-    """Look which logs there are, by their names; only others are opened.
+def with_layers(path: Path) -> list[Path]:
+    """List a log and the layers beside it; of a folder the folder alone, which has them."""
+    if not path.is_file():
+        return [path]
+    beside = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
+    layers = (each for each in beside if each.name.endswith(SUFFIX) and is_log(each))
+    return [path, *sorted(layers)]
+
+
+def find_with_layers(paths: Iterable[Path]) -> list[Path]:
+    """List logs with the layers beside them, and all that is in folders, each file once.
 
     Raises
     ------
     LogError
-        If there is none.
+        If there is no such log, or none in a folder.
     """
-    found = {
-        log.resolve(): log
-        for path in paths
-        for each in with_layers(path)
-        for log in find_logs(each)
-    }
-    losses: list[str] = []
-    entries = []
-    for path in found.values():
+    files = (file for path in paths for each in with_layers(path) for file in find_logs(each))
+    return list({file.resolve(): file for file in files}.values())
+
+
+def find_timed_files(
+    paths: Iterable[Path], start: int | None, end: int | None, losses: list[str]
+) -> list[TimedFile]:
+    """Find the logs and layers with messages in a span of time.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        As `find_with_layers` takes them.
+    start, end : int, optional
+        In nanoseconds of UTC.
+    losses : list of str
+        What cannot be read, and why, is appended.
+
+    Returns
+    -------
+    list of TimedFile
+        In the order of time.
+    """
+    files = []
+    for path in find_with_layers(paths):
         try:
-            entry = _entry(path)
-        except LogError as error:
+            span = time_span(path)
+            if span is None or (start is not None and span[1] < start):
+                continue
+            # What ends in the span may be logged later, so only the start of a log excludes it.
+            if end is not None and span[0] >= end:
+                continue
+            size = path.stat().st_size
+        except (LogError, OSError) as error:
             losses.append(str(error))
             continue
-        if entry is not None:
-            entries.append(entry)
-    return Shelf(sorted(_closed(entries), key=lambda entry: (entry.start, entry.path.name)), losses)
+        files.append(TimedFile(path, *span, size, log_name(path).layer))
+    return sorted(files, key=lambda file: (file.first, file.path.name))
 
 
-def days_in_words(days: Sequence[date]) -> str:
-    """Name days, those that follow each other as one: `2026-03-01 to 2026-03-04, 2026-03-09`."""
-    numbered = enumerate(days)
-    runs = [list(run) for _, run in groupby(numbered, lambda pair: pair[1].toordinal() - pair[0])]
-    texts = [f"{run[0][1]}" if len(run) == 1 else f"{run[0][1]} to {run[-1][1]}" for run in runs]
-    return ", ".join(texts[-5:]) if len(texts) <= 5 else f"{texts[0]} … {', '.join(texts[-4:])}"
+def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
+    """Yield the `hearthlog` records of logs that have one, the last log first; layers have none."""
+    for path in reversed(list(logs)):
+        if is_layer(path):
+            continue
+        with suppress(LogError), LogFile(path) as file:  # an error comes when the log is read
+            yield from read_provenance(file)[:1]
 
 
-def check_day(shelf: Shelf, first: date, last: date, zone: tzinfo) -> None:
-    """Raise DataError unless there is a log on one of some days."""
-    days = shelf.days(zone)
-    if any(first <= day <= last for day in days):
-        return
-    when = f"{first}" if first == last else f"{first} to {last}"
-    there = f"there are {days_in_words(days)}" if days else "nor of any other day"
-    loss = f"; {shelf.losses[0]}" if shelf.losses else ""
-    raise DataError(f"no logs of {when} in the home's time zone, {zone}; {there}{loss}")
+def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
+    """Find the time zone of a home: the named one, or that of the latest log that says one.
+
+    Raises
+    ------
+    DataError
+        If there is no such zone.
+    LogError
+        If there is no log.
+    """
+    return home_zone(name, latest_records([log for path in paths for log in find_logs(path)]))
 
 
-def _entry(path: Path) -> Entry | None:
-    """Tell by its name what a file is; None if there is nothing in it."""
-    match = _NAME.fullmatch(stem(path))
-    assert match is not None
-    layer = match["layer"] or ""
-    if not layer and is_layer(path):
-        return None  # of sound
-    try:
-        moment = datetime.strptime(match["start"] or "", "%Y%m%dT%H%M%S").replace(tzinfo=UTC)
-        return Entry(path, match["node"], layer, int(moment.timestamp()) * NANOSECONDS, _NEVER)
-    except ValueError:
-        span = time_span(path)
-        return None if span is None else Entry(path, "", layer, span[0], span[1] + 1)
+def find_chains(paths: Iterable[Path]) -> list[Chain]:
+    """Find logs, and those before and behind them.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs, of which layers are passed over.
+
+    Raises
+    ------
+    LogError
+        If there is no such log, or it is a layer.
+    """
+    asked: dict[str, Path] = {}
+    for path in paths:
+        if is_layer(path):
+            raise LogError(f"{path}: is a layer; name the log that it speaks of")
+        asked |= {str(log): log for log in find_logs(path) if not is_layer(log)}
+    homes = {str(folder): folder for folder in map(home_folder, asked.values())}
+    chains = []
+    for root in homes.values():
+        for logs in _logs_by_node(root):
+            places = {i: log for i, log in enumerate(logs) if str(log) in asked}
+            if places:
+                chains.append(Chain(logs, places))
+    return chains
 
 
-def _closed(entries: Iterable[Entry]) -> Iterator[Entry]:
-    """End each log where the next one of its kind begins."""
-    by_kind: dict[tuple[str, str], list[Entry]] = {}
-    for entry in entries:
-        by_kind.setdefault((entry.node, entry.layer), []).append(entry)
-    for same in by_kind.values():
-        same.sort(key=lambda entry: entry.start)
-        starts = sorted({entry.start for entry in same})
-        following = dict(zip(starts, [*starts[1:], _NEVER], strict=True))
-        for entry in same:
-            yield entry if entry.end < _NEVER else entry._replace(end=following[entry.start])
+def home_folder(log: Path) -> Path:
+    """Return the folder that has the folders of years; of another layout that of the log."""
+    folder = log.parent
+    days = "/".join(part.name for part in (folder.parent.parent, folder.parent, folder))
+    return folder.parent.parent.parent if _DAY.fullmatch(days) else folder
 
 
-def _record(path: Path) -> Mapping[str, str] | None:
-    with LogFile(path) as file:
-        return next(iter(read_provenance(file)), None)
+def _logs_by_node(root: Path) -> list[list[Path]]:
+    """List the logs of each node of a home, in the order of time."""
+    nodes: dict[str, list[tuple[str, Path]]] = {}
+    for log in (*root.glob("*"), *root.glob(_DAYS)):
+        if home_folder(log) == root and is_log(log) and not is_layer(log):
+            name = log_name(log)
+            time = name.time or f"{_first_time(log):020}"
+            nodes.setdefault(name.node, []).append((time, log))
+    return [[log for _, log in sorted(logs)] for _, logs in sorted(nodes.items())]
+
+
+def _first_time(log: Path) -> int:
+    with suppress(LogError):  # why it cannot be read will be said when it is labelled
+        return (time_span(log) or (0, 0))[0]
+    return 0

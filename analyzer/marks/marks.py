@@ -20,18 +20,18 @@ from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.files import SUFFIX, stem
+from hearthlog.schemas.logs.files import SUFFIX, review_path, stem
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import Topic, check_microphone_name, topic
+from hearthlog.schemas.messages.topics import REVIEW, Topic, check_microphone_name, labelling_topic
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
 PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
-_KINDS = {message_types.SEGMENT: "review/segment", message_types.MARK: "review/mark"}
+_KINDS = {message_types.SEGMENT: "segment", message_types.MARK: "mark"}
 _SPAN = ("header.stamp", "duration", "label")
 _SAYS = ("reviewer", "made", "corrects")
 _FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_SAYS)}
@@ -67,11 +67,6 @@ class MarkedSpan(NamedTuple):
     end: int
 
 
-def review_path(log: Path) -> Path:
-    """Name the review layer of a log, finished or not."""
-    return log.with_name(f"{stem(log)}.review{SUFFIX}")
-
-
 def read_marks(log: Path) -> list[Mark]:
     """Read the marks of a log, those of each microphone in the order of time.
 
@@ -95,7 +90,7 @@ def read_marks(log: Path) -> list[Mark]:
         raise LogError(f"{path}: is cut off; `hearthlog recover` saves what is there of it")
     for name, same in selection.channels.items():
         kind = next((k for k in _KINDS if all(is_compatible(*d, k, _FIELDS[k]) for d in same)), "")
-        if not kind or not re.fullmatch(rf"/[^/]+/{_KINDS[kind]}", name):
+        if not kind or not re.fullmatch(rf"/[^/]+/{REVIEW}/{_KINDS[kind]}", name):
             raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
     selection.verify()
     spans: list[Mark] = []
@@ -223,7 +218,11 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
 def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
     """Make the file; elsewhere, for there it must not be taken for a log being written."""
     microphones = sorted({mark.microphone for mark in marks})
-    topics = [Topic(topic(m, kind), type_) for type_, kind in _KINDS.items() for m in microphones]
+    topics = [
+        Topic(labelling_topic(microphone, REVIEW, kind), type_)
+        for type_, kind in _KINDS.items()
+        for microphone in microphones
+    ]
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         writer = LogWriter(Path(folder) / name, topics, about)
         writer.write_columns([_rows(t.name, t.type, marks) for t in topics])

@@ -4,7 +4,6 @@ import glob
 import hashlib
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -13,14 +12,12 @@ from typing import NamedTuple
 
 from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.logs.provenance import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import Topic, topic
+from hearthlog.schemas.messages.topics import Topic, labelling_topic, relabelling
 
 _TAIL = 1 << 16  # bytes
-_NO_TOPIC = re.compile("[^A-Za-z0-9_]")
 _RUN = ("label", "start", "frames", "confidence")
 
 
@@ -62,15 +59,10 @@ class About(NamedTuple):
     lost: str
 
 
-def layer_path(log: Path, model: str) -> Path:
-    """Name the layer of a log."""
-    return log.with_name(f"{stem(log)}.relabel-{model}{SUFFIX}")
-
-
 def topics_of(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
     """Return the topics of the labels and of the segments."""
-    name = _NO_TOPIC.sub("_", model)
-    label, segment = (topic(microphone, f"relabel/{name}/{kind}") for kind in ("label", "segment"))
+    labelling = relabelling(model)
+    label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
     return (
         Topic(label, message_types.LABEL, array_names={"probabilities": classes}),
         Topic(segment, message_types.SEGMENT),

@@ -7,13 +7,13 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hearthlog.analyzer.logs.chains import is_active
 from hearthlog.analyzer.logs.recorder_info import Origin, read_origin
 from hearthlog.analyzer.relabel.stream import Stream
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import is_active
 from hearthlog.schemas.salvage.recover import recover_log
 from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.times import NANOSECONDS

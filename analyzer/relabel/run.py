@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hearthlog.analyzer.logs.chains import Chain, find_chains, is_active
+from hearthlog.analyzer.logs.layers import Chain, find_chains
 from hearthlog.analyzer.relabel.labels import Job, Labelled, complete_layer, label_log
-from hearthlog.analyzer.relabel.layer import About, digest, layer_path, read_about
+from hearthlog.analyzer.relabel.layer import About, digest, read_about
 from hearthlog.analyzer.workers import Workers
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.logs.files import stem
+from hearthlog.schemas.logs.files import is_active, relabel_path, stem
 from hearthlog.schemas.logs.provenance import check_version
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
@@ -171,7 +171,7 @@ class _Relabelling:
     def _look_at(self, log: Path) -> tuple[About | None, str] | HearthlogError:
         """Read what the layer of a log says of itself, and the digest of the log."""
         try:
-            return read_about(layer_path(log, self._model.name)), digest(log)
+            return read_about(relabel_path(log, self._model.name)), digest(log)
         except HearthlogError as error:
             return error
 
@@ -199,7 +199,7 @@ class _Relabelling:
         first = max(place - _MOST_BEFORE, 0) if carried else 0
         return Job(
             log=log,
-            layer=layer_path(log, self._model.name),
+            layer=relabel_path(log, self._model.name),
             before=tuple(reversed(chain.logs[first:place])),
             behind=chain.logs[place + 1] if place + 1 < len(chain.logs) else None,
             model=self._model_path,

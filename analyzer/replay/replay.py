@@ -15,7 +15,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.logs.merged_reading import time_spans
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
@@ -62,7 +62,7 @@ class LogSet:
     """
 
     def __init__(self, paths: Sequence[Path], kind: str) -> None:
-        spans = sorted((*span, path) for path in paths if (span := time_span(path)) is not None)
+        spans = time_spans(paths)
         if not spans:
             raise LogError(f"{paths[0]}: no messages, nothing to replay")
         self.kind = kind

@@ -16,7 +16,6 @@ from hearthlog.analyzer.report.class_words import (
 )
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.html import box, figure, heading, page, paragraph, swatch, table
-from hearthlog.analyzer.report.read_home import LIVE
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
 from hearthlog.analyzer.report.summary_text import (
@@ -30,6 +29,7 @@ from hearthlog.analyzer.report.summary_text import (
 )
 from hearthlog.analyzer.report.values import Count, Minutes, Value
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
+from hearthlog.schemas.messages.topics import LIVE
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95

@@ -1,6 +1,5 @@
 """What the logs of a home say: segments, with what a reviewer says; gaps; trouble."""
 
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
-from hearthlog.analyzer.logs.layers import RELABEL, REVIEW, Entry, Shelf
+from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, without
 from hearthlog.analyzer.logs.typed_columns import is_compatible
@@ -25,20 +24,24 @@ from hearthlog.models.modelfile.card import DESCRIPTION
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import SUFFIX, stem
+from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, microphone_of
+from hearthlog.schemas.messages.topics import (
+    DIAGNOSTICS,
+    LIVE,
+    labelling_topic,
+    microphone_of,
+    relabelling,
+)
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
-LIVE = "live"
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
 _LATEST = 1 << 61
 _MOST_CLASSES = 100
 _FIELDS = {"header.stamp", "duration", "label", "confidence"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
-_SEGMENTS = re.compile(r"/(?P<microphone>[^/]+)/segment")
 Source = tuple[str, str]  # node, microphone
 
 
@@ -94,7 +97,7 @@ class Heard:
 
 
 def read_heard(
-    shelf: Shelf,
+    shelf: HomeLogs,
     labelling: str,
     since: int,
     close: tuple[int, int],
@@ -104,7 +107,7 @@ def read_heard(
 
     Parameters
     ----------
-    shelf : Shelf
+    shelf : HomeLogs
     labelling : str
         `live`, or the model of relabel layers.
     since : int
@@ -126,7 +129,8 @@ def read_heard(
     near = shelf.between(*close)
     microphones = _look_closely(heard, near, close)
     _read_late_gaps(heard, shelf, close[1])
-    topics = {segment_topic(name, labelling) for name in microphones}
+    name = labelling if labelling == LIVE else relabelling(labelling)
+    topics = {labelling_topic(microphone, name, "segment") for microphone in microphones}
     found: dict[Source, list[Columns]] = {}
     wanted = shelf.between(since, close[1] + _LATE, layer)
     for i, entry in enumerate(wanted):
@@ -135,34 +139,27 @@ def read_heard(
         progress((i + 1) / len(wanted))
     for source, parts in sorted(found.items()):
         heard.segments[source] = _in_order(source, parts)
-    marks = _marks(heard, shelf.between(since, close[1], REVIEW))
+    marks = _marks(heard, shelf.between(since, close[1], REVIEW_LAYER))
     for source, own in marks.items():
         before = heard.segments.get(source, _of_marks([]))
         heard.segments[source] = _corrected(before, _of_marks(own))
     _check(heard, shelf, labelling, close)
-    _name_classes(heard, shelf.between(*close, layer), labelling)
+    _name_classes(heard, shelf.between(*close, layer), name)
     if labelling == LIVE:
         heard.precisions = _precisions(near)
     return heard
 
 
-def segment_topic(microphone: str, labelling: str) -> str:
-    """Name the topic of the segments of a labelling."""
-    if labelling == LIVE:
-        return f"/{microphone}/segment"
-    return f"/{microphone}/relabel/{re.sub(r'[^A-Za-z0-9_]', '_', labelling)}/segment"
-
-
-def _layer(shelf: Shelf, labelling: str) -> str:
+def _layer(shelf: HomeLogs, labelling: str) -> str:
     if labelling == LIVE:
         return ""
     if labelling not in shelf.layers:
         there = ", ".join([LIVE, *shelf.layers])
         raise DataError(f"no labelling {labelling[:64]!r} beside these logs; there is {there}")
-    return RELABEL + labelling
+    return RELABEL_LAYER + labelling
 
 
-def _look_closely(heard: Heard, entries: Sequence[Entry], close: tuple[int, int]) -> set[str]:
+def _look_closely(heard: Heard, entries: Sequence[HomeLog], close: tuple[int, int]) -> set[str]:
     """Read gaps and diagnostics of the days that are reported, and return the microphones."""
     microphones: set[str] = set()
     nodes: dict[str, None] = {}
@@ -197,7 +194,7 @@ def _is_complete(path: Path) -> bool:
         return file.complete
 
 
-def _read_late_gaps(heard: Heard, shelf: Shelf, end: int) -> None:
+def _read_late_gaps(heard: Heard, shelf: HomeLogs, end: int) -> None:
     """Read gaps that end after the days that are reported: they are in later logs."""
     later = [entry for entry in shelf.between(end, _LATEST) if entry.start >= end]
     for number, entry in enumerate(later):
@@ -217,7 +214,7 @@ def _topics_of(selection: Selection, kind: str, fields: Collection[str]) -> list
 
 
 def _segments(
-    heard: Heard, entry: Entry, topics: set[str], limits: tuple[int, int]
+    heard: Heard, entry: HomeLog, topics: set[str], limits: tuple[int, int]
 ) -> Iterator[Columns]:
     try:
         selection = select([entry.path])
@@ -273,12 +270,11 @@ def _chances(confidences: NDArray[Any]) -> NDArray[np.float64]:
     return np.clip(np.nan_to_num(confidences.astype(np.float64)), 0.0, 1.0)
 
 
-def _marks(heard: Heard, layers: Iterable[Entry]) -> dict[Source, list[Mark]]:
+def _marks(heard: Heard, layers: Iterable[HomeLog]) -> dict[Source, list[Mark]]:
     found: dict[Source, list[Mark]] = {}
     for entry in layers:
-        log = entry.path.with_name(stem(entry.path).removesuffix(f".{REVIEW}") + SUFFIX)
         try:
-            for mark in read_marks(log):
+            for mark in read_marks(log_of_layer(entry.path)):
                 found.setdefault((entry.node, mark.microphone), []).append(mark)
         except LogError as error:
             _lose(heard, str(error))
@@ -311,7 +307,7 @@ def _corrected(segments: Segments, marks: Segments) -> Segments:
     )
 
 
-def _check(heard: Heard, shelf: Shelf, labelling: str, close: tuple[int, int]) -> None:
+def _check(heard: Heard, shelf: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
     """Raise DataError unless something was heard in the days that are reported."""
     days = Spans(np.array([close[0]]), np.array([close[1]]))
     if any(common(segments.spans, days).length for segments in heard.segments.values()):
@@ -326,7 +322,7 @@ def _check(heard: Heard, shelf: Shelf, labelling: str, close: tuple[int, int]) -
     raise DataError(f"no labels of {labelling} in the logs of that time: {advice}{loss}")
 
 
-def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> None:
+def _name_classes(heard: Heard, entries: Iterable[HomeLog], labelling: str) -> None:
     """Find which classes there may be: those that logs name, and those that there are."""
     names: dict[Source, dict[str, None]] = {source: {} for source in heard.segments}
     for entry in entries:
@@ -335,7 +331,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
         except LogError:
             continue  # it has been named
         for node, microphone in heard.segments:
-            topic = segment_topic(microphone, labelling).removesuffix("segment") + "label"
+            topic = labelling_topic(microphone, labelling, "label")
             for channel, _ in selection.channels.get(topic, ()) if node == entry.node else ():
                 said = array_names(channel.metadata, "probabilities")
                 names[node, microphone] |= dict.fromkeys(said)
@@ -345,7 +341,7 @@ def _name_classes(heard: Heard, entries: Iterable[Entry], labelling: str) -> Non
         heard.known[source] = list(dict.fromkeys(sound))[:_MOST_CLASSES]
 
 
-def _precisions(entries: Iterable[Entry]) -> dict[str, float]:
+def _precisions(entries: Iterable[HomeLog]) -> dict[str, float]:
     """Read from the models that logs name how often a class was right; the last log counts."""
     found: Mapping[str, float] = {}
     for entry in entries:

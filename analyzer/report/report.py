@@ -7,17 +7,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.logs.health import Trouble
-from hearthlog.analyzer.logs.layers import Shelf, check_day
+from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.spans import common, one
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
 from hearthlog.analyzer.report.page import day_page, week_page
-from hearthlog.analyzer.report.read_home import LIVE, Heard, read_heard
+from hearthlog.analyzer.report.read_home import Heard, read_heard
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.new_files import check_new, new_file
 
@@ -42,7 +43,7 @@ class Made:
 
 
 def make_report(
-    shelf: Shelf,
+    shelf: HomeLogs,
     period: Period,
     page: Path,
     labelling: str = LIVE,
@@ -52,7 +53,7 @@ def make_report(
 
     Parameters
     ----------
-    shelf : Shelf
+    shelf : HomeLogs
     period : Period
     page : Path
         Of the HTML file; the picture is beside it, with the suffix `.png`.

@@ -3,7 +3,7 @@
 import re
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
@@ -12,8 +12,14 @@ from hearthlog.schemas.storage.regular_file import may_be_regular
 from hearthlog.schemas.times import NANOSECONDS
 
 SUFFIX = ".mcap"
-AUDIO_SUFFIX = ".audio" + SUFFIX
-_LAYER = re.compile(r"\.(relabel-.+|review|audio)\.mcap(\.active)?")
+AUDIO_LAYER, REVIEW_LAYER, RELABEL_LAYER = (
+    "audio",
+    "review",
+    "relabel-",
+)  # layers; the last with a model behind it
+AUDIO_SUFFIX = f".{AUDIO_LAYER}{SUFFIX}"
+_NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER}))?", re.DOTALL)
+_RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
 ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
 
@@ -39,9 +45,53 @@ def active_path(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
 
 
+class LogName(NamedTuple):
+    """What the name of a file says.
+
+    Attributes
+    ----------
+    log : str
+        Name of the log without its suffix, of a layer that of the log it speaks of.
+    layer : str
+        `audio`, `review` or `relabel-<model>`; empty for a log.
+    node, time : str
+        `20260301T120000Z`, and what may be behind it; empty if no recorder gave the name.
+    """
+
+    log: str
+    layer: str
+    node: str
+    time: str
+
+
+def log_name(path: Path) -> LogName:
+    """Take the name of a log or a layer apart."""
+    parts = _NAME.fullmatch(stem(path))
+    if parts is None:  # nothing but a suffix
+        return LogName("", "", "", "")
+    log, layer = parts.groups("")
+    recorded = _RECORDED.fullmatch(log)
+    return LogName(log, layer, *(recorded.groups() if recorded else ("", "")))
+
+
 def audio_path(log: Path) -> Path:
     """Name the layer of a log that has its clips of sound."""
     return log.with_name(stem(log) + AUDIO_SUFFIX)
+
+
+def review_path(log: Path) -> Path:
+    """Name the review layer of a log, finished or not."""
+    return log.with_name(f"{stem(log)}.{REVIEW_LAYER}{SUFFIX}")
+
+
+def relabel_path(log: Path, model: str) -> Path:
+    """Name the layer of a log that has the labels of a model."""
+    return log.with_name(f"{stem(log)}.{RELABEL_LAYER}{model}{SUFFIX}")
+
+
+def log_of_layer(layer: Path) -> Path:
+    """Name the finished log that a layer speaks of."""
+    return layer.with_name(log_name(layer).log + SUFFIX)
 
 
 def stem(log: Path) -> str:
@@ -49,9 +99,14 @@ def stem(log: Path) -> str:
     return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
 
 
+def is_active(path: Path) -> bool:
+    """Tell by its name whether a log is still being written."""
+    return path.name.endswith(ACTIVE_SUFFIX)
+
+
 def is_layer(path: Path) -> bool:
     """Tell by its name whether a log is a layer, which speaks of another log."""
-    return _LAYER.search(path.name) is not None
+    return bool(log_name(path).layer)
 
 
 def is_log(path: Path) -> bool:

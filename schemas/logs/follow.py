@@ -9,7 +9,7 @@ from threading import Event
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, stem
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.mcap.chunks import RawMessages, read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
@@ -93,9 +93,9 @@ def follow_messages(
     watch = _Folder(folder)
     present = watch.new_logs()
     if start is not None:
-        finished = [path for path in present if not path.name.endswith(ACTIVE_SUFFIX)]
+        finished = [path for path in present if not is_active(path)]
         yield from _read_finished(finished, topics, start, damaged)
-    growing = [g for path in present if path.name.endswith(ACTIVE_SUFFIX) for g in _open(path)]
+    growing = [g for path in present if is_active(path) for g in _open(path)]
     if start is None:
         for log in growing:
             log.file.scan_new()  # and forget what was written before

@@ -3,12 +3,18 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import message_types
 
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"
+LIVE, REVIEW, RELABEL = "live", "review", "relabel"  # labellings; `relabel/<model>` by its model
+_MICROPHONE = "[a-z](?:_?[a-z0-9])*"
+_OF_LAYER = rf"{REVIEW}|{RELABEL}/\w{{1,200}}"
+LABELLING = re.compile(f"{LIVE}|{_OF_LAYER}", re.ASCII)
+_TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_OF_LAYER})/)?(\w+)", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class Topic:
 
 def check_microphone_name(name: str) -> str:
     """Return the name if it can be part of a ROS topic."""
-    if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
+    if not re.fullmatch(_MICROPHONE, name):
         raise LogError(
             f"microphone name {name!r} cannot be a topic: use lower-case letters, digits and "
             "single underscores, starting with a letter"
@@ -57,6 +63,39 @@ def check_microphone_name(name: str) -> str:
 def topic(microphone: str, kind: str) -> str:
     """Name the topic of one kind (`info`, `features`, `label` …) of a microphone."""
     return f"/{microphone}/{kind}"
+
+
+class TopicName(NamedTuple):
+    """The parts of the name of a topic.
+
+    Attributes
+    ----------
+    microphone : str
+    labelling : str
+        `live`, `review` or `relabel/<model>`.
+    kind : str
+        `features`, `label`, `segment` …
+    """
+
+    microphone: str
+    labelling: str
+    kind: str
+
+
+def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
+    """Name the topic of one kind (`label`, `segment`, `mark`) of a labelling."""
+    return topic(microphone, kind if labelling == LIVE else f"{labelling}/{kind}")
+
+
+def relabelling(model: str) -> str:
+    """Name the labelling of a model that relabelled logs."""
+    return f"{RELABEL}/{re.sub('[^A-Za-z0-9_]', '_', model)}"
+
+
+def parse_topic(name: str) -> TopicName | None:
+    """Return the parts of a topic of a microphone; None if it is none."""
+    match = _TOPIC.fullmatch(name)
+    return None if match is None else TopicName(match[1], match[2] or LIVE, match[3])
 
 
 def microphone_of(topic: str) -> str:

@@ -57,7 +57,8 @@ def diff(
 
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
-    from hearthlog.analyzer.logs.labellings import find_sources, segment_topic
+    from hearthlog.analyzer.logs.labellings import find_sources
+    from hearthlog.schemas.messages.topics import labelling_topic
 
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
@@ -81,7 +82,7 @@ def diff(
         print(json.dumps({**result.about, "spans": spans_as_text}, allow_nan=False))
     else:
         print(*result.table, sep="\n")
-    _report_losses(sources, [segment_topic(name, each) for each in chosen])
+    _report_losses(sources, [labelling_topic(name, each, "segment") for each in chosen])
 
 
 class _Result(NamedTuple):
@@ -109,10 +110,10 @@ def _queue(
     limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:
-    from hearthlog.analyzer.logs.labellings import REVIEW
     from hearthlog.analyzer.review.queue.queue_table import queue_table
     from hearthlog.analyzer.review.queue.ranking import make_queue
     from hearthlog.analyzer.review.queue.review_list import queued
+    from hearthlog.schemas.messages.topics import REVIEW
 
     names = [side.name for side in sides]
     if REVIEW in names:

@@ -11,7 +11,7 @@ from hearthlog.tools.cli.selection import Logs, wrong_use
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.layers import Shelf
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 _YEARS = range(1970, 2200)
 
@@ -50,11 +50,11 @@ def report(
         wrong_use(f"--output {output}: a page is named *.html")
     first = None if day is None and week is None else _first_day(day, week)
 
-    from hearthlog.analyzer.logs.layers import find_shelf
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
-    shelf = find_shelf(logs)
+    shelf = find_home_logs(logs)
     zone = home_zone(timezone, shelf.records())
     if first is None:
         first = shelf.last_whole_day(zone)
@@ -83,7 +83,7 @@ def _first_day(day: str | None, week: str | None) -> date:
     return found if week is None else found - timedelta(days=found.weekday())
 
 
-def _name(shelf: "Shelf", first: date, count: int) -> str:
+def _name(shelf: "HomeLogs", first: date, count: int) -> str:
     """Name a page after the home and the day."""
     node = next((entry.node for entry in shelf.entries if entry.node), "home")
     when = f"{first}" if count == 1 else f"{first:%G-W%V}"

@@ -98,8 +98,8 @@ def _end(number: int, _frame: object) -> None:
 
 def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
     """Read the option --day: from midnight to midnight, at home."""
+    from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.logs.local_time import day_span
-    from hearthlog.analyzer.logs.timeline_files import zone_of
 
     zone = zone_of(logs, timezone)
     today = datetime.now(zone).date()
@@ -212,7 +212,8 @@ def _work(
     from hearthlog.analyzer.logs.labellings import find_sources
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import queue_items
-    from hearthlog.analyzer.review.timeline.model import LIVE, no_spans
+    from hearthlog.analyzer.review.timeline.model import no_spans
+    from hearthlog.schemas.messages.topics import LIVE
 
     known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []

@@ -118,7 +118,7 @@ def _follow(
     logs: Path, start: int, timezone: str | None, server: "LiveServer", stop: Event
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
-    from hearthlog.analyzer.logs.timeline_files import zone_of
+    from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.review.timeline.live import Live
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages

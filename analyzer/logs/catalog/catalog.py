@@ -20,22 +20,16 @@ from hearthlog.analyzer.logs.catalog.file import (
     write_table,
 )
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import CATALOG, SUFFIX, find_logs, stem
+from hearthlog.schemas.logs.files import CATALOG, find_logs, log_name, log_of_layer
+from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
 from hearthlog.schemas.storage.new_files import replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
-LOG, RELABEL, REVIEW = "log", "relabel", "review"
+LOG = "log"  # the kind of a file that is no layer
 FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"
-_SEGMENT_TOPICS = {
-    LOG: "/[^/]+/segment",
-    RELABEL: "/[^/]+/relabel/[^/]+/segment",
-    REVIEW: "/[^/]+/review/segment",
-}
 _HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
-_NODE = re.compile(r"(.+)_\d{8}T\d{6}Z")
-_LAYER = re.compile(rf"(.+)\.(?:({RELABEL})-.+|({REVIEW})){re.escape(SUFFIX)}", re.DOTALL)
 _BATCH = 1000  # rows
 _NEVER = -1
 
@@ -226,10 +220,10 @@ def _divided(logs: Sequence[Path], known: Catalog | None) -> tuple[list[int], li
 
 def _read_row(folder: Path, path: Path) -> list[Row]:
     """Make the row of a file; none if the file has gone."""
-    name = stem(path) + SUFFIX
-    layer = _LAYER.fullmatch(name)
-    kind = LOG if layer is None else layer[2] or layer[3]
-    node = _NODE.match(name)
+    name = log_name(path)
+    kind = name.layer.partition("-")[0]
+    if kind not in {RELABEL, REVIEW}:  # sound is no labelling
+        kind = LOG
     home = _HOME.fullmatch(_relative(path, folder))
     try:
         size, mtime = _size_and_time(path)
@@ -238,14 +232,14 @@ def _read_row(folder: Path, path: Path) -> list[Row]:
     row = Row(
         path=_relative(path, folder),
         home="" if home is None else home[1] or "",
-        node=None if node is None else node[1],
+        node=name.node or None,
         kind=kind,
-        log=layer and _relative(path.with_name(layer[1] + SUFFIX), folder),
+        log=None if kind == LOG else _relative(log_of_layer(path), folder),
         size=size,
         mtime=mtime,
     )
     try:
-        return [_filled(row, read_contents(path, _SEGMENT_TOPICS[kind]))]
+        return [_filled(row, read_contents(path, LIVE if kind == LOG else kind))]
     except LogError as error:
         if not path.exists():  # a recorder has completed it, and given it another name
             return []

@@ -1,6 +1,5 @@
 """What one log holds, found with as little reading as will do: features are not decoded."""
 
-import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile, time_span
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import microphone_of
+from hearthlog.schemas.messages.topics import microphone_of, parse_topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
@@ -69,14 +68,14 @@ class Contents:
     segments: Counter[str] = field(default_factory=Counter)
 
 
-def read_contents(path: Path, segment_topic: str) -> Contents:
+def read_contents(path: Path, labelling: str) -> Contents:
     """Find out what a log holds.
 
     Parameters
     ----------
     path : Path
-    segment_topic : str
-        A pattern: segments of other topics are not counted.
+    labelling : str
+        `live`, `relabel` or `review`: segments of others are not counted.
 
     Raises
     ------
@@ -86,7 +85,7 @@ def read_contents(path: Path, segment_topic: str) -> Contents:
     span = time_span(path)
     with LogFile(path) as file:
         found = Contents(file.complete, span, _about(file))
-        reading = _Reading(file, found, re.compile(segment_topic))
+        reading = _Reading(file, found, labelling)
         if file.statistics is None:  # nothing says how many messages there are, or where
             reading.read(file.chunks, _EVENTS | _FEATURES)
         else:
@@ -119,10 +118,10 @@ def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
 class _Reading:
     """Reads messages of one log, and notes in its contents what they say."""
 
-    def __init__(self, file: LogFile, found: Contents, segment_topic: re.Pattern[str]) -> None:
+    def __init__(self, file: LogFile, found: Contents, labelling: str) -> None:
         self._file = file
         self._found = found
-        self._segment_topic = segment_topic
+        self._labelling = labelling
 
     def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
         """Return the channels of some types, of which some fields are wanted."""
@@ -156,8 +155,13 @@ class _Reading:
         elif columns.type == message_types.GAP:
             self._found.gaps += len(columns)
             self._found.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
-        elif self._segment_topic.fullmatch(columns.topic):
+        elif self._is_labelled(columns.topic):
             self._note_segments(columns)
+
+    def _is_labelled(self, name: str) -> bool:
+        topic = parse_topic(name)
+        labelling = "" if topic is None else topic.labelling.partition("/")[0]
+        return labelling == self._labelling and name.endswith("/segment")
 
     def _note_features(self, columns: Columns) -> None:
         ends = columns.take(np.array([0, len(columns) - 1]))

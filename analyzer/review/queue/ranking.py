@@ -7,7 +7,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY, events_of
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources, label_topic
+from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,
     judgeable_spans,
@@ -18,6 +18,7 @@ from hearthlog.analyzer.review.queue.uncertainty import ModelUncertainty
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.messages.topics import labelling_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 # Of two that differ one may be right, and what is new may be labelled well.
@@ -108,7 +109,7 @@ def make_queue(  # noqa: PLR0913
     if not len(windows):
         raise DataError(f"{side.name}: nothing is left to review")
     doubt = ModelUncertainty(windows, classes)
-    _add_frames(doubt, sources, label_topic(microphone, side.name), windows, progress)
+    _add_frames(doubt, sources, labelling_topic(microphone, side.name, "label"), windows, progress)
     if other is None and not (doubt.uncertainty.known or doubt.novelty.known):
         raise DataError(
             f"{side.name}: the logs do not say how sure the model was (no labels with "

@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.review.queue.ranking import ReviewQueue
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.topics import check_microphone_name
+from hearthlog.schemas.messages.topics import LABELLING, check_microphone_name
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import read_time, time_text
 
@@ -21,7 +21,6 @@ MOST_SPANS = 100_000
 REASONS = ("uncertainty", "disagreement", "novelty")
 _SIZE_LIMIT = 64 << 20
 _LATEST = 1 << 62  # nanoseconds
-_LABELLING = re.compile(r"live|review|relabel/\w{1,200}", re.ASCII)
 _NUMBER = re.compile(r"[0-9]{1,3}(\.[0-9]{1,20})?")
 
 
@@ -140,7 +139,7 @@ def _span(where: str, fields: Sequence[str]) -> ReviewSpan:
     except LogError as error:
         raise DataError(f"{where}: {error}") from error
     for labelling, label in ((a, label_a), *([(b, label_b)] if b or label_b else [])):
-        if not _LABELLING.fullmatch(labelling):
+        if not LABELLING.fullmatch(labelling):
             raise DataError(f"{where}: {labelling[:64]!r} is no labelling")
         if not CLASS_NAME.fullmatch(label) and (labelling, label) != (b, ""):
             raise DataError(f"{where}: {label[:64]!r} cannot be the name of a class")

@@ -4,10 +4,11 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labellings import REVIEW, Sources
+from hearthlog.analyzer.logs.labellings import Sources
 from hearthlog.analyzer.review.queue.ranking import RANKINGS, make_queue
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan, queued, read_list
 from hearthlog.analyzer.review.session.session import ReviewItem
+from hearthlog.schemas.messages.topics import REVIEW
 
 Limits = tuple[int | None, int | None]
 

@@ -1,6 +1,5 @@
 """What a timeline takes of logs: topics, fields, and what is made of them."""
 
-import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -10,12 +9,9 @@ from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans,
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import REVIEW, TopicName, parse_topic
 
-TOPIC = re.compile(
-    r"/(?P<microphone>[a-z](?:_?[a-z0-9])*)/(?:(?P<labelling>relabel/\w{1,200})/)?"
-    r"(?P<kind>features|label|segment|gap)",
-    re.ASCII,
-)
+_KINDS = {"features", "label", "segment", "gap"}
 FIELDS = {
     message_types.FEATURES: ("header.stamp", "values"),
     message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
@@ -25,6 +21,14 @@ FIELDS = {
     message_types.LOG: ("stamp", "level", "msg"),
 }
 _QUIETEST = 1e-10  # of a mean square: -100 dB
+
+
+def shown_topic(name: str) -> TopicName | None:
+    """Return the parts of a topic that has a part in the timeline; marks are read otherwise."""
+    topic = parse_topic(name)
+    if topic is None or topic.kind not in _KINDS or topic.labelling == REVIEW:
+        return None
+    return topic
 
 
 def decibel(energy: Any) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.typed_columns import decode_types
-from hearthlog.analyzer.review.timeline.decode import FIELDS, TOPIC, decibel, spans_of
+from hearthlog.analyzer.review.timeline.decode import FIELDS, decibel, shown_topic, spans_of
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.lanes import Changes, changes, clock
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
@@ -23,6 +23,7 @@ from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.mcap.chunks import RawMessages
 from hearthlog.schemas.mcap.logfile import time_span
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 
 LIVE_LANE, GAP_LANE, TROUBLE_LANE = "live", "not heard", "trouble"
@@ -128,8 +129,8 @@ class Live:
             yield LogLines(columns["stamp"], columns["level"], columns["msg"])
         elif columns.type == message_types.DIAGNOSTICS:
             yield from _health(columns)
-        elif (match := TOPIC.fullmatch(columns.topic)) and not match["labelling"]:
-            microphone = match["microphone"]
+        elif (topic := shown_topic(columns.topic)) and topic.labelling == LIVE:
+            microphone = topic.microphone
             if columns.type == message_types.FEATURES:
                 yield from self._clock(columns["header.stamp"])
                 yield from self._features(path, microphone, columns)
@@ -246,7 +247,7 @@ def _gaps(microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
 def _health(columns: Columns) -> Iterator[Lane]:
     names = columns["header.frame_id"]
     for name in np.unique(names.astype(str)).tolist():
-        if not TOPIC.fullmatch(f"/{name}/gap"):
+        if not shown_topic(f"/{name}/gap"):
             continue
         own = names == name
         levels = [

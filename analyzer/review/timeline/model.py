@@ -11,8 +11,6 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 
-LIVE, REVIEW = "live", "review"
-
 
 class LabelledSpans(NamedTuple):
     """Spans of time that say something.

@@ -1,6 +1,5 @@
 """Read logs, their layers and clips, as a timeline: once through, within bounded memory."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,23 +12,21 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.coverage import coverage_of
+from hearthlog.analyzer.logs.layers import TimedFile, find_timed_files, latest_records
 from hearthlog.analyzer.logs.local_time import home_zone
-from hearthlog.analyzer.logs.timeline_files import File, find_files, records_of
 from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.timeline.decode import (
     FIELDS,
-    TOPIC,
     chained,
     decibel,
     lasting,
     runs,
+    shown_topic,
     spans_of,
 )
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.model import (
-    LIVE,
-    REVIEW,
     FrameValues,
     GridSeries,
     LabelledSpans,
@@ -43,9 +40,11 @@ from hearthlog.analyzer.review.timeline.model import (
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.files import AUDIO_LAYER, REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import LIVE, REVIEW, parse_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
@@ -53,7 +52,6 @@ _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
 _ENERGY = "energy"
-_RELABELLED = re.compile(r"\.(?=relabel-)")  # in the name of a layer, between log and labelling
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
 
 
@@ -88,7 +86,7 @@ def read_timeline(
         If there is nothing in this span of time.
     """
     losses: list[str] = []
-    found = find_files(paths, start, end, losses)
+    found = find_timed_files(paths, start, end, losses)
     if not found:
         raise _nothing(losses, limited=start is not None or end is not None)
     first = min(file.first for file in found) if start is None else start
@@ -103,7 +101,7 @@ def read_timeline(
         except (LogError, DataError) as error:
             losses.append(str(error))
         progress((number + 1) / len(found))
-    known = home_zone(zone, records_of(file.path for file in found))
+    known = home_zone(zone, latest_records(file.path for file in found))
     microphones = reader.microphones()
     heard = {
         name: coverage_of(
@@ -179,12 +177,12 @@ class _Reader:
         self._clip_seconds = 0.0
         self._layers: dict[tuple[Path, str], Path] = {}
 
-    def read(self, file: File) -> None:
+    def read(self, file: TimedFile) -> None:
         """Take a log or a layer."""
-        if file.path.name.endswith(".audio.mcap"):
+        if file.layer == AUDIO_LAYER:
             self._read_clips(file.path)
             return
-        if ".review." in file.path.name:
+        if file.layer == REVIEW_LAYER:
             return  # with its log
         kinds = FIELDS
         if file.layer:
@@ -193,7 +191,7 @@ class _Reader:
         if not file.layer:
             self._read_marks(file.path)  # last, for a damaged layer must not hide its log
 
-    def _read_messages(self, file: File, kinds: Mapping[str, Sequence[str]]) -> None:
+    def _read_messages(self, file: TimedFile, kinds: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
             decoded = partial(decode_types, file.path, types=kinds)
             span = (self._grid.start, end)
@@ -203,7 +201,7 @@ class _Reader:
                 if min(int(columns.log_times[0]) for columns in batch) > self._grid.end:
                     break  # what ended later began later, but for what lasted for minutes
 
-    def _parts(self, file: File) -> Iterator[tuple[list[str] | None, int | None, int]]:
+    def _parts(self, file: TimedFile) -> Iterator[tuple[list[str] | None, int | None, int]]:
         """Yield topics, the log time up to which they are read, and one of how many chunks."""
         with LogFile(file.path) as log:
             topics = [channel.topic for channel in log.channels.values()]
@@ -220,7 +218,7 @@ class _Reader:
 
     def _check_alone(self, path: Path, topics: Sequence[str]) -> None:
         """Raise LogError if another layer of the same log has the same labelling."""
-        log = path.with_name(_RELABELLED.split(path.name)[0])
+        log = log_of_layer(path)
         for topic in topics:
             other = self._layers.setdefault((log, topic), path)
             if other != path:
@@ -234,10 +232,10 @@ class _Reader:
             self._take_lines(columns)
         elif columns.type == message_types.DIAGNOSTICS:
             self._take_health(columns)
-        elif match := TOPIC.fullmatch(columns.topic):
-            heard = self._microphone(match["microphone"])
+        elif topic := shown_topic(columns.topic):
+            heard = self._microphone(topic.microphone)
             heard.logs.add(path)
-            name = match["labelling"] or LIVE
+            name = topic.labelling
             if columns.type == message_types.FEATURES:
                 self._take_features(path, columns, heard)
             elif columns.type == message_types.LABEL:
@@ -294,7 +292,7 @@ class _Reader:
         )
         for stamp, name, statuses in rows:
             bad = [status["message"] for status in statuses if status["level"]]
-            if TOPIC.fullmatch(f"/{name}/gap"):
+            if shown_topic(f"/{name}/gap"):
                 self._microphone(name).troubles.append((stamp, "; ".join(bad)[:200]))
 
     def _read_marks(self, log: Path) -> None:
@@ -308,9 +306,10 @@ class _Reader:
         with LogFile(path) as file:
             topics = sorted(channel.topic for channel in file.channels.values())
         for topic in topics:
-            if not re.fullmatch(r"/[a-z](_?[a-z0-9])*/audio", topic, re.ASCII):
+            name = parse_topic(topic)
+            if name is None or name[1:] != (LIVE, "audio"):
                 raise LogError(f"{path}: has a topic {topic[:64]!r}, which no layer of sound has")
-            clips = self._microphone(topic.split("/")[1]).clips
+            clips = self._microphone(name.microphone).clips
             for start, rate, samples in read_clips(path, topic, self._grid.start, self._grid.end):
                 self._clip_seconds += len(samples) / rate
                 if self._clip_seconds > MOST_CLIP_SECONDS:

@@ -11,7 +11,6 @@ from hearthlog.analyzer.colours import GAP, Colour, colour
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.lanes import changes, clock, disagreements, overview
 from hearthlog.analyzer.review.timeline.model import (
-    REVIEW,
     FrameValues,
     MicrophoneTimeline,
     Timeline,
@@ -19,6 +18,7 @@ from hearthlog.analyzer.review.timeline.model import (
 )
 from hearthlog.analyzer.review.viewer.canvas import TIMELINE, Canvas
 from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.messages.topics import REVIEW
 
 APPLICATION = "hearthlog"
 OVERVIEW, DETAIL = "lanes", "exact"

@@ -1,0 +1,164 @@
+"""The logs of a home and their layers, and of which time each of them may speak, by name."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, tzinfo
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
+from hearthlog.analyzer.logs.local_time import day_span, local_time
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name
+from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.times import NANOSECONDS
+
+_NEVER = 1 << 62
+_TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one
+
+
+class HomeLog(NamedTuple):
+    """A log or a layer.
+
+    Attributes
+    ----------
+    path : Path
+    node : str
+    layer : str
+        Empty for a log, else `review` or `relabel-<model>`.
+    start, end : int
+        What it says is of this span (ns of UTC); what ends later may have begun in it.
+    """
+
+    path: Path
+    node: str
+    layer: str
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class HomeLogs:
+    """The logs of a home with their layers, in the order of time.
+
+    Attributes
+    ----------
+    entries : list of HomeLog
+    losses : list of str
+        What cannot be read, and why.
+    """
+
+    entries: Sequence[HomeLog]
+    losses: Sequence[str]
+
+    def between(self, start: int, end: int, layer: str = "") -> list[HomeLog]:
+        """List the logs, or the layers of one name, that may speak of a span of time."""
+        return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
+
+    @property
+    def layers(self) -> list[str]:
+        """Names of the models that have relabelled logs."""
+        layers = {entry.layer for entry in self.entries if entry.layer.startswith(RELABEL_LAYER)}
+        return sorted(layer.removeprefix(RELABEL_LAYER) for layer in layers)
+
+    def records(self) -> Iterator[Mapping[str, str]]:
+        """Yield the `hearthlog` records of the logs, the last log first."""
+        return latest_records(entry.path for entry in self.between(0, _NEVER))
+
+    def days(self, zone: tzinfo) -> list[date]:
+        """List the days on which there are logs."""
+        days = {local_time(entry.start, zone).date() for entry in self.between(0, _NEVER)}
+        end = self.end()
+        if end is not None:
+            days.add(local_time(end - 1, zone).date())
+        return sorted(days)
+
+    def last_whole_day(self, zone: tzinfo) -> date:
+        """Return the last day that the logs reach beyond, or the last one if there is none."""
+        days = self.days(zone)
+        if not days:
+            raise LogError(self.losses[0] if self.losses else "there is no message in these logs")
+        end = self.end() or 0
+        whole = [day for day in days if day_span(day, zone)[1] - _TAIL <= end]
+        return whole[-1] if whole else days[-1]
+
+    def end(self) -> int | None:
+        """Return the log time of the last message of the logs."""
+        for entry in reversed(self.between(0, _NEVER)):
+            try:
+                span = time_span(entry.path)
+            except LogError:
+                continue
+            if span is not None:
+                return span[1]
+        return None
+
+
+def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
+    """Look which logs there are, by their names; only others are opened.
+
+    Raises
+    ------
+    LogError
+        If there is none.
+    """
+    losses: list[str] = []
+    entries = []
+    for path in find_with_layers(paths):
+        try:
+            entry = _entry(path)
+        except LogError as error:
+            losses.append(str(error))
+            continue
+        if entry is not None:
+            entries.append(entry)
+    return HomeLogs(
+        sorted(_closed(entries), key=lambda entry: (entry.start, entry.path.name)), losses
+    )
+
+
+def days_in_words(days: Sequence[date]) -> str:
+    """Name days, those that follow each other as one: `2026-03-01 to 2026-03-04, 2026-03-09`."""
+    numbered = enumerate(days)
+    runs = [list(run) for _, run in groupby(numbered, lambda pair: pair[1].toordinal() - pair[0])]
+    texts = [f"{run[0][1]}" if len(run) == 1 else f"{run[0][1]} to {run[-1][1]}" for run in runs]
+    return ", ".join(texts[-5:]) if len(texts) <= 5 else f"{texts[0]} … {', '.join(texts[-4:])}"
+
+
+def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
+    """Raise DataError unless there is a log on one of some days."""
+    days = logs.days(zone)
+    if any(first <= day <= last for day in days):
+        return
+    when = f"{first}" if first == last else f"{first} to {last}"
+    there = f"there are {days_in_words(days)}" if days else "nor of any other day"
+    loss = f"; {logs.losses[0]}" if logs.losses else ""
+    raise DataError(f"no logs of {when} in the home's time zone, {zone}; {there}{loss}")
+
+
+def _entry(path: Path) -> HomeLog | None:
+    """Tell by its name what a file is; None if there is nothing in it."""
+    _, layer, node, time = log_name(path)
+    if layer == AUDIO_LAYER:
+        return None
+    try:
+        moment = datetime.strptime(time, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        return HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, _NEVER)
+    except ValueError:
+        span = time_span(path)
+        return None if span is None else HomeLog(path, "", layer, span[0], span[1] + 1)
+
+
+def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:
+    """End each log where the next one of its kind begins."""
+    by_kind: dict[tuple[str, str], list[HomeLog]] = {}
+    for entry in entries:
+        by_kind.setdefault((entry.node, entry.layer), []).append(entry)
+    for same in by_kind.values():
+        same.sort(key=lambda entry: entry.start)
+        starts = sorted({entry.start for entry in same})
+        following = dict(zip(starts, [*starts[1:], _NEVER], strict=True))
+        for entry in same:
+            yield entry if entry.end < _NEVER else entry._replace(end=following[entry.start])
