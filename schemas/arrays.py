@@ -23,3 +23,19 @@ def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
         (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
     )
     return view[offsets]
+
+
+def scatter(rows: NDArray[np.void], buffer: Bytes, offsets: Int64) -> None:
+    """Copy rows of bytes to any offsets of a buffer, at which they do not overlap.
+
+    Parameters
+    ----------
+    rows : np.ndarray [shape=(n,)], of dtype V`size`
+    buffer : np.ndarray [shape=(b,)], uint8
+    offsets : np.ndarray [shape=(n,)], int64
+    """
+    size = rows.dtype.itemsize
+    view: NDArray[np.void] = np.ndarray(
+        (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
+    )
+    view[offsets] = rows

@@ -11,8 +11,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
+from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import decode_rows
 from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import DURATION, TIME

@@ -32,7 +32,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.records import MAGIC
+from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages.message_types import decode, encode
 
 HEAD = struct.Struct("<BQ")

@@ -38,7 +38,8 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
-from hearthlog.schemas.mcap.logfile import FOOTER_SIZE, time_span
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.messages.topics import RELABEL, REVIEW, Topic

@@ -25,9 +25,10 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter, StoredChunk
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
 from hearthlog.schemas.messages.topics import Topic

@@ -48,7 +48,7 @@ from hearthlog.recorder.service import describe_log, record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.mcap.records import MAGIC
+from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour

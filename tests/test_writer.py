@@ -14,9 +14,10 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import LogStreamWriter
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
-from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message
 from hearthlog.schemas.messages.topics import Topic

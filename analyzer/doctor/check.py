@@ -21,8 +21,9 @@ from hearthlog.analyzer.doctor.metadata_checks import About
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
-from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, FOOTER_SIZE, LogFile
-from hearthlog.schemas.mcap.records import HEAD, MAGIC, parse
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.mcap.records import parse
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 LIBRARY = "hearthlog"

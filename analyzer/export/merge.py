@@ -19,9 +19,10 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import ENCODING
-from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter, message_blocks
-from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.new_files import new_file
 

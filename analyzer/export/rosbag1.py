@@ -16,7 +16,7 @@ from hearthlog.analyzer.export.merge import is_latched
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
-from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.message_types import definition, typestore
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS

@@ -10,7 +10,7 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
-from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.times import NANOSECONDS

@@ -12,7 +12,7 @@ from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name
-from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.times import NANOSECONDS
 
 _NEVER = 1 << 62

@@ -11,7 +11,8 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, find_logs, is_layer, is_log, log_name, stem
 from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.statistics import time_span
 
 _DAY = re.compile(r"\d{4}/\d\d/\d\d")
 _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"

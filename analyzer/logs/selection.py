@@ -12,8 +12,10 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.mcap.chunks import RawMessages, read_definitions, verify_chunks
-from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
 

@@ -11,7 +11,7 @@ from mcap.records import Channel, Schema
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.writer import ENCODING
-from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import Field, fields_of, lacking
 

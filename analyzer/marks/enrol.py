@@ -31,7 +31,7 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, log_path
-from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS

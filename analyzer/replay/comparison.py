@@ -9,7 +9,7 @@ import numpy as np
 from hearthlog.recorder.pipeline import Record
 from hearthlog.schemas.arrays import Bytes, Int64
 from hearthlog.schemas.logs.columns import decode
-from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows
 from hearthlog.schemas.messages.cdr_layout import MessageType, message_type

@@ -13,7 +13,7 @@ from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunks import RawMessages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Fields
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, topic

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
-from hearthlog.schemas.mcap.chunks import RawMessages, bounds
-from hearthlog.schemas.mcap.logfile import topic_counts
+from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
+from hearthlog.schemas.mcap.statistics import topic_counts
 from hearthlog.schemas.messages.cdr_codec import Fields, decode_rows, ragged
 from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.storage.byte_ranges import map_logs

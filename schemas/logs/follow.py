@@ -11,8 +11,9 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunks import RawMessages, read_in_batches
+from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 
 _POLL_SECONDS = 0.2
 _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a further change

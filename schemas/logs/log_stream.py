@@ -9,7 +9,8 @@ import numpy as np
 
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.chunk_writer import Block, ChunkWriter
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.mcap.message_blocks import Block
 from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
 from hearthlog.schemas.messages.message_types import definition, type_hash
 from hearthlog.schemas.messages.topics import Topic

@@ -8,9 +8,11 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap.chunks import RawMessages, read_chunks
-from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.storage.byte_ranges import map_logs
 from hearthlog.schemas.storage.prefetch import prefetch
 

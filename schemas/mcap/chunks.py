@@ -1,10 +1,8 @@
-"""The messages of many chunks at once, still encoded, found through the index behind each chunk."""
+"""The messages of many chunks at once, still encoded, by the message indexes behind each chunk."""
 
-import struct
 from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,9 +13,17 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import (
+from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
+from hearthlog.schemas.mcap.formats import (
     HEAD,
+    INDEX_ENTRIES,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX_HEAD,
+)
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
+from hearthlog.schemas.mcap.records import (
     ChunkHead,
     McapError,
     chunk_head,
@@ -25,74 +31,11 @@ from hearthlog.schemas.mcap.records import (
     parse,
 )
 
-_INDEX = np.dtype([("time", "<i8"), ("offset", "<i8")])
-_INDEX_HEAD = np.dtype([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")])
-_ENTRY = struct.Struct("<QQ")
-MESSAGE_HEAD = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<i8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<i8"),
-        ("publish_time", "<i8"),
-    ]
-)
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _CHANNELS_LIMIT = 1 << 16
 _BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
-_FIXED = MESSAGE_HEAD.itemsize - HEAD.size  # bytes of a message's content before its payload
 
 Entries = tuple[int, bytes | memoryview]  # of the index of a chunk, and which chunk that is
-
-
-@dataclass(frozen=True)
-class RawMessages:
-    """Some messages of one channel, in the order of their log times.
-
-    Attributes
-    ----------
-    channel : mcap.records.Channel
-    schema : mcap.records.Schema or None
-    buffer : np.ndarray [shape=(b,)], uint8
-        Holds their records, and others.
-    offsets : np.ndarray [shape=(n,)], int64
-        Where in the buffer their payloads begin.
-    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-    """
-
-    channel: records.Channel
-    schema: records.Schema | None
-    buffer: Bytes
-    offsets: Int64
-    heads: NDArray[np.void]
-
-    def __len__(self) -> int:
-        return len(self.offsets)
-
-    @property
-    def sizes(self) -> Int64:
-        """Bytes of the payloads."""
-        return self.heads["length"] - _FIXED
-
-    @property
-    def log_times(self) -> Int64:
-        """Log times in nanoseconds."""
-        return self.heads["log_time"]
-
-    def between(self, start: int | None, end: int | None) -> "RawMessages":
-        """Return those with start <= log time < end."""
-        rows = slice(*bounds(self.log_times, start, end))
-        if rows == slice(0, len(self)):
-            return self
-        return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
-
-
-def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
-    """Tell where in ascending times those with start <= time < end begin and stop."""
-    first = 0 if start is None else int(np.searchsorted(times, start))
-    last = len(times) if end is None else int(np.searchsorted(times, end))
-    return first, max(first, last)
 
 
 def read_chunks(
@@ -222,27 +165,19 @@ def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
     return chunk_head(content), content
 
 
-def _walk(file: LogFile, content: memoryview) -> dict[int, bytes]:
-    """Go through all records of a chunk: note its channels, make the index it should have."""
-    found: dict[int, list[bytes]] = {}
-    start = 0
-    while start < len(content):
-        if start + HEAD.size > len(content):
-            raise McapError("a record in a chunk is cut")
-        opcode, length = HEAD.unpack_from(content, start)
-        first, start = start + HEAD.size, start + HEAD.size + length
-        if start > len(content):
-            raise McapError("a record in a chunk claims to be longer than the chunk")
-        if opcode == Opcode.MESSAGE and length >= _FIXED:
-            identity, time = struct.unpack_from("<H4xQ", content, first)
-            found.setdefault(identity, []).append(_ENTRY.pack(time, first - HEAD.size))
+def _index_records(file: LogFile, content: memoryview) -> dict[int, bytes]:
+    """Go through the records of a chunk: add its definitions to the file, make its index."""
+    starts: list[int] = []
+    for opcode, start, end in iterate_records(content):
+        if opcode == Opcode.MESSAGE and end - start >= MESSAGE_HEAD.itemsize:
+            starts.append(start)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            record = parse(opcode, bytes(content[first:start]))
+            record = parse(opcode, bytes(content[start + HEAD.size : end]))
             if isinstance(record, records.Schema):
                 file.schemas.setdefault(record.id, record)
             elif isinstance(record, records.Channel):
                 file.channels.setdefault(record.id, record)
-    return {identity: b"".join(entries) for identity, entries in found.items()}
+    return index_messages(content, np.array(starts, np.int64))
 
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
@@ -251,7 +186,7 @@ def _define(file: LogFile, identities: AbstractSet[int]) -> None:
         return
     for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
         with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
-            _read(file, np.array([chunk]), check=False).walk()
+            _read(file, np.array([chunk]), check=False).index_records()
         if identities <= file.channels.keys():
             return
 
@@ -276,8 +211,8 @@ class _Batch(NamedTuple):
             found.setdefault(identity, []).append((number, self.raw[first : first + size].data))
         unknown = not found.keys() <= self.file.channels.keys()
         for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
-            walked = self.walk(number)
-            for identity, entries in walked.items() if without[number] else ():
+            entries_by_channel = self.index_records(number)
+            for identity, entries in entries_by_channel.items() if without[number] else ():
                 found.setdefault(identity, []).append((number, entries))
         return found
 
@@ -295,16 +230,16 @@ class _Batch(NamedTuple):
         while len(numbers):
             if len(parts) > _CHANNELS_LIMIT:
                 raise self._damaged(numbers[0], "a chunk has more indexes than there are channels")
-            first = starts + _INDEX_HEAD.itemsize
+            first = starts + MESSAGE_INDEX_HEAD.itemsize
             if (first > ends).any():
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
-            heads = gather(self.raw, starts, _INDEX_HEAD.itemsize).view(_INDEX_HEAD)
+            heads = gather(self.raw, starts, MESSAGE_INDEX_HEAD.itemsize).view(MESSAGE_INDEX_HEAD)
             length, size = heads["length"], heads["size"].astype(np.int64)
             sound = (
                 (heads["opcode"] == Opcode.MESSAGE_INDEX)
-                & (length >= size + _INDEX_HEAD.itemsize - HEAD.size)
+                & (length >= size + MESSAGE_INDEX_HEAD.itemsize - HEAD.size)
                 & (length <= ends - starts - HEAD.size)
-                & (size % _INDEX.itemsize == 0)
+                & (size % INDEX_ENTRIES.itemsize == 0)
             )
             if not sound.all():
                 raise self._damaged(numbers[sound.argmin()], "here should be a message index")
@@ -315,19 +250,19 @@ class _Batch(NamedTuple):
             numbers, starts, ends = numbers[going], starts[going], ends[going]
         return np.concatenate(parts)
 
-    def walk(self, number: int = 0) -> dict[int, bytes]:
+    def index_records(self, number: int = 0) -> dict[int, bytes]:
         """Go through the records of a chunk: note its channels, make the index it should have."""
         end = int(self.sizes[: number + 1].sum())
         content = self.buffer[end - int(self.sizes[number]) : end].data
         try:
-            return _walk(self.file, content)
+            return _index_records(self.file, content)
         except (McapError, UnicodeDecodeError) as error:
             raise self.file.damaged(int(self.chunks["offset"][number]), error) from error
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
         """Follow the index entries of a channel to its messages, and check every one of them."""
-        entries = np.frombuffer(b"".join(part for _, part in parts), _INDEX)
-        counts = [len(part) // _INDEX.itemsize for _, part in parts]
+        entries = np.frombuffer(b"".join(part for _, part in parts), INDEX_ENTRIES)
+        counts = [len(part) // INDEX_ENTRIES.itemsize for _, part in parts]
         number = np.repeat([number for number, _ in parts], counts)
         channel = self.file.channels.get(identity)
         if channel is None:
@@ -337,12 +272,12 @@ class _Batch(NamedTuple):
         if not inside.all():
             raise self._damaged(number[inside.argmin()], _WRONG_INDEX)
         starts = entries["offset"] + (np.cumsum(self.sizes) - self.sizes)[number]
-        heads = gather(self.buffer, starts, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+        heads = gather_heads(self.buffer, starts)
         sound = (
             (heads["opcode"] == Opcode.MESSAGE)
             & (heads["channel"] == identity)
             & (heads["log_time"] == entries["time"])
-            & (heads["length"] >= _FIXED)
+            & (heads["length"] >= MESSAGE_FIXED)
             & (heads["length"] <= rest - HEAD.size)
             & (heads["log_time"] >= self.chunks["start"][number])
             & (heads["log_time"] <= self.chunks["end"][number])

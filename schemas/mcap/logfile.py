@@ -4,9 +4,7 @@ import io
 import struct
 import zlib
 from array import array
-from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing, suppress
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -17,10 +15,22 @@ from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError, parse
-from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
+from hearthlog.schemas.mcap.formats import (
+    CHUNK,
+    CHUNK_INDEX,
+    CHUNK_INDEX_TAIL,
+    FOOTER,
+    FOOTER_SIZE,
+    HEAD,
+    INDEX_OFFSET,
+    MAGIC,
+    MESSAGE,
+    UINT16,
+    UINT64,
+)
+from hearthlog.schemas.mcap.records import LIMIT, McapError, parse
+from hearthlog.schemas.storage.byte_ranges import Section, open_file
 
-FOOTER_SIZE = HEAD.size + 20 + len(MAGIC)
 CHUNKS = np.dtype(
     [
         ("offset", "<i8"),  # of the chunk, or of a run of messages outside of chunks
@@ -32,12 +42,6 @@ CHUNKS = np.dtype(
         ("channels", "<i8"),  # a place in `LogFile.channel_sets`
     ]
 )
-_CHUNK_INDEX = struct.Struct("<QQQQI")
-_CHUNK_INDEX_REST = struct.Struct("<QI")
-_CHUNK_HEAD = struct.Struct("<QQQ")
-_MESSAGE = struct.Struct("<BQHIQQ")  # up to its payload
-_ID = struct.Struct("<H")
-_SUMMARY_OFFSET = struct.Struct("<9xBQQ")
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 _RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
 
@@ -180,7 +184,7 @@ class LogFile:
                     rows.extend(self._chunk_index(content))
                 else:
                     self._add(parse(place.opcode, content))
-            crc = zlib.crc32(self.read(end, HEAD.size + 16), crc)
+            crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
         except (McapError, UnicodeDecodeError, struct.error):
             crc = -1
         counted = self.statistics.message_count if self.statistics else -1
@@ -217,7 +221,7 @@ class LogFile:
         for place in self._places(self.size):
             if place.opcode == Opcode.MESSAGE_INDEX and chunk:
                 chunk[2] += place.length
-                ids.update(_ID.unpack(self.read(place.offset + HEAD.size, _ID.size)))
+                ids.update(UINT16.unpack(self.read(place.offset + HEAD.size, UINT16.size)))
             elif place.opcode == Opcode.MESSAGE and chunk and self._continues(chunk, place):
                 _, _, _, size, start, end = self._chunk(place)
                 chunk[1:] = [chunk[1] + size, -1, chunk[3] + size, *_span(chunk, start, end)]
@@ -264,13 +268,13 @@ class LogFile:
         """Describe a chunk, or a message outside of one; nothing if this is neither."""
         if place.opcode not in {Opcode.CHUNK, Opcode.MESSAGE}:
             return []
-        head = self.read(place.offset, min(place.length, HEAD.size + _CHUNK_HEAD.size))
+        head = self.read(place.offset, min(place.length, HEAD.size + CHUNK.size))
         try:
             if place.opcode == Opcode.CHUNK:
-                start, end, size = _CHUNK_HEAD.unpack_from(head, HEAD.size)
+                start, end, size, _, _ = CHUNK.unpack_from(head, HEAD.size)
                 index_length = 0
             else:
-                start = end = _MESSAGE.unpack_from(head)[4]
+                start = end = MESSAGE.unpack_from(head)[4]
                 size, index_length = place.length, -1
         except struct.error as error:
             raise self.damaged(place.offset, "a record is too short") from error
@@ -279,12 +283,13 @@ class LogFile:
         return [place.offset, place.length, index_length, size, start, end]
 
     def _chunk_index(self, content: bytes) -> tuple[int, ...]:
-        start, end, offset, length, entries = _CHUNK_INDEX.unpack_from(content)
-        first = _CHUNK_INDEX.size
-        ids = frozenset(i for i, _ in struct.iter_unpack("<HQ", content[first : first + entries]))
+        start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
+        first = CHUNK_INDEX.size
+        offsets = INDEX_OFFSET.iter_unpack(content[first : first + entries])
+        ids = frozenset(channel for channel, _ in offsets)
         first += entries
-        index_length, text = _CHUNK_INDEX_REST.unpack_from(content, first)
-        (size,) = struct.unpack_from("<Q", content, first + _CHUNK_INDEX_REST.size + text + 8)
+        index_length, text = CHUNK_INDEX_TAIL.unpack_from(content, first)
+        (size,) = UINT64.unpack_from(content, first + CHUNK_INDEX_TAIL.size + text + UINT64.size)
         if max(offset + length + index_length, start, end, size) >= 1 << 63:
             raise McapError("a number is out of range")
         return offset, length, index_length, size, start, end, self._channel_set(ids)
@@ -329,77 +334,3 @@ def _span(chunk: list[int], start: int, end: int) -> tuple[int, int]:
 
 def _by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
     return chunks[np.argsort(chunks["start"], kind="stable")]
-
-
-def time_span(path: Path) -> tuple[int, int] | None:
-    """Return the first and the last log time of a log, or None if it has no messages.
-
-    Raises
-    ------
-    LogError
-        If it is no MCAP file, or is damaged.
-    """
-    try:
-        with closing(open_file(path)) as file:
-            about = _statistics(file)
-    except (McapError, struct.error):
-        about = None
-    if about is not None:
-        times = about.message_start_time, about.message_end_time
-        return times if about.message_count else None
-    with LogFile(path) as log:
-        if not len(log.chunks):
-            return None
-        return int(log.chunks["start"].min()), int(log.chunks["end"].max())
-
-
-def topic_counts(path: Path) -> Counter[str]:
-    """Count the messages of each topic as a finished log says, so far as that can be true."""
-    found: Counter[str] = Counter()
-    with (
-        suppress(LogError, McapError, UnicodeDecodeError, struct.error),
-        closing(open_file(path)) as file,
-    ):
-        about = _statistics(file)
-        counts = {} if about is None else about.channel_message_counts
-        for channel in _summary_group(file, Opcode.CHANNEL):
-            if isinstance(channel, records.Channel):
-                most = file.size  # a message takes more than a byte
-                found[channel.topic] += min(counts.get(channel.id, 0), most)
-    return found
-
-
-def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
-    """Read the statistics of a finished log, which are found without reading its index."""
-    for found in _summary_group(file, Opcode.STATISTICS):
-        if isinstance(found, records.Statistics):
-            return found
-    return None
-
-
-def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord | None]:
-    """Read the records of one kind in the summary of a finished log."""
-    end = max(file.size - FOOTER_SIZE, 0)
-    tail = file.read(end, FOOTER_SIZE)
-    if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
-        return []
-    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
-    assert isinstance(footer, records.Footer)
-    size = end - footer.summary_offset_start
-    if not footer.summary_offset_start or not 0 <= size <= _RUN_LIMIT:
-        return []
-    offsets = file.read(footer.summary_offset_start, size)
-    for group, start, length in _SUMMARY_OFFSET.iter_unpack(offsets):
-        if group == opcode and length <= _RUN_LIMIT and start < end:
-            return _split(file.read(start, length))
-    return []
-
-
-def _split(raw: bytes) -> list[McapRecord | None]:
-    found = []
-    start = 0
-    while start < len(raw):
-        opcode, length = HEAD.unpack_from(raw, start)
-        start += HEAD.size + length
-        found.append(parse(opcode, raw[start - length : start]))
-    return found

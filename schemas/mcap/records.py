@@ -13,28 +13,25 @@ from typing import Any, NamedTuple
 import lz4.frame
 import zstandard
 from mcap import records
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
-from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from hearthlog.schemas.mcap.formats import CHUNK, UINT64
 
 __all__ = [
-    "HEAD",
     "LIMIT",
-    "MAGIC",
     "ChunkHead",
     "McapError",
     "chunk_head",
     "decompress",
     "decompress_into",
+    "encode",
     "parse",
 ]
 
 LIMIT = 100 << 20  # bytes; ours are below 2 MiB
-HEAD = struct.Struct("<BQ")  # opcode and length
-_CHUNK = struct.Struct("<QQQII")
-_LENGTH = struct.Struct("<Q")
 _CLASSES: dict[int, Any] = {
     Opcode.HEADER: records.Header,
     Opcode.FOOTER: records.Footer,
@@ -69,14 +66,32 @@ def parse(opcode: int, content: bytes) -> McapRecord | None:
     McapError
         If it is too short for what it claims to hold.
     UnicodeDecodeError
-        If a text in it is none.
+        If a text in it is not UTF-8.
     """
     kind = _CLASSES.get(opcode)
     return None if kind is None else kind.read(_Content(BytesIO(content)))
 
 
+def encode(record: McapRecord) -> bytes:
+    """Encode a record, opcode and length included."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
 class ChunkHead(NamedTuple):
-    """What a chunk says of itself, and where in the record its data are."""
+    """The head of a chunk.
+
+    Attributes
+    ----------
+    start, end : int
+        Log times of its first and last message, in nanoseconds.
+    size, crc : int
+        Bytes and CRC-32 of its records, uncompressed; a CRC of 0 is none.
+    compression : bytes
+    data : slice
+        Bytes of the chunk's content that are its compressed records.
+    """
 
     start: int
     end: int
@@ -87,7 +102,7 @@ class ChunkHead(NamedTuple):
 
 
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
-    """Read the head of a chunk's content.
+    """Read the head of a chunk from its content.
 
     Raises
     ------
@@ -95,13 +110,13 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
         If it contradicts itself, or claims to be larger than `LIMIT`.
     """
     try:
-        start, end, size, crc, length = _CHUNK.unpack_from(content)
-        first = _CHUNK.size + length
-        compression = bytes(content[_CHUNK.size : first])
-        (stored,) = _LENGTH.unpack_from(content, first)
+        start, end, size, crc, length = CHUNK.unpack_from(content)
+        first = CHUNK.size + length
+        compression = bytes(content[CHUNK.size : first])
+        (stored,) = UINT64.unpack_from(content, first)
     except struct.error as error:
         raise McapError("a chunk is too short") from error
-    first += _LENGTH.size
+    first += UINT64.size
     if first + stored > len(content):
         raise McapError("a chunk is shorter than it claims")
     if size > LIMIT:

@@ -1,6 +1,5 @@
 """What was lost where a file is damaged, as far as it can still be known."""
 
-import struct
 import zlib
 from array import array
 from collections.abc import Mapping
@@ -15,12 +14,12 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.logfile import FOOTER_SIZE
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError, parse
-from hearthlog.schemas.salvage.record_verifier import MESSAGE_SIZE, SHORTEST, RecordVerifier
+from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
+from hearthlog.schemas.mcap.records import LIMIT, McapError, parse
+from hearthlog.schemas.salvage.record_sizes import SHORTEST
+from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 
 _BLOCK = 1 << 20
-_TIMES = struct.Struct("<QQ")
 _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
 _OF_INDEX = {
     Opcode.SCHEMA,
@@ -155,7 +154,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     crc = 0
     for place in range(start, end, _BLOCK):
         crc = zlib.crc32(reader.read(place, min(_BLOCK, end - place)), crc)
-    if zlib.crc32(tail[: HEAD.size + 16], crc) != footer.summary_crc:
+    if zlib.crc32(tail[: HEAD.size + FOOTER.size], crc) != footer.summary_crc:
         return None
     with suppress(McapError, UnicodeDecodeError, OverflowError):
         return _records_of_index(reader, start, end)
@@ -210,7 +209,7 @@ def loss_in(reader: RecordVerifier, stretch: DamagedRange, index: Index | None) 
     )
     first, last = np.searchsorted(index.chunks[:, 0], [stretch.start, stretch.end])
     if first == last:
-        exact = bool(len(index.chunks)) or stretch.end - stretch.start < MESSAGE_SIZE
+        exact = bool(len(index.chunks)) or stretch.end - stretch.start < MESSAGE.size
         return Loss({}, exact, None, others)
     chunks = index.chunks[first:last]
     messages: dict[int, int] = {}
@@ -223,7 +222,7 @@ def loss_in(reader: RecordVerifier, stretch: DamagedRange, index: Index | None) 
 
 def _by_what_is_around(reader: RecordVerifier, stretch: DamagedRange) -> Loss:
     start, end, opcode, ends = stretch
-    if end - start < MESSAGE_SIZE and (end < reader.end or opcode != Opcode.CHUNK):
+    if end - start < MESSAGE.size and (end < reader.end or opcode != Opcode.CHUNK):
         return _NOTHING
     is_record = end in ends or end == reader.end
     if end in ends and reader.like_message_index(start):
@@ -231,7 +230,8 @@ def _by_what_is_around(reader: RecordVerifier, stretch: DamagedRange) -> Loss:
     if opcode == Opcode.CHUNK:
         messages: dict[int, int] = {}
         behind, span = _count(reader, end, messages)
-        times = _TIMES.unpack(reader.read(start + HEAD.size, 16).ljust(16, b"\0"))
+        head = reader.read(start + HEAD.size, CHUNK.size).ljust(CHUNK.size, b"\0")
+        times = CHUNK.unpack(head)[:2]
         exact = bool(messages) and end in ends and behind < reader.end
         exact = (
             exact and reader.plausible(behind) and reader.head(behind)[0] != Opcode.MESSAGE_INDEX

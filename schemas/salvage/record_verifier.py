@@ -7,81 +7,32 @@ add up to the length before it.
 import os
 import struct
 import zlib
-from array import array
-from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
-from mcap import records
 from mcap.opcode import Opcode
-from mcap.records import McapRecord
 from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import gather
-from hearthlog.schemas.mcap.chunk_writer import StoredChunk
-from hearthlog.schemas.mcap.records import (
+from hearthlog.schemas.mcap.chunk_records import index_messages
+from hearthlog.schemas.mcap.formats import (
+    CHUNK,
     HEAD,
-    LIMIT,
+    INDEX_ENTRIES,
     MAGIC,
-    ChunkHead,
-    McapError,
-    decompress,
-    parse,
+    MESSAGE_INDEX,
+    UINT64,
 )
-
-MESSAGE_SIZE = 31  # bytes of a message without payload, opcode and length included
-_SMALL = 16 << 20  # bytes; a record that is neither chunk, message nor attachment has fewer
-_LARGEST: dict[int, int] = {Opcode.ATTACHMENT: LIMIT, Opcode.MESSAGE_INDEX: LIMIT}
-_TEXT, _DATA = struct.Struct("<I"), struct.Struct("<Q")
-# What follows opcode and length: so many bytes, or the length of a text or of data, and these.
-_FIELDS: dict[int, tuple[int | struct.Struct, ...]] = {
-    Opcode.HEADER: (_TEXT, _TEXT),
-    Opcode.FOOTER: (20,),
-    Opcode.SCHEMA: (2, _TEXT, _TEXT, _TEXT),
-    Opcode.CHANNEL: (4, _TEXT, _TEXT, _TEXT),
-    Opcode.CHUNK: (28, _TEXT, _DATA),
-    Opcode.MESSAGE_INDEX: (2, _TEXT),
-    Opcode.CHUNK_INDEX: (32, _TEXT, 8, _TEXT, 16),
-    Opcode.ATTACHMENT: (16, _TEXT, _TEXT, _DATA, 4),
-    Opcode.ATTACHMENT_INDEX: (40, _TEXT, _TEXT),
-    Opcode.STATISTICS: (42, _TEXT),
-    Opcode.METADATA: (_TEXT, _TEXT),
-    Opcode.METADATA_INDEX: (16, _TEXT),
-    Opcode.SUMMARY_OFFSET: (17,),
-    Opcode.DATA_END: (4,),
-}
-_UNKNOWN = 1 << 62
-SHORTEST = np.full(256, _UNKNOWN)  # what a record must have at least after opcode and length
-for _opcode, _fields in _FIELDS.items():
-    SHORTEST[_opcode] = sum(f if isinstance(f, int) else f.size for f in _fields)
-SHORTEST[Opcode.MESSAGE] = MESSAGE_SIZE - HEAD.size
-_CHUNK = struct.Struct("<BQQQQII")
-_MESSAGE = struct.Struct("<BQHIQQ")
-_INDEX_HEAD = struct.Struct("<BQHI")
-_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
-
-
-class WholeChunk(NamedTuple):
-    """A chunk whose content is proved, and what it defines."""
-
-    stored: StoredChunk
-    definitions: list[records.Schema | records.Channel]
-
-
-class WholeAttachment(NamedTuple):
-    """An attachment as the file holds it, and what an index says of it."""
-
-    record: bytes
-    about: records.AttachmentIndex
-
-
-class WholeRecord(NamedTuple):
-    """A whole record, from `offset` to `end`; `wrong` says what of its head had to be corrected."""
-
-    offset: int
-    end: int
-    record: McapRecord | WholeChunk | WholeAttachment | None
-    wrong: str = ""
+from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, McapError, decompress, parse
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.salvage.record_sizes import FIELDS, SHORTEST, UNKNOWN, longest
+from hearthlog.schemas.salvage.whole_records import (
+    WholeChunk,
+    WholeRecord,
+    read_attachment,
+    read_definitions,
+    read_message,
+    span_of,
+    split_content,
+)
 
 
 class RecordVerifier:
@@ -137,23 +88,24 @@ class RecordVerifier:
         opcode, length = self.head(offset)
         outer = offset + HEAD.size + length
         inner = offset + HEAD.size
-        for field in _FIELDS.get(opcode, (length,)):
+        for field in FIELDS.get(opcode, (length,)):
             if isinstance(field, int):
                 inner += field
                 continue
             data = self.read(inner, field.size)
             if len(data) < field.size:
-                return outer, _UNKNOWN
+                return outer, UNKNOWN
             inner += field.size + field.unpack(data)[0]
         return outer, inner
 
     def like_message_index(self, offset: int) -> bool:
         """Whether the record that begins here could be a message index, but for its opcode."""
-        data = self.read(offset, HEAD.size + 6)
-        if len(data) < HEAD.size + 6:
+        data = self.read(offset, HEAD.size + MESSAGE_INDEX.size)
+        if len(data) < HEAD.size + MESSAGE_INDEX.size:
             return False
-        _, length, _, size = _INDEX_HEAD.unpack(data)
-        return bool(length == size + 6 and size % _ENTRY.itemsize == 0)
+        _, length = HEAD.unpack_from(data)
+        _, size = MESSAGE_INDEX.unpack_from(data, HEAD.size)
+        return bool(length == size + MESSAGE_INDEX.size and size % INDEX_ENTRIES.itemsize == 0)
 
     def plausible(self, offset: int) -> bool:
         """Whether a record may begin here, or the file may be cut here."""
@@ -161,7 +113,7 @@ class RecordVerifier:
             return offset == self.end
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
-            return bool(SHORTEST[data[0]] < _UNKNOWN) or MAGIC.startswith(data)
+            return bool(SHORTEST[data[0]] < UNKNOWN) or MAGIC.startswith(data)
         opcode, length = HEAD.unpack(data)
         return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
 
@@ -191,7 +143,7 @@ class RecordVerifier:
             return self._message(offset, chained)
         outer, inner = self.ends(offset)
         wrong = "" if inner == outer else "the length of a record"
-        if inner - offset > _LARGEST.get(opcode, _SMALL):
+        if inner - offset > longest(opcode):
             raise McapError("a record claims to be too large")
         if inner > self.end:
             raise McapError("a record claims to be longer than the file")
@@ -203,7 +155,7 @@ class RecordVerifier:
         if wrong:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         if opcode == Opcode.ATTACHMENT:
-            return WholeRecord(offset, inner, _attachment(raw), wrong)
+            return WholeRecord(offset, inner, read_attachment(raw), wrong)
         return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
 
     def chunk(self, offset: int) -> WholeRecord:
@@ -218,34 +170,40 @@ class RecordVerifier:
         UnicodeDecodeError
             If a text in it is none.
         """
-        head = self.read(offset, _CHUNK.size + 4 + _DATA.size)
+        name = HEAD.size + CHUNK.size  # where that of the compression begins
+        head = self.read(offset, name + 4 + UINT64.size)
         try:
-            opcode, length, start, end, size, crc, text = _CHUNK.unpack_from(head)
-            first = _CHUNK.size + text
-            (stored,) = _DATA.unpack_from(head, first)
+            opcode, length = HEAD.unpack_from(head)
+            start, end, size, crc, text = CHUNK.unpack_from(head, HEAD.size)
+            first = name + text
+            (stored,) = UINT64.unpack_from(head, first)
         except struct.error as error:
             raise McapError("the head of a chunk is damaged") from error
-        first += _DATA.size
+        first += UINT64.size
         exact = (opcode, length) == (Opcode.CHUNK, first + stored - HEAD.size)
         if not crc and not exact:
             raise McapError("the head of a chunk is damaged")
         if size > LIMIT:
             raise McapError("a chunk claims to be too large")
-        compression = head[_CHUNK.size : first - _DATA.size]
-        about = ChunkHead(start, end, size, crc, compression, slice(None))
+        compression = head[name : first - UINT64.size]
+        claim = ChunkHead(start, end, size, crc, compression, slice(None))
         # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
         # shorter one comes first: if it is enough it is right.
         lengths = sorted({stored, length + HEAD.size - first})
         for number in lengths:
             try:
                 data = self._data(offset + first, number)
-                content, checksum = self._proved(about, data)
+                content, checksum = self._prove(claim, data)
             except McapError:
                 if number == lengths[-1]:
                     raise
                 continue
             break
-        definitions, entries, span = self._content(content)
+        messages, others = split_content(content)
+        self.inner += len(messages) + len(others)
+        definitions = read_definitions(content, others)
+        entries = index_messages(content, messages)
+        span = span_of(entries)
         wrong = "" if exact and (not entries or span == (start, end)) else "the head of a chunk"
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         return WholeRecord(offset, offset + first + number, WholeChunk(chunk, definitions), wrong)
@@ -258,7 +216,7 @@ class RecordVerifier:
             raise McapError("a chunk claims to be longer than the file")
         return memoryview(self.read(offset, length))
 
-    def _proved(self, head: ChunkHead, data: memoryview) -> tuple[bytes, int]:
+    def _prove(self, head: ChunkHead, data: memoryview) -> tuple[bytes, int]:
         """Decompress a chunk; return its content and its checksum."""
         self.work += head.size
         content = decompress(head, data)
@@ -266,40 +224,6 @@ class RecordVerifier:
         if head.crc not in {0, checksum}:
             raise McapError("a chunk has another checksum than it claims")
         return content, checksum
-
-    def _content(
-        self, content: bytes
-    ) -> tuple[list[records.Schema | records.Channel], dict[int, bytes], tuple[int, int]]:
-        """Go through the records of a chunk; return its definitions, its index and its times."""
-        found = array("q", _starts(content))
-        self.inner += len(found)
-        starts = np.frombuffer(found, np.int64)
-        buffer = np.frombuffer(content, np.uint8)
-        is_message = buffer[starts] == Opcode.MESSAGE if len(starts) else np.empty(0, np.bool_)
-        definitions = []
-        for start in starts[~is_message].tolist():
-            record = parse(content[start], content[start + HEAD.size : _end(content, start)])
-            assert isinstance(record, records.Schema | records.Channel)
-            definitions.append(record)
-        starts = starts[is_message]
-        if not len(starts):
-            return definitions, {}, (0, 0)
-        channels = gather(buffer, starts + 9, 2).view("<u2")
-        times = gather(buffer, starts + 15, 8).view("<i8")
-        span = int(times.min()), int(times.max())
-        if span[0] < 0:
-            raise McapError("a log time is out of range")
-        entries = np.empty(len(starts), _ENTRY)
-        entries["time"] = times
-        entries["offset"] = starts
-        order = np.argsort(channels, kind="stable")
-        numbers, places, counts = np.unique(channels, return_index=True, return_counts=True)
-        lasts = np.cumsum(counts)
-        index = {
-            int(numbers[i]): entries[order[lasts[i] - counts[i] : lasts[i]]].tobytes()
-            for i in np.argsort(places)
-        }
-        return definitions, index, span
 
     def _message(self, offset: int, chained: int) -> WholeRecord:
         opcode, length = self.head(offset)
@@ -319,7 +243,7 @@ class RecordVerifier:
                 break
             follower += HEAD.size + length
         raw = self.read(offset, end - offset)
-        return WholeRecord(offset, end, _as_message(raw))
+        return WholeRecord(offset, end, read_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index: its channel, its entries, and where it ends.
@@ -335,77 +259,8 @@ class RecordVerifier:
         if outer != inner or inner > self.end or inner - offset > LIMIT:
             raise McapError("a message index is damaged")
         raw = self.read(offset, inner - offset)
-        (channel,) = struct.unpack_from("<H", raw, HEAD.size)
-        entries = raw[HEAD.size + 6 :]
-        if len(entries) % _ENTRY.itemsize:
+        channel, _ = MESSAGE_INDEX.unpack_from(raw, HEAD.size)
+        entries = raw[HEAD.size + MESSAGE_INDEX.size :]
+        if len(entries) % INDEX_ENTRIES.itemsize:
             raise McapError("a message index is damaged")
-        return channel, np.frombuffer(entries, _ENTRY), inner
-
-
-def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
-    """Read the messages of a chunk that was found."""
-    head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
-    content = decompress(head, chunk.data)
-    for start in _starts(content):
-        if content[start] == Opcode.MESSAGE:
-            yield _as_message(content[start : _end(content, start)])
-
-
-def _starts(content: bytes) -> Iterator[int]:
-    """Go from record to record inside a chunk."""
-    start, size, head = 0, len(content), HEAD.unpack_from
-    allowed = {
-        Opcode.MESSAGE: MESSAGE_SIZE - HEAD.size,
-        Opcode.SCHEMA: int(SHORTEST[Opcode.SCHEMA]),
-        Opcode.CHANNEL: int(SHORTEST[Opcode.CHANNEL]),
-    }
-    try:
-        while start < size:
-            opcode, length = head(content, start)
-            if length < allowed[opcode]:
-                raise McapError("a record in a chunk is too short")
-            yield start
-            start += 9 + length
-    except (struct.error, KeyError) as error:
-        raise McapError("the records of a chunk are damaged") from error
-    if start != size:
-        raise McapError("a record in a chunk claims to be longer than the chunk")
-
-
-def _end(content: bytes, start: int) -> int:
-    return start + HEAD.size + int(HEAD.unpack_from(content, start)[1])
-
-
-def _as_message(raw: bytes) -> records.Message:
-    _, _, channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(raw)
-    if log_time >= 1 << 63:
-        raise McapError("a log time is out of range")
-    return records.Message(
-        channel_id=channel,
-        log_time=log_time,
-        data=raw[_MESSAGE.size :],
-        publish_time=publish_time,
-        sequence=sequence,
-    )
-
-
-def _attachment(raw: bytes) -> WholeAttachment:
-    record = memoryview(raw)
-    (crc,) = _TEXT.unpack(record[-4:])
-    if crc not in {0, zlib.crc32(record[HEAD.size : -4])}:
-        raise McapError("an attachment has another checksum than it claims")
-    log_time, create_time, name = struct.unpack_from("<QQI", record, HEAD.size)
-    first = HEAD.size + 20 + name
-    (media,) = _TEXT.unpack_from(record, first)
-    return WholeAttachment(
-        raw,
-        records.AttachmentIndex(
-            offset=0,
-            length=0,
-            log_time=log_time,
-            create_time=create_time,
-            data_size=_DATA.unpack_from(record, first + 4 + media)[0],
-            name=str(record[first - name : first], "utf-8"),
-            media_type=str(record[first + 4 : first + 4 + media], "utf-8"),
-        ),
-    )
+        return channel, np.frombuffer(entries, INDEX_ENTRIES), inner

@@ -10,9 +10,10 @@ from pathlib import Path
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.chunks import read_in_batches
+from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.salvage.salvage import Definition, Salvage
+from hearthlog.schemas.salvage.salvage import Salvage
 from hearthlog.schemas.salvage.salvaged_copy import Recovery, SalvagedCopy, TopicRecovery
 from hearthlog.schemas.storage.new_files import check_new, sync_file, sync_folder
 from hearthlog.schemas.storage.regular_file import open_regular

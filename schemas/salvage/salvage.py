@@ -9,7 +9,6 @@ the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, 
 """
 
 import os
-import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -21,11 +20,15 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, McapError
+from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.mcap.records import LIMIT, McapError
 from hearthlog.schemas.salvage.damage import Damage, DamagedRange, loss_in, read_index
-from hearthlog.schemas.salvage.record_verifier import (
-    SHORTEST,
-    RecordVerifier,
+from hearthlog.schemas.salvage.doubtful_definitions import DoubtfulDefinitions
+from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
+from hearthlog.schemas.salvage.record_verifier import RecordVerifier
+from hearthlog.schemas.salvage.whole_records import (
     WholeAttachment,
     WholeChunk,
     WholeRecord,
@@ -38,47 +41,9 @@ _HELD = 128 << 20  # bytes of definitions, names and indexes that a file may mak
 _HELD_EACH = 256
 _DAMAGES = 1000  # as many are told apart
 _WINDOW = 1 << 20
-_OVERLAP = 64  # a head of a chunk fits in, and where its data begin
-_COMPRESSED = re.compile(
-    rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL
-)
-_BEFORE_COMPRESSION = HEAD.size + 28
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
 
-Definition = records.Schema | records.Channel
 Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
-
-
-class Definitions:
-    """Schemas and channels, by number, wherever a file defines them."""
-
-    def __init__(self) -> None:
-        self.schemas: dict[int, records.Schema] = {}
-        self.channels: dict[int, records.Channel] = {}
-        self._doubtful: set[tuple[type, int]] = set()
-
-    def add(self, record: Definition) -> bool:
-        """Add one; False if its number has another meaning already."""
-        if isinstance(record, records.Schema):
-            return self.schemas.setdefault(record.id, record) == record
-        return self.channels.setdefault(record.id, record) == record
-
-    def doubt(self, record: Definition) -> None:
-        """From now on it is not known what this number means."""
-        self._doubtful.add((type(record), record.id))
-
-    def defines(self, number: int) -> bool:
-        """Whether it is known what the messages of a channel are."""
-        channel = self.channels.get(number)
-        if channel is None or (records.Channel, number) in self._doubtful:
-            return False
-        schema = channel.schema_id
-        known = schema == 0 or schema in self.schemas
-        return known and (records.Schema, schema) not in self._doubtful
-
-    def topic(self, number: int) -> str:
-        """Name the topic of a channel, or the channel if that is not known."""
-        return self.channels[number].topic if self.defines(number) else f"channel {number}"
 
 
 @dataclass
@@ -121,7 +86,7 @@ class Salvage:
     complete : bool
         Whether it is finished, and its index is whole.
     header : mcap.records.Header or None
-    definitions : Definitions
+    definitions : DoubtfulDefinitions
         Those met so far.
     expected : dict of int to int, or None
         How many messages each channel should have, if an index says so that is whole.
@@ -135,7 +100,7 @@ class Salvage:
 
     def __init__(self, path: Path, known: Iterable[Definition] = ()) -> None:
         self.header: records.Header | None = None
-        self.definitions = Definitions()
+        self.definitions = DoubtfulDefinitions()
         self.unnamed: dict[int, Unnamed] = {}
         try:
             self._descriptor = open_regular(path)
@@ -204,8 +169,8 @@ class Salvage:
                     return
                 self._offset = self._pass(offset, str(error))
                 continue
-            if found.wrong:
-                self._add(Damage(offset, found.end, f"{found.wrong} is wrong"))
+            if found.corrected:
+                self._add(Damage(offset, found.end, f"{found.corrected} is wrong"))
             self._offset = found.end
             yield from self._taken(found)
             del found  # before the next is read, which may be as large
@@ -240,7 +205,7 @@ class Salvage:
         elif isinstance(record, Definition):
             held += _size(record)
         elif isinstance(record, WholeAttachment):
-            held += len(record.about.name) + len(record.about.media_type)
+            held += len(record.index_record.name) + len(record.index_record.media_type)
         elif isinstance(record, records.Metadata):
             held += len(record.name)
         else:
@@ -302,9 +267,10 @@ class Salvage:
         """Return where the next whole record begins, or where the data end."""
         end = self._reader.end
         while start < end:
-            window = os.pread(self._descriptor, min(_WINDOW + _OVERLAP, end - start), start)
-            chunks = set(_chunks_in(window))
-            for place in sorted(chunks.union(_heads_in(window))):
+            size = min(_WINDOW + CHUNK_HEAD_LIMIT, end - start)
+            window = os.pread(self._descriptor, size, start)
+            chunks = {place for place in find_chunk_heads(window) if place < _WINDOW}
+            for place in sorted(chunks.union(find_record_heads(window[: _WINDOW + 8]))):
                 try:
                     self._found = self._at(start + place, searching=True, chunk=place in chunks)
                 except McapError:
@@ -379,21 +345,3 @@ def _size(record: Definition) -> int:
         return _HELD_EACH + len(record.data) + len(record.name)
     texts = [record.topic, record.message_encoding, *record.metadata, *record.metadata.values()]
     return _HELD_EACH + sum(map(len, texts))
-
-
-def _heads_in(window: bytes) -> list[int]:
-    """Find the bytes at which opcode and length of a record may stand."""
-    count = min(len(window) - HEAD.size + 1, _WINDOW)
-    if count <= 0:
-        return []
-    shortest = SHORTEST[np.frombuffer(window, np.uint8)[:count]]
-    places = np.flatnonzero(shortest <= LIMIT)
-    lengths = np.ndarray((count,), "<u8", window, 1, (1,))[places]
-    found: list[int] = places[(lengths <= LIMIT) & (lengths >= shortest[places])].tolist()
-    return found
-
-
-def _chunks_in(window: bytes) -> list[int]:
-    """Find the bytes at which the head of a compressed chunk may stand, damaged or not."""
-    places = [match.start() - _BEFORE_COMPRESSION for match in _COMPRESSED.finditer(window)]
-    return [place for place in places if 0 <= place < _WINDOW]

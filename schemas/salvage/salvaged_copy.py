@@ -9,10 +9,11 @@ from mcap.records import Message
 
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.salvage.damage import Damage
-from hearthlog.schemas.salvage.record_verifier import WholeAttachment, WholeChunk
-from hearthlog.schemas.salvage.salvage import Definition, Piece, Salvage
+from hearthlog.schemas.salvage.salvage import Piece, Salvage
+from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
 
 _PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
 _ENCODING = "cdr"
@@ -152,7 +153,7 @@ class SalvagedCopy:
             self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
             self._count(number, 1, time, time)
         elif isinstance(piece, WholeAttachment):
-            self._writer.copy_attachment(piece.record, piece.about)
+            self._writer.copy_attachment(piece.record, piece.index_record)
         elif piece.name != rosbag2.METADATA:
             self._writer.add_metadata(piece.name, piece.metadata)
 

@@ -18,8 +18,9 @@ from rosbags.highlevel import AnyReader
 
 from hearthlog.schemas.logs.columns import Columns, iterate_columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import HEAD, chunk_head
+from hearthlog.schemas.mcap.records import chunk_head
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import BenchError, best_of, hearthlog

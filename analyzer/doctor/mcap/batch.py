@@ -7,8 +7,9 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import Bytes, Int64, gather
-from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD, RawMessages
+from hearthlog.schemas.arrays import Bytes, Int64
+from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 
 BATCH_SIZE = 4 << 20  # bytes
 
@@ -40,14 +41,6 @@ class Batch(NamedTuple):
                 offsets = self.starts[rows] + MESSAGE_HEAD.itemsize
                 schema = schemas.get(channel.schema_id)
                 yield RawMessages(channel, schema, self.buffer, offsets, self.heads[rows])
-
-
-def heads_at(content: bytes, starts: Int64) -> NDArray[np.void]:
-    """Read the heads of the messages that begin at some places of a chunk."""
-    if not len(starts):
-        return np.empty(0, MESSAGE_HEAD)
-    buffer = np.frombuffer(content, np.uint8)
-    return gather(buffer, starts, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
 
 
 def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[Batch]:

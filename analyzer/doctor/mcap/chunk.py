@@ -3,6 +3,7 @@
 import struct
 import zlib
 from array import array
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -10,18 +11,23 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.mcap.batch import heads_at
 from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of
 from hearthlog.analyzer.doctor.mcap.walk import Record
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD
-from hearthlog.schemas.mcap.records import HEAD, ChunkHead, McapError, chunk_head, decompress
-
-_ENTRY = np.dtype([("time", "<i8"), ("offset", "<i8")])
-_INDEX_HEAD = struct.Struct("<HI")
-_PLACE = struct.Struct("<HQ")
-_CHUNK_INDEX = struct.Struct("<QQQQI")
-_FIXED = MESSAGE_HEAD.itemsize - HEAD.size
+from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.formats import (
+    CHUNK_INDEX,
+    CHUNK_INDEX_TAIL,
+    HEAD,
+    INDEX_ENTRIES,
+    INDEX_OFFSET,
+    MESSAGE_FIXED,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    UINT64,
+)
+from hearthlog.schemas.mcap.raw_messages import gather_heads
+from hearthlog.schemas.mcap.records import ChunkHead, McapError, chunk_head, decompress
 
 
 class Content(NamedTuple):
@@ -70,17 +76,18 @@ class Chunk:
         """Take a message index that stands behind the chunk."""
         self._index_length += record.length
         try:
-            channel, size = _INDEX_HEAD.unpack_from(record.content)
+            channel, size = MESSAGE_INDEX.unpack_from(record.content)
         except struct.error:
             channel, size = 0, -1
-        if size % _ENTRY.itemsize or size > len(record.content) - _INDEX_HEAD.size or size < 0:
+        most = len(record.content) - MESSAGE_INDEX.size
+        if size % INDEX_ENTRIES.itemsize or not 0 <= size <= most:
             what = "a message index has another length than it says"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         elif channel in self._indexes:
             what = f"a second message index of channel {channel} behind one chunk"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         else:
-            entries = record.content[_INDEX_HEAD.size : _INDEX_HEAD.size + size]
+            entries = record.content[MESSAGE_INDEX.size : MESSAGE_INDEX.size + size]
             self._indexes[channel] = entries
             if entries:
                 self._places.append((channel, record.offset))
@@ -89,8 +96,8 @@ class Chunk:
         """Check what is in it; `cut`: its message indexes may not all be there."""
         if not self.whole:
             return
-        counts = [len(entries) // _ENTRY.itemsize for entries in self._indexes.values()]
-        entries = np.frombuffer(b"".join(self._indexes.values()), _ENTRY)
+        counts = [len(entries) // INDEX_ENTRIES.itemsize for entries in self._indexes.values()]
+        entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
         channels = np.repeat([*self._indexes], counts)
         order = np.argsort(entries["offset"], kind="stable")
         entries, channels = entries[order], channels[order]
@@ -105,13 +112,13 @@ class Chunk:
         if self._head is None:
             return None
         head = self._head
-        first = _CHUNK_INDEX.pack(
-            head.start, head.end, self.offset, self._length, len(self._places) * _PLACE.size
+        first = CHUNK_INDEX.pack(
+            head.start, head.end, self.offset, self._length, len(self._places) * INDEX_OFFSET.size
         )
-        places = b"".join(_PLACE.pack(*place) for place in self._places)
-        text = struct.pack("<QI", self._index_length, len(head.compression)) + head.compression
+        places = b"".join(INDEX_OFFSET.pack(*place) for place in self._places)
+        text = CHUNK_INDEX_TAIL.pack(self._index_length, len(head.compression)) + head.compression
         size = head.data.stop - head.data.start
-        return first + places + text + struct.pack("<QQ", size, head.size)
+        return first + places + text + UINT64.pack(size) + UINT64.pack(head.size)
 
     def _find_records(self, hints: Int64) -> None:
         """Find messages, take schemas and channels."""
@@ -121,10 +128,9 @@ class Chunk:
             self._error("chunk-records", "the last record of a chunk is longer than the chunk")
             self.whole = False
         new: dict[int, int] = {}
-        for opcode, start, length in others:
-            content = records[start + HEAD.size : start + HEAD.size + length]
-            new |= self._other(opcode, start, content)
-        self.content = Content(records, starts, heads_at(records, starts))
+        for opcode, start, last in others:
+            new |= self._other(opcode, start, records[start + HEAD.size : last])
+        self.content = Content(records, starts, gather_heads(records, starts))
         check_channels(self._findings, self._definitions, self.content, new, self.offset)
 
     def _other(self, opcode: int, start: int, content: bytes) -> dict[int, int]:
@@ -194,17 +200,17 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
     starts : np.ndarray [shape=(m,)], int64
         Where messages begin.
     others : list of tuple of int
-        Opcode, start and length of the other records, and of messages that are too short.
+        Opcode, start and end of the other records, and of messages that are too short.
     end : int
         Of the last record; not the length of the chunk if that is damaged.
     """
     if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
-        heads = heads_at(records, hints)
+        heads = gather_heads(records, hints)
         lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
         firsts = np.concatenate([[0], hints + HEAD.size + lengths])
         lasts = np.concatenate([hints, [len(records)]])
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
-            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= _FIXED)
+            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= MESSAGE_FIXED)
         ).all():
             others: list[tuple[int, int, int]] = []
             for place in np.flatnonzero(firsts < lasts).tolist():
@@ -217,21 +223,18 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
     return _walk(records, 0, len(records))
 
 
-def _walk(records: bytes, place: int, end: int) -> tuple[Int64, list[tuple[int, int, int]], int]:
-    """Go from record to record; returns what `_split` does."""
-    starts = array("q")
+def _walk(content: bytes, start: int, end: int) -> tuple[Int64, list[tuple[int, int, int]], int]:
+    """Go from record to record; return what `_split` does."""
+    messages = array("q")
     others: list[tuple[int, int, int]] = []
-    while place + HEAD.size <= end:
-        opcode, length = HEAD.unpack_from(records, place)
-        following = place + HEAD.size + length
-        if following > end:
-            break
-        if opcode == Opcode.MESSAGE and length >= _FIXED:
-            starts.append(place)
-        else:
-            others.append((opcode, place, length))
-        place = following
-    return np.frombuffer(starts, np.int64), others, place
+    with suppress(McapError):
+        for opcode, first, last in iterate_records(content, start, end):
+            if opcode == Opcode.MESSAGE and last - first >= MESSAGE_HEAD.itemsize:
+                messages.append(first)
+            else:
+                others.append((opcode, first, last))
+            start = last
+    return np.frombuffer(messages, np.int64), others, start
 
 
 def check_channels(

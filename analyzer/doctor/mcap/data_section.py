@@ -1,6 +1,5 @@
 """The data section of a file, checked against the specification of MCAP."""
 
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -8,11 +7,11 @@ from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, DataEnd, Header, Metadata
+from mcap.records import Attachment, AttachmentIndex, DataEnd, Header, Metadata, MetadataIndex
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
-from hearthlog.analyzer.doctor.mcap.batch import BATCH_SIZE, Batch, batches, heads_at
+from hearthlog.analyzer.doctor.mcap.batch import BATCH_SIZE, Batch, batches
 from hearthlog.analyzer.doctor.mcap.chunk import Chunk, Content, check_channels
 from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of, parse_strictly
 from hearthlog.analyzer.doctor.mcap.walk import Record
@@ -20,8 +19,10 @@ from hearthlog.models.modelfile.card import CARD, DESCRIPTION
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
-from hearthlog.schemas.mcap.chunks import MESSAGE_HEAD
-from hearthlog.schemas.mcap.records import HEAD
+from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64
+from hearthlog.schemas.mcap.raw_messages import gather_heads
+from hearthlog.schemas.mcap.records import encode
 
 ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
 _NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept
@@ -161,28 +162,33 @@ class Data:
             self.whole = False
 
     def _add_metadata(self, found: Metadata, record: Record) -> None:
-        name = found.name.encode()
-        index = struct.pack("<QQI", record.offset, record.length, len(name)) + name
-        self.places[Opcode.METADATA_INDEX][record.offset] = (
-            index if len(index) < _INDEX_SIZE else b""
-        )
+        index = encode(MetadataIndex(record.offset, record.length, found.name))
+        self._expect_index(Opcode.METADATA_INDEX, record.offset, index)
         _keep(self.metadata, found.name, found.metadata, record)
 
     def _add_attachment(self, found: Attachment, record: Record) -> None:
-        index = struct.pack("<QQ", record.offset, record.length)
-        index += struct.pack("<QQQ", found.log_time, found.create_time, len(found.data))
-        for text in (found.name.encode(), found.media_type.encode()):
-            index += struct.pack("<I", len(text)) + text
-        self.places[Opcode.ATTACHMENT_INDEX][record.offset] = (
-            index if len(index) < _INDEX_SIZE else b""
+        index = AttachmentIndex(
+            record.offset,
+            record.length,
+            found.log_time,
+            found.create_time,
+            len(found.data),
+            found.name,
+            found.media_type,
         )
+        self._expect_index(Opcode.ATTACHMENT_INDEX, record.offset, encode(index))
         _keep(self.attachments, found.name, found.data, record)
         texts = len(found.name.encode()) + len(found.media_type.encode())
-        end = 8 + 8 + 4 + 4 + 8 + texts + len(found.data)
-        (crc,) = struct.unpack_from("<I", record.content, end)
+        end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + len(found.data)
+        (crc,) = UINT32.unpack_from(record.content, end)
         if crc and zlib.crc32(record.content[:end]) != crc:
             what = f"attachment {found.name} has another checksum than it claims"
             self.findings.error("attachment-crc", what, RECOVER, offset=record.offset)
+
+    def _expect_index(self, opcode: int, offset: int, index: bytes) -> None:
+        """Keep the index record that there should be, unless it is too long to be compared."""
+        content = index[HEAD.size :]
+        self.places[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
 
     def _add_index(self, record: Record) -> None:
         if self._chunk is None:
@@ -223,13 +229,8 @@ class Data:
         if not self._run:
             return
         records, self._run = bytes(self._run), bytearray()
-        starts = [0]
-        while (end := starts[-1] + HEAD.size + HEAD.unpack_from(records, starts[-1])[1]) < len(
-            records
-        ):
-            starts.append(end)
-        places = np.array(starts, np.int64)
-        content = Content(records, places, heads_at(records, places))
+        starts = np.array([start for _, start, _ in iterate_records(records)], np.int64)
+        content = Content(records, starts, gather_heads(records, starts))
         check_channels(self.findings, self.definitions, content, {}, self._run_offset)
         self._add_messages(content)
 

@@ -2,13 +2,13 @@
 
 import re
 
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.records import McapError, parse
+from hearthlog.schemas.mcap.formats import HEAD
+from hearthlog.schemas.mcap.records import McapError, encode, parse
 from hearthlog.schemas.messages.cdr_layout import message_type
 
 PROFILE = "ros2"
@@ -31,12 +31,11 @@ def parse_strictly(
     except (McapError, UnicodeDecodeError) as error:
         findings.error("fields", f"{name_of(opcode)}: {error}", RECOVER, offset=offset)
         return None
-    if record is not None and opcode != Opcode.ATTACHMENT:
-        builder = RecordBuilder()
-        record.write(builder)
-        if not content.startswith(builder.end()[9:]):  # behind it may be fields of later versions
-            what = f"{name_of(opcode)}: a map in it has a key twice, or another length than it says"
-            findings.error("fields", what, RECOVER, offset=offset)
+    if record is None or opcode == Opcode.ATTACHMENT:
+        return record
+    if not content.startswith(encode(record)[HEAD.size :]):  # later versions may append fields
+        what = f"{name_of(opcode)}: a map in it has a key twice, or another length than it says"
+        findings.error("fields", what, RECOVER, offset=offset)
     return record
 
 

@@ -1,6 +1,5 @@
 """The summary section of a file and its footer, compared with what is in the file."""
 
-import struct
 import zlib
 from collections import Counter
 from typing import Any
@@ -12,7 +11,8 @@ from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.mcap.data_section import Data
 from hearthlog.analyzer.doctor.mcap.definitions import name_of, parse_strictly
 from hearthlog.analyzer.doctor.mcap.walk import Record
-from hearthlog.schemas.mcap.records import HEAD, parse
+from hearthlog.schemas.mcap.formats import CHUNK_INDEX, HEAD, INDEX_OFFSET, UINT64
+from hearthlog.schemas.mcap.records import parse
 
 _ALLOWED = {
     Opcode.SCHEMA,
@@ -150,7 +150,7 @@ class Summary:
         if len(record.content) < at + 8:
             parse_strictly(self._findings, record.opcode, record.offset, record.content)
             return
-        (offset,) = struct.unpack_from("<Q", record.content, at)
+        (offset,) = UINT64.unpack_from(record.content, at)
         expected = self._unseen[record.opcode].pop(offset, None)
         if expected is None:
             thing = _THINGS[Opcode(record.opcode)]
@@ -164,8 +164,10 @@ class Summary:
         if not record.content.startswith(expected):
             self._compare(record, expected)
         if record.opcode == Opcode.CHUNK_INDEX:
-            (size,) = struct.unpack_from("<I", expected, 32)
-            self._indexed |= {i for i, _ in struct.iter_unpack("<HQ", expected[36 : 36 + size])}
+            first = CHUNK_INDEX.size
+            *_, size = CHUNK_INDEX.unpack_from(expected)
+            offsets = INDEX_OFFSET.iter_unpack(expected[first : first + size])
+            self._indexed |= {channel for channel, _ in offsets}
 
     def _compare(self, record: Record, expected: bytes) -> None:
         found = parse_strictly(self._findings, record.opcode, record.offset, record.content)

@@ -1,8 +1,6 @@
 """From record to record through a file, over what is damaged to where it goes on."""
 
 import bisect
-import re
-import struct
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -10,14 +8,11 @@ from mcap.opcode import Opcode
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.mcap.byte_source import Source
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC
+from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
+from hearthlog.schemas.mcap.formats import HEAD, MAGIC
+from hearthlog.schemas.mcap.records import LIMIT
 
-_CHUNK = re.compile(
-    rb"\x06.{36}(?:\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\x00lz4.{8}\x04\x22\x4d\x18)",
-    re.DOTALL,
-)
-_LENGTH = struct.Struct("<Q")
-_WINDOW, _OVERLAP = 1 << 20, 64  # bytes
+_WINDOW = 1 << 20  # bytes
 _CUT = 2 << 20  # bytes; a longer end was not left by a writer that was killed
 
 
@@ -116,11 +111,11 @@ class Walk:
         """Find the next compressed chunk that is not longer than the file."""
         source = self._source
         while offset < source.size:
-            window = source.at(offset, _WINDOW + _OVERLAP)
-            for found in _CHUNK.finditer(window):
-                place = offset + found.start()
-                (length,) = _LENGTH.unpack_from(window, found.start() + 1)
-                if place + HEAD.size + length <= source.size:
-                    return place
+            window = source.at(offset, _WINDOW + CHUNK_HEAD_LIMIT)
+            for place in find_chunk_heads(window):
+                opcode, length = HEAD.unpack_from(window, place)
+                end = offset + place + HEAD.size + length
+                if opcode == Opcode.CHUNK and end <= source.size:
+                    return offset + place
             offset += _WINDOW
         return None

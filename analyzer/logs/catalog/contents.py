@@ -13,7 +13,8 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_in_batches
-from hearthlog.schemas.mcap.logfile import LogFile, time_span
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import microphone_of, parse_topic
 from hearthlog.schemas.times import NANOSECONDS

@@ -20,8 +20,8 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
-from hearthlog.schemas.mcap.chunks import RawMessages
-from hearthlog.schemas.mcap.logfile import time_span
+from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS

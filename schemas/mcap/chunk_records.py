@@ -1,0 +1,96 @@
+"""The records inside of a chunk, and the chunks inside of a file that has lost its way."""
+
+import re
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Int64, gather
+from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES
+from hearthlog.schemas.mcap.records import McapError
+
+_COMPRESSED = re.compile(  # from the length of the compression's name on, with the data's magic
+    rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL
+)
+_BEFORE_COMPRESSED = HEAD.size + CHUNK.size - 4
+CHUNK_HEAD_LIMIT = 64  # bytes, in which the head of a compressed chunk and its data's magic fit
+
+
+def iterate_records(
+    content: bytes | memoryview, start: int = 0, end: int | None = None
+) -> Iterator[tuple[int, int, int]]:
+    """Go from record to record in the uncompressed content of a chunk, or in a part of it.
+
+    Parameters
+    ----------
+    content : bytes-like
+    start, end : int, optional
+        Bytes of the content; all of it by default.
+
+    Yields
+    ------
+    opcode, start, end : int
+        Whatever the opcode; from the first byte of the record up to that of the next one.
+
+    Raises
+    ------
+    McapError
+        If the last record is cut, or claims to be longer than the content.
+    """
+    last = len(content) if end is None else end
+    unpack = HEAD.unpack_from
+    while start < last:
+        try:
+            opcode, length = unpack(content, start)
+        except struct.error as error:
+            raise McapError("a record in a chunk is cut") from error
+        following = start + 9 + length
+        if following > last:
+            raise McapError("a record in a chunk claims to be longer than the chunk")
+        yield opcode, start, following
+        start = following
+
+
+def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
+    """Make the message index that a chunk should have.
+
+    Parameters
+    ----------
+    content : bytes-like
+    starts : np.ndarray [shape=(n,)], int64
+        Where its messages begin, ascending.
+
+    Returns
+    -------
+    dict of int to bytes
+        By channel, in the order of their first messages: rows of dtype `INDEX_ENTRIES`.
+    """
+    if not len(starts):
+        return {}
+    buffer = np.frombuffer(content, np.uint8)
+    channels = gather(buffer, starts + 9, 2).view("<u2")
+    entries = np.empty(len(starts), INDEX_ENTRIES)
+    entries["time"] = gather(buffer, starts + 15, 8).view("<i8")
+    entries["offset"] = starts
+    order = np.argsort(channels, kind="stable")
+    numbers, firsts, counts = np.unique(channels, return_index=True, return_counts=True)
+    ends = np.cumsum(counts)
+    return {
+        int(numbers[i]): entries[order[ends[i] - counts[i] : ends[i]]].tobytes()
+        for i in np.argsort(firsts)
+    }
+
+
+def find_chunk_heads(window: bytes) -> Iterator[int]:
+    """Search for the heads of compressed chunks, by their compression and its magic.
+
+    Yields
+    ------
+    int
+        Bytes of the window at which a head may begin, ascending. What is there, its opcode too,
+        may be damaged.
+    """
+    for match in _COMPRESSED.finditer(window):
+        if match.start() >= _BEFORE_COMPRESSED:
+            yield match.start() - _BEFORE_COMPRESSED

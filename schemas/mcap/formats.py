@@ -1,0 +1,67 @@
+"""The binary layouts of MCAP records, each defined once (https://mcap.dev/spec).
+
+All numbers are little-endian; times are nanoseconds. A record is its opcode, the length of its
+content, and its content. A `Struct` is the fixed beginning of a content, unless its comment says
+that opcode and length are part of it; a dtype has rows of whole numbers of records or entries.
+"""
+
+import struct
+
+import numpy as np
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+__all__ = [
+    "ATTACHMENT",
+    "CHUNK",
+    "CHUNK_INDEX",
+    "CHUNK_INDEX_TAIL",
+    "FOOTER",
+    "FOOTER_SIZE",
+    "HEAD",
+    "INDEX_ENTRIES",
+    "INDEX_ENTRY",
+    "INDEX_OFFSET",
+    "MAGIC",
+    "MESSAGE",
+    "MESSAGE_FIXED",
+    "MESSAGE_HEAD",
+    "MESSAGE_INDEX",
+    "MESSAGE_INDEX_HEAD",
+    "SUMMARY_OFFSET",
+    "UINT16",
+    "UINT32",
+    "UINT64",
+]
+
+UINT16, UINT32, UINT64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
+HEAD = struct.Struct("<BQ")  # opcode, length of the content
+MESSAGE = struct.Struct("<BQHIQQ")  # with HEAD: channel, sequence, log time, publish time; payload
+MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes of a message's content before its payload
+MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ]
+)
+# First and last log time, size and CRC uncompressed, length of the compression's name; that name,
+# length of the data (UINT64), data.
+CHUNK = struct.Struct("<QQQII")
+MESSAGE_INDEX = struct.Struct("<HI")  # channel, bytes of the entries; entries
+MESSAGE_INDEX_HEAD = np.dtype(
+    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")]
+)
+INDEX_ENTRY = struct.Struct("<QQ")  # log time of a message, offset in the uncompressed chunk
+INDEX_ENTRIES = np.dtype([("time", "<i8"), ("offset", "<i8")])
+# First and last log time, offset and length of the chunk, bytes of the index offsets; these, the
+# tail, the compression's name, size compressed and uncompressed (UINT64 each).
+CHUNK_INDEX = struct.Struct("<QQQQI")
+INDEX_OFFSET = struct.Struct("<HQ")  # channel, offset of its message index
+CHUNK_INDEX_TAIL = struct.Struct("<QI")  # bytes of the message indexes, length of a name
+ATTACHMENT = struct.Struct("<QQI")  # log time, time of creation, length of the name
+SUMMARY_OFFSET = struct.Struct("<9xBQQ")  # with HEAD: opcode, start and length of a group
+FOOTER = struct.Struct("<QQ")  # start of the summary, start of the summary offsets; CRC (UINT32)
+FOOTER_SIZE = HEAD.size + FOOTER.size + UINT32.size + len(MAGIC)

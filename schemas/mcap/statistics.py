@@ -1,0 +1,92 @@
+"""The time span and the message counts of a log, without its index where it is finished."""
+
+import struct
+from collections import Counter
+from contextlib import closing, suppress
+from pathlib import Path
+
+from mcap import records
+from mcap.opcode import Opcode
+from mcap.records import McapRecord
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC, SUMMARY_OFFSET
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import McapError, parse
+from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
+
+_SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
+
+
+def time_span(path: Path) -> tuple[int, int] | None:
+    """Return the first and the last log time of a log, or None if it has no messages.
+
+    Raises
+    ------
+    LogError
+        If it is no MCAP file, or is damaged.
+    """
+    try:
+        with closing(open_file(path)) as file:
+            about = _statistics(file)
+    except (McapError, struct.error):
+        about = None
+    if about is not None:
+        times = about.message_start_time, about.message_end_time
+        return times if about.message_count else None
+    with LogFile(path) as log:
+        if not len(log.chunks):
+            return None
+        return int(log.chunks["start"].min()), int(log.chunks["end"].max())
+
+
+def topic_counts(path: Path) -> Counter[str]:
+    """Count the messages of each topic as a finished log says, so far as that can be true."""
+    found: Counter[str] = Counter()
+    with (
+        suppress(LogError, McapError, UnicodeDecodeError, struct.error),
+        closing(open_file(path)) as file,
+    ):
+        about = _statistics(file)
+        counts = {} if about is None else about.channel_message_counts
+        for channel in _summary_group(file, Opcode.CHANNEL):
+            if isinstance(channel, records.Channel):
+                most = file.size  # a message takes more than a byte
+                found[channel.topic] += min(counts.get(channel.id, 0), most)
+    return found
+
+
+def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
+    """Read the statistics of a finished log, which are found without reading its index."""
+    for found in _summary_group(file, Opcode.STATISTICS):
+        if isinstance(found, records.Statistics):
+            return found
+    return None
+
+
+def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord | None]:
+    """Read the records of one kind in the summary of a finished log."""
+    end = max(file.size - FOOTER_SIZE, 0)
+    tail = file.read(end, FOOTER_SIZE)
+    if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
+        return []
+    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
+    assert isinstance(footer, records.Footer)
+    size = end - footer.summary_offset_start
+    if not footer.summary_offset_start or not 0 <= size <= _SIZE_LIMIT:
+        return []
+    offsets = file.read(footer.summary_offset_start, size)
+    for group, start, length in SUMMARY_OFFSET.iter_unpack(offsets):
+        if group == opcode and length <= _SIZE_LIMIT and start < end:
+            return _split(file.read(start, length))
+    return []
+
+
+def _split(raw: bytes) -> list[McapRecord | None]:
+    found = []
+    start = 0
+    while start < len(raw):
+        opcode, length = HEAD.unpack_from(raw, start)
+        start += HEAD.size + length
+        found.append(parse(opcode, raw[start - length : start]))
+    return found

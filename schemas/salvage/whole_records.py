@@ -1,0 +1,178 @@
+"""Records of a damaged file that are whole, and what is in them."""
+
+import zlib
+from array import array
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from mcap import records
+from mcap.opcode import Opcode
+from mcap.records import McapRecord
+
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.mcap.chunk_records import iterate_records
+from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
+from hearthlog.schemas.mcap.records import ChunkHead, McapError, decompress, parse
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.salvage.record_sizes import SHORTEST
+
+_DEFINITIONS_LIMIT = 1 << 19
+
+
+class WholeChunk(NamedTuple):
+    """A chunk whose content is proved, and the definitions in it."""
+
+    stored: StoredChunk
+    definitions: list[Definition]
+
+
+class WholeAttachment(NamedTuple):
+    """An attachment as the file holds it, and what an index says of it."""
+
+    record: bytes
+    index_record: records.AttachmentIndex
+
+
+class WholeRecord(NamedTuple):
+    """A whole record.
+
+    Attributes
+    ----------
+    offset, end : int
+        Bytes of the file.
+    record : McapRecord, WholeChunk, WholeAttachment or None
+        None for a message index, which is made anew.
+    corrected : str
+        What of its head was wrong and had to be corrected; empty if nothing was.
+    """
+
+    offset: int
+    end: int
+    record: McapRecord | WholeChunk | WholeAttachment | None
+    corrected: str = ""
+
+
+def split_content(content: bytes) -> tuple[Int64, Int64]:
+    """Go through the records of a chunk.
+
+    Returns
+    -------
+    messages, definitions : np.ndarray [shape=(n,)], int64
+        Where in the content they begin.
+
+    Raises
+    ------
+    McapError
+        If a record is damaged, or of a kind that no chunk holds.
+    """
+    messages, definitions = array("q"), array("q")
+    for opcode, start, _ in _records(content):
+        (messages if opcode == Opcode.MESSAGE else definitions).append(start)
+    return np.frombuffer(messages, np.int64), np.frombuffer(definitions, np.int64)
+
+
+def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
+    """Read the schemas and channels that begin at some bytes of a chunk.
+
+    Raises
+    ------
+    McapError
+        If one is damaged, or they are too many.
+    UnicodeDecodeError
+        If a text in one is not UTF-8.
+    """
+    if len(starts) > _DEFINITIONS_LIMIT:
+        raise McapError("a chunk holds more definitions than can be kept")
+    definitions: list[Definition] = []
+    for start in starts.tolist():
+        opcode, length = HEAD.unpack_from(content, start)
+        record = parse(opcode, content[start + HEAD.size : start + HEAD.size + length])
+        assert isinstance(record, Definition)
+        definitions.append(record)
+    return definitions
+
+
+def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
+    """Return the first and last log time of a message index; 0 and 0 if it is empty.
+
+    Raises
+    ------
+    McapError
+        If a log time is out of range.
+    """
+    if not entries:
+        return 0, 0
+    times = np.concatenate([np.frombuffer(e, INDEX_ENTRIES)["time"] for e in entries.values()])
+    if (times < 0).any():
+        raise McapError("a log time is out of range")
+    return int(times.min()), int(times.max())
+
+
+def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
+    """Read the messages of a chunk that is proved, one by one."""
+    head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
+    content = decompress(head, chunk.data)
+    for opcode, start, end in _records(content):
+        if opcode == Opcode.MESSAGE:
+            yield read_message(content[start:end])
+
+
+def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Go from record to record inside a chunk, which holds messages and definitions alone."""
+    shortest: dict[int, int] = {
+        opcode: HEAD.size + int(SHORTEST[opcode])
+        for opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+    }
+    for opcode, start, end in iterate_records(content):
+        if opcode not in shortest:
+            raise McapError("the records of a chunk are damaged")
+        if end - start < shortest[opcode]:
+            raise McapError("a record in a chunk is too short")
+        yield opcode, start, end
+
+
+def read_message(raw: bytes) -> records.Message:
+    """Read a message from its record; raise McapError if its log time is out of range."""
+    _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
+    if log_time >= 1 << 63:
+        raise McapError("a log time is out of range")
+    return records.Message(
+        channel_id=channel,
+        log_time=log_time,
+        data=raw[MESSAGE.size :],
+        publish_time=publish_time,
+        sequence=sequence,
+    )
+
+
+def read_attachment(raw: bytes) -> WholeAttachment:
+    """Read an attachment from its record, whose lengths add up.
+
+    Raises
+    ------
+    McapError
+        If its checksum is wrong.
+    UnicodeDecodeError
+        If a text in it is not UTF-8.
+    """
+    record = memoryview(raw)
+    (crc,) = UINT32.unpack(record[-UINT32.size :])
+    if crc not in {0, zlib.crc32(record[HEAD.size : -UINT32.size])}:
+        raise McapError("an attachment has another checksum than it claims")
+    log_time, create_time, name = ATTACHMENT.unpack_from(record, HEAD.size)
+    first = HEAD.size + ATTACHMENT.size + name
+    (media,) = UINT32.unpack_from(record, first)
+    return WholeAttachment(
+        raw,
+        records.AttachmentIndex(
+            offset=0,
+            length=0,
+            log_time=log_time,
+            create_time=create_time,
+            data_size=UINT64.unpack_from(record, first + 4 + media)[0],
+            name=str(record[first - name : first], "utf-8"),
+            media_type=str(record[first + 4 : first + 4 + media], "utf-8"),
+        ),
+    )
