@@ -11,16 +11,14 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_log import compare
 from hearthlog.analyzer.evaluation.event_scores import (
     Events,
-    common,
     event_based,
     false_alarms_per_day,
     laid_out,
-    merged,
     segment_based,
-    total,
 )
 from hearthlog.analyzer.evaluation.table import class_table, confusion_table
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import Spans, common, joined
 from hearthlog.analyzer.training.scores import (
     Bin,
     calibration_error,
@@ -254,16 +252,16 @@ def test_spans_are_joined_and_cut_like_sets_of_moments(first, second):
         {t for start, length in rows for t in range(start, start + length)}
         for rows in (first, second)
     ]
-    joined = [
-        merged(*(np.array(v, np.int64) for v in ([a for a, _ in rows], [a + n for a, n in rows])))
+    spans = [
+        joined(*(np.array(v, np.int64) for v in ([a for a, _ in rows], [a + n for a, n in rows])))
         for rows in (first, second)
     ]
-    assert [total(one) for one in joined] == [len(one) for one in sets]
-    assert total(common(*joined)) == len(sets[0] & sets[1])
+    assert [one.length for one in spans] == [len(one) for one in sets]
+    assert common(*spans).length == len(sets[0] & sets[1])
 
 
 def test_what_is_outside_of_the_evaluated_spans_is_left_out():
-    spans = np.array([10, 20]) * SECOND, np.array([12, 25]) * SECOND
+    spans = Spans(np.array([10, 20]) * SECOND, np.array([12, 25]) * SECOND)
     laid = laid_out(events((0, 5, 0), (9, 21.5, 1), (24, 30, 2)), spans)
     assert (laid.ends - laid.starts).tolist() == [2 * SECOND, SECOND * 3 // 2, SECOND]
     assert (laid.starts % SECOND == 0).all()

@@ -8,38 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events
+from hearthlog.analyzer.evaluation.event_scores import Events, events_of
 from hearthlog.analyzer.logs.labellings import Side
+from hearthlog.analyzer.logs.spans import Overlay, overlay
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 
 DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
-
-
-class Pieces(NamedTuple):
-    """Time in which no labelling changes.
-
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-    rows : np.ndarray [shape=(m, n)], int64
-        For each labelling the row of its event; -1 where it has none.
-    """
-
-    starts: Int64
-    ends: Int64
-    rows: Int64
-
-    @property
-    def labelled(self) -> NDArray[np.bool_]:
-        """Where all labellings have an event."""
-        return np.logical_and.reduce(self.rows >= 0)
-
-    def taken(self, which: NDArray[np.bool_]) -> "Pieces":
-        """Return some of them."""
-        return Pieces(self.starts[which], self.ends[which], self.rows[:, which])
 
 
 class Runs(NamedTuple):
@@ -149,9 +126,8 @@ def compare_sides(a: Side, b: Side) -> Difference:
     """
     b = b.called_as(a.classes)
     classes = list(dict.fromkeys([*a.classes, *b.classes]))
-    events = [events_of(side, classes) for side in (a, b)]
-    pieces = laid_over(events, DAY)
-    pieces = pieces.taken(pieces.labelled)
+    events = [events_of(side.labelling, classes) for side in (a, b)]
+    pieces = overlay(events, DAY).in_all()
     if not len(pieces.starts):
         raise DataError(f"{a.name} and {b.name} have no time in common")
     counts = _Counts(pieces, events, len(classes))
@@ -175,34 +151,7 @@ def compare_sides(a: Side, b: Side) -> Difference:
     )
 
 
-def events_of(side: Side, classes: Sequence[str]) -> Events:
-    """Return the segments of a side, their labels as places in `classes`."""
-    place = {name: i for i, name in enumerate(classes)}
-    found = side.labelling
-    labels = np.fromiter(map(place.__getitem__, found.labels), np.int64, len(found))
-    return Events(found.starts, found.ends, labels)
-
-
-def laid_over(labellings: Sequence[Events], every: int = 0) -> Pieces:
-    """Cut the time wherever one of some labellings changes.
-
-    Parameters
-    ----------
-    labellings : sequence of Events
-        Each in the order of time, one label at a time.
-    every : int, optional
-        Cut it also at the multiples of so many nanoseconds.
-    """
-    edges = [times for events in labellings for times in (events.starts, events.ends)]
-    if every:
-        first, last = min(int(e[0]) for e in edges), max(int(e[-1]) for e in edges)
-        edges.append(np.arange(-(-first // every) * every, last, every))
-    times = np.unique(np.concatenate(edges))
-    rows = [_rows_at(events, times[:-1]) for events in labellings]
-    return Pieces(times[:-1], times[1:], np.stack(rows))
-
-
-def runs_of(pieces: Pieces, a: Events, b: Events) -> Runs:
+def runs_of(pieces: Overlay, a: Events, b: Events) -> Runs:
     """Join successive pieces whose labels are the same; they may be a frame apart."""
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)
@@ -218,7 +167,7 @@ def runs_of(pieces: Pieces, a: Events, b: Events) -> Runs:
 class _Counts:
     """Nanoseconds and events by day and class."""
 
-    def __init__(self, pieces: Pieces, events: Sequence[Events], classes: int) -> None:
+    def __init__(self, pieces: Overlay, events: Sequence[Events], classes: int) -> None:
         self.days, day = np.unique(pieces.starts // DAY, return_inverse=True)
         labels = [e.labels[rows] for e, rows in zip(events, pieces.rows, strict=True)]
         self._labels, self._lengths, self._classes = labels, pieces.ends - pieces.starts, classes
@@ -258,11 +207,6 @@ class _Counts:
             kappa=float((agreement - chance) / (1.0 - chance)) if chance < 1.0 else None,
             per_class={name: ClassAmounts(*row) for name, *row in rows if row[0] or row[1]},
         )
-
-
-def _rows_at(events: Events, times: Int64) -> Int64:
-    rows = np.searchsorted(events.starts, times, side="right") - 1
-    return np.where((rows >= 0) & (events.ends[rows] > times), rows, -1)
 
 
 def _added(row: Int64, column: Int64, weight: Int64 | None, shape: tuple[int, int]) -> Float64:

@@ -11,14 +11,13 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import (
     Detections,
     Events,
-    common,
     detect,
+    events_of,
     laid_out,
-    merged,
-    total,
 )
 from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import common, joined
 from hearthlog.analyzer.marks.formats import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
@@ -79,16 +78,16 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
     DataError
         If the two have no time in common, or the reference no label that the log knows.
     """
-    covered = merged(reference.starts, reference.ends, FRAME_NANOSECONDS)
-    spans = common(covered, merged(found.starts, found.ends, FRAME_NANOSECONDS))
-    if not total(spans):
+    covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
+    spans = common(covered, joined(found.starts, found.ends, FRAME_NANOSECONDS))
+    if not spans.length:
         raise DataError(
             f"the reference ({_between(reference)}) and what is labelled in the log "
             f"({_between(found)}) have no time in common"
         )
     reference = reference.called_as(classes)
     names = [*classes, *sorted(set(reference.labels) - set(classes))]
-    true, said = (laid_out(_events(each, names), spans) for each in (reference, found))
+    true, said = (laid_out(events_of(each, names), spans) for each in (reference, found))
     lengths = np.bincount(true.labels, true.ends - true.starts, len(names)) / NANOSECONDS
     unknown = {
         name: float(length)
@@ -104,18 +103,12 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
     scores, ambiguous = _frames(true, said, classes)
     return Comparison(
         scores=scores,
-        detections=detect(known, said, classes, total(spans)),
-        reference_seconds=_seconds(total(covered)),
-        evaluated_seconds=_seconds(total(spans)),
+        detections=detect(known, said, classes, spans.length),
+        reference_seconds=_seconds(covered.length),
+        evaluated_seconds=_seconds(spans.length),
         ambiguous_seconds=_seconds(ambiguous * FRAME_NANOSECONDS),
         unknown_labels=unknown,
     )
-
-
-def _events(labelling: Labelling, names: Sequence[str]) -> Events:
-    place = {name: i for i, name in enumerate(names)}
-    labels = np.fromiter(map(place.__getitem__, labelling.labels), np.int64, len(labelling))
-    return Events(labelling.starts, labelling.ends, labels)
 
 
 def _frames(reference: Events, found: Events, classes: Sequence[str]) -> tuple[Scores, int]:

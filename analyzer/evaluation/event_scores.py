@@ -16,6 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces, runs
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -23,8 +25,6 @@ COLLAR = NANOSECONDS // 5
 _PART_OF_LENGTH = 0.5
 _DAY = 24 * 3600 * NANOSECONDS
 _MOST_PAIRS = 20_000_000
-
-Spans = tuple[Int64, Int64]
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,13 @@ class Events:
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
         """Return some of them."""
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
+
+
+def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
+    """Return the spans of a labelling, their labels as indices of `classes`."""
+    indices = {name: i for i, name in enumerate(classes)}
+    labels = np.fromiter(map(indices.__getitem__, labelling.labels), np.int64, len(labelling))
+    return Events(labelling.starts, labelling.ends, labels)
 
 
 @dataclass(frozen=True)
@@ -132,28 +139,6 @@ def detect(reference: Events, found: Events, classes: Sequence[str], duration: i
     )
 
 
-def merged(starts: Int64, ends: Int64, tolerance: int = 0) -> Spans:
-    """Join spans that overlap, or are no further apart than `tolerance`.
-
-    Returns
-    -------
-    (starts, ends)
-        Ascending, disjoint.
-    """
-    order = np.argsort(starts, kind="stable")
-    starts, reach = starts[order], np.maximum.accumulate(ends[order])
-    first = np.concatenate([[True], starts[1:] > reach[:-1] + tolerance])[: len(starts)]
-    last = np.concatenate([first[1:], [True]])[: len(starts)]
-    return starts[first], reach[last]
-
-
-def common(first: Spans, second: Spans) -> Spans:
-    """Return the spans that are in both of two ascending, disjoint lists."""
-    events = Events(*first, np.zeros(len(first[0]), np.int64))
-    cut, _ = _cut(events, *second)
-    return cut.starts, cut.ends
-
-
 def laid_out(events: Events, spans: Spans) -> Events:
     """Cut events to spans of time, and lay the spans out as recordings one after the other.
 
@@ -163,34 +148,13 @@ def laid_out(events: Events, spans: Spans) -> Events:
     Parameters
     ----------
     events : Events
-    spans : (starts, ends)
-        Ascending, disjoint.
+    spans : Spans
     """
-    starts, ends = spans
-    seconds = -((starts - ends) // NANOSECONDS) + 1
+    seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
-    cut, span = _cut(events, starts, ends)
-    shift = (places - starts)[span]
-    return Events(cut.starts + shift, cut.ends + shift, cut.labels)
-
-
-def _cut(events: Events, starts: Int64, ends: Int64) -> tuple[Events, NDArray[np.intp]]:
-    """Cut events to disjoint spans; return the pieces and the span that each is in."""
-    first = np.searchsorted(ends, events.starts, "right")
-    count = np.maximum(np.searchsorted(starts, events.ends, "left") - first, 0)
-    event = np.repeat(np.arange(len(events)), count)
-    span = first[event] + _positions(count)
-    pieces = Events(
-        np.maximum(events.starts[event], starts[span]),
-        np.minimum(events.ends[event], ends[span]),
-        events.labels[event],
-    )
-    return pieces, span
-
-
-def _positions(counts: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Count 0, 1 … within runs of these lengths."""
-    return np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    parts, event, span = pieces(events, spans)
+    shift = (places - spans.starts)[span]
+    return Events(parts.starts + shift, parts.ends + shift, events.labels[event])
 
 
 def segment_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
@@ -205,18 +169,13 @@ def segment_based(reference: Events, found: Events, classes: Sequence[str]) -> D
     counts = []
     for label in range(len(classes)):
         true, said = _seconds(reference.of(label)), _seconds(found.of(label))
-        counts.append((total(common(true, said)), total(true), total(said)))
+        counts.append((common(true, said).length, true.length, said.length))
     return _scores(counts, classes)
 
 
 def _seconds(events: Events) -> Spans:
     """Return the whole seconds that events touch."""
-    return merged(events.starts // NANOSECONDS, -(-events.ends // NANOSECONDS))
-
-
-def total(spans: Spans) -> int:
-    """Add up the lengths of spans."""
-    return int((spans[1] - spans[0]).sum())
+    return joined(events.starts // NANOSECONDS, -(-events.ends // NANOSECONDS))
 
 
 def event_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
@@ -249,8 +208,7 @@ def _matches(reference: Events, found: Events) -> int:
     count = np.searchsorted(found.starts, reference.starts + COLLAR, "right") - first
     if count.sum() > _MOST_PAIRS:
         raise DataError("too many events start within 0.2 s of each other; this is no labelling")
-    row = np.repeat(np.arange(len(reference)), count)
-    column = first[row] + _positions(count)
+    row, column = runs(first, count)
     tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
     near = np.abs(reference.ends[row] - found.ends[column]) <= tolerance[row]
     if not near.any():
@@ -282,7 +240,7 @@ def false_alarms_per_day(
 
 
 def _false_alarms(reference: Events, found: Events) -> int:
-    starts, ends = merged(reference.starts, reference.ends)
+    starts, ends = joined(reference.starts, reference.ends)
     before = np.searchsorted(starts, found.ends, "left")
     reached = np.concatenate([[np.iinfo(np.int64).min], ends])[before]
     return int((reached <= found.starts).sum())

@@ -1,11 +1,14 @@
-"""Spans of time as arrays: joined, cut, taken from each other, measured."""
+"""Spans of time as arrays: joined, cut, taken from each other, laid over each other, measured."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Int64
+
+Rows = NDArray[np.intp]
 
 
 class Spans(NamedTuple):
@@ -25,6 +28,41 @@ class Spans(NamedTuple):
         return int((self.ends - self.starts).sum())
 
 
+class Timed(Protocol):
+    """Whatever has starts and ends, as `Spans` and labelled spans have."""
+
+    @property
+    def starts(self) -> Int64:
+        """When each begins, ascending."""
+
+    @property
+    def ends(self) -> Int64:
+        """When each ends."""
+
+
+class Overlay(NamedTuple):
+    """Time in which nothing begins or ends.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+    rows : np.ndarray [shape=(m, n)], int64
+        For each of what was laid over each other the row of its span; -1 where it has none.
+    """
+
+    starts: Int64
+    ends: Int64
+    rows: Int64
+
+    def taken(self, which: NDArray[np.bool_]) -> "Overlay":
+        """Return some of its parts."""
+        return Overlay(self.starts[which], self.ends[which], self.rows[:, which])
+
+    def in_all(self) -> "Overlay":
+        """Return the parts in which all have a span."""
+        return self.taken(np.logical_and.reduce(self.rows >= 0))
+
+
 NONE = Spans(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
@@ -33,7 +71,7 @@ def one(start: int, end: int) -> Spans:
     return Spans(np.array([start]), np.array([end]))
 
 
-def first_of_groups(starts: Int64, ends: Int64, pause: int) -> NDArray[np.intp]:
+def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
     """Find where, in spans by their starts, one begins more than a pause after all before it."""
     if not len(starts):
         return np.empty(0, np.intp)
@@ -49,14 +87,38 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
     return Spans(starts[firsts], np.maximum.reduceat(ends, firsts)) if len(firsts) else NONE
 
 
-def common(a: Spans, b: Spans) -> Spans:
-    """Return what is in both."""
+def runs(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
+    """Count up from each of some numbers.
+
+    Returns
+    -------
+    rows, numbers : np.ndarray [shape=(counts.sum(),)]
+        `firsts[0]`, `firsts[0] + 1` … of row 0, then those of row 1.
+    """
+    rows = np.repeat(np.arange(len(counts)), counts)
+    return rows, np.arange(counts.sum()) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
+
+
+def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
+    """Cut spans, which may overlap, to others.
+
+    Returns
+    -------
+    spans : Spans
+        What is in both, in the order of `a`.
+    of_a, of_b : np.ndarray [shape=(n,)]
+        The rows each is a piece of.
+    """
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
-    counts = np.maximum(high - low, 0)
-    of_a = np.repeat(np.arange(len(counts)), counts)
-    of_b = np.arange(counts.sum()) + np.repeat(low - (np.cumsum(counts) - counts), counts)
-    return Spans(np.maximum(a.starts[of_a], b.starts[of_b]), np.minimum(a.ends[of_a], b.ends[of_b]))
+    of_a, of_b = runs(low, np.maximum(high - low, 0))
+    starts = np.maximum(a.starts[of_a], b.starts[of_b])
+    return Spans(starts, np.minimum(a.ends[of_a], b.ends[of_b])), of_a, of_b
+
+
+def common(a: Spans, b: Spans) -> Spans:
+    """Return what is in both."""
+    return pieces(a, b)[0]
 
 
 def cut(spans: Spans, start: int, end: int) -> Spans:
@@ -69,12 +131,45 @@ def cut(spans: Spans, start: int, end: int) -> Spans:
 
 def without(a: Spans, b: Spans) -> Spans:
     """Return what is in the first and not in the second."""
+    return remains(a, b)[0]
+
+
+def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
+    """Take spans from others; return what is left, and the row of `a` that each is left of."""
     if not len(a.starts) or not len(b.starts):
-        return a
+        return Spans(a.starts, a.ends), np.arange(len(a.starts))
     first, last = min(a.starts[0], b.starts[0]), max(a.ends[-1], b.ends[-1])
     starts, ends = np.concatenate([[first], b.ends]), np.concatenate([b.starts, [last]])
     left = starts < ends
-    return common(a, Spans(starts[left], ends[left]))
+    spans, of_a, _ = pieces(a, Spans(starts[left], ends[left]))
+    return spans, of_a
+
+
+def rows_at(spans: Timed, times: Int64) -> Int64:
+    """Find the row of the span that each time lies in; -1 for none."""
+    if not len(spans.starts):
+        return np.full(len(times), -1)
+    rows = np.searchsorted(spans.starts, times, side="right") - 1
+    return np.where((rows >= 0) & (spans.ends[rows] > times), rows, -1)
+
+
+def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
+    """Cut the time wherever one of some layers of spans changes.
+
+    Parameters
+    ----------
+    layers : sequence
+        Of spans that ascend and do not overlap.
+    every : int, optional
+        Cut it also at the multiples of so many nanoseconds.
+    """
+    edges = [times for spans in layers for times in (spans.starts, spans.ends)]
+    if every:
+        first, last = min(int(e[0]) for e in edges), max(int(e[-1]) for e in edges)
+        edges.append(np.arange(-(-first // every) * every, last, every))
+    times = np.unique(np.concatenate(edges))
+    rows = np.stack([rows_at(spans, times[:-1]) for spans in layers])
+    return Overlay(times[:-1], times[1:], rows)
 
 
 def lengths(spans: Spans, edges: Int64) -> Int64:

@@ -15,7 +15,7 @@ from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, without
+from hearthlog.analyzer.logs.spans import Spans, common, joined, one, remains
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.models.classes import class_name
@@ -293,24 +293,20 @@ def _of_marks(marks: Sequence[Mark]) -> Segments:
 
 def _corrected(segments: Segments, marks: Segments) -> Segments:
     """Put what a person says in the place of what a model said."""
-    marked = marks.spans
-    own = Spans(segments.starts, segments.ends)
-    left = without(own, marked) if len(own.starts) else NONE
-    of = np.searchsorted(own.starts, left.starts, side="right") - 1
+    left, rows = remains(segments, marks.spans)
     starts = np.concatenate([left.starts, marks.starts])
     order = np.argsort(starts, kind="stable")
     return Segments(
         starts[order],
         np.concatenate([left.ends, marks.ends])[order],
-        np.concatenate([segments.labels[of], marks.labels])[order],
-        np.concatenate([segments.confidences[of], marks.confidences])[order],
+        np.concatenate([segments.labels[rows], marks.labels])[order],
+        np.concatenate([segments.confidences[rows], marks.confidences])[order],
     )
 
 
 def _check(heard: Heard, shelf: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
     """Raise DataError unless something was heard in the days that are reported."""
-    days = Spans(np.array([close[0]]), np.array([close[1]]))
-    if any(common(segments.spans, days).length for segments in heard.segments.values()):
+    if any(common(segments.spans, one(*close)).length for segments in heard.segments.values()):
         return
     if labelling != LIVE:
         advice = f"`hearthlog relabel LOGS --model {labelling}.safetensors` makes them"

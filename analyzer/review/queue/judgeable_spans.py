@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import laid_over
 from hearthlog.analyzer.evaluation.event_scores import Events
+from hearthlog.analyzer.logs.spans import Spans, overlay, remains, runs
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -73,8 +73,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     parts = np.where(ends - starts < SHORTEST, 0, -(-(ends - starts) // LONGEST))
     if parts.sum() > _MOST:
         raise DataError("too much to rank at once: choose a part with --start and --end")
-    source = np.repeat(np.arange(len(first)), parts)
-    part = np.arange(len(source)) - np.repeat(np.cumsum(parts) - parts, parts)
+    source, part = runs(np.zeros(len(first), np.int64), parts)
     begins, stops = (
         starts[source] + (ends - starts)[source] * number // parts[source]
         for number in (part, part + 1)
@@ -84,9 +83,8 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
 
 def without(segments: Events, starts: Int64, ends: Int64) -> Events:
     """Leave of some segments what is outside of spans that do not overlap."""
-    pieces = laid_over([segments, Events(starts, ends, np.zeros(len(starts), np.int64))])
-    pieces = pieces.taken((pieces.rows[0] >= 0) & (pieces.rows[1] < 0))
-    return Events(pieces.starts, pieces.ends, segments.labels[pieces.rows[0]])
+    spans, rows = remains(segments, Spans(starts, ends))
+    return Events(*spans, segments.labels[rows])
 
 
 def other_labels(windows: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
@@ -100,8 +98,7 @@ def other_labels(windows: JudgeableSpans, others: Events) -> tuple[Int64, NDArra
         Share of the window in which it says something else.
     """
     own = Events(windows.starts, windows.ends, windows.labels)
-    pieces = laid_over([own, others])
-    pieces = pieces.taken(pieces.labelled)
+    pieces = overlay([own, others]).in_all()
     row, label = pieces.rows[0], others.labels[pieces.rows[1]]
     lengths = pieces.ends - pieces.starts
     apart = np.where(label != windows.labels[row], lengths, 0)

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import DAY, events_of
+from hearthlog.analyzer.evaluation.difference import DAY
+from hearthlog.analyzer.evaluation.event_scores import events_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources
 from hearthlog.analyzer.review.queue.judgeable_spans import (
@@ -102,7 +103,7 @@ def make_queue(  # noqa: PLR0913
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
-    segments = events_of(side, classes)
+    segments = events_of(side.labelling, classes)
     if marks is not None:
         segments = without(segments, marks.starts, marks.ends)
     windows = judgeable_spans(segments)
@@ -117,7 +118,7 @@ def make_queue(  # noqa: PLR0913
         )
     labels, differing = np.full(len(windows), -1), np.zeros(len(windows))
     if other is not None:
-        labels, differing = other_labels(windows, events_of(other, classes))
+        labels, differing = other_labels(windows, events_of(other.labelling, classes))
     parts = doubt.uncertainty.values(), differing, doubt.novelty.values()
     scores = _scores(np.stack(parts), ranking)
     if not scores.any():

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.spans import Spans, lengths
 from hearthlog.schemas.arrays import Float64, Int64
 
 
@@ -93,11 +94,8 @@ def time_shares(
         0 to 1.
     """
     edges = grid.edges
-    shares = np.empty((grid.count, width))
-    for label in range(width):
-        own = labels == label
-        times = np.stack([starts[own], ends[own]], axis=1).ravel()
-        heard = np.cumsum(np.stack([0 * starts[own], (ends - starts)[own]], axis=1))
-        until = np.interp(edges, times, heard, left=0.0) if len(times) else np.zeros(len(edges))
-        shares[:, label] = np.diff(until)
-    return shares / np.diff(edges)[:, np.newaxis]
+    taken = [
+        lengths(Spans(starts[labels == label], ends[labels == label]), edges)
+        for label in range(width)
+    ]
+    return np.stack(taken, axis=1) / np.diff(edges)[:, np.newaxis]

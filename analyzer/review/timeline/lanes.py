@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.analyzer.review.timeline.grid import Grid, time_shares
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LabellingTimeline, no_spans
 from hearthlog.models.classes import SILENCE, class_name, translation
@@ -89,9 +90,8 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     """
     if not len(one) or not len(other):
         return no_spans()
-    edges = np.unique(np.concatenate([one.starts, one.ends, other.starts, other.ends]))
-    starts, ends = edges[:-1], edges[1:]
-    a, b = _at(one, starts), _at(other, starts)
+    parts = overlay([one, other])
+    a, b = parts.rows
     differ = (a >= 0) & (b >= 0)
     names = translation(set(other.texts), set(one.texts))
     said = np.array([names[text] for text in other.texts], object)
@@ -104,13 +104,9 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     texts = [
         f"{x} / {y}" for x, y in zip(one.texts[a[places]], other.texts[b[places]], strict=True)
     ]
-    return LabelledSpans(starts[places], np.minimum(stops, ends[-1]), np.array(texts, object))
-
-
-def _at(spans: LabelledSpans, times: Int64) -> Int64:
-    """Find the span that each time lies in; -1 for none."""
-    found = np.searchsorted(spans.starts, times, side="right") - 1
-    return np.where((found >= 0) & (times < spans.ends[np.maximum(found, 0)]), found, -1)
+    return LabelledSpans(
+        parts.starts[places], np.minimum(stops, parts.ends[-1]), np.array(texts, object)
+    )
 
 
 def clock(grid: Grid, zone: tzinfo) -> LabelledSpans:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.review.timeline.decode import FIELDS, decibel, shown_topic, spans_of
 from hearthlog.analyzer.review.timeline.grid import Grid
@@ -182,9 +183,9 @@ class Live:
         """Say again what was heard in the seconds that segments settle: now it is smoothed."""
         seconds = self._open.get(microphone, np.empty(0, np.int64))
         times = np.unique(np.append(seconds, spans.starts))
-        found = np.searchsorted(spans.starts, times, side="right") - 1
-        settled = (found >= 0) & (times < spans.ends[found])
-        texts = spans.texts[found[settled]]
+        rows = rows_at(spans, times)
+        settled = rows >= 0
+        texts = spans.texts[rows[settled]]
         yield Lane(microphone, LIVE_LANE, Changes(times[settled], texts.tolist()))
         self._open[microphone] = seconds[seconds >= spans.ends[-1]]
 
