@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from hearthlog.analyzer.doctor.check import Examined, examine_file
+from hearthlog.analyzer.doctor.file_checks import ExaminedFile, examine_file
 from hearthlog.analyzer.doctor.findings import Finding, Findings
 from hearthlog.analyzer.doctor.folder_checks import check_leftovers, check_series
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import Progress, ignore_progress
 
-__all__ = ["Examined", "Finding", "Findings", "examine", "examine_file"]
+__all__ = ["ExaminedFile", "Finding", "Findings", "examine", "examine_file"]
 
 
 def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
@@ -44,7 +44,7 @@ def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
     return [*(file.findings for file in files), *left]
 
 
-def _examine_all(logs: Sequence[Path], progress: Progress) -> list[Examined]:
+def _examine_all(logs: Sequence[Path], progress: Progress) -> list[ExaminedFile]:
     sizes = [log.stat().st_size if log.is_file() else 0 for log in logs]
     whole = max(sum(sizes), 1)
     files = []

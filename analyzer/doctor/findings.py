@@ -60,7 +60,7 @@ class Finding(NamedTuple):
 
 @dataclass
 class Findings:
-    """What was found in one file; of every kind the first few and the number of all.
+    """The findings of one file: of every rule the first few, and the number of all.
 
     Attributes
     ----------

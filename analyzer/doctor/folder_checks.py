@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from hearthlog.analyzer.doctor.check import Examined
+from hearthlog.analyzer.doctor.file_checks import ExaminedFile
 from hearthlog.analyzer.doctor.findings import Findings, time_text
-from hearthlog.analyzer.doctor.frame_sequence import Frames
+from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX
 
@@ -28,9 +28,9 @@ def check_leftovers(folder: Path) -> Iterator[Findings]:
                 yield findings
 
 
-def check_series(files: Sequence[Examined]) -> None:
-    """Compare the logs of each node with each other, and add what is found to their findings."""
-    nodes: dict[str, list[Examined]] = {}
+def check_series(files: Sequence[ExaminedFile]) -> None:
+    """Compare the logs of each node with each other, and add to their findings."""
+    nodes: dict[str, list[ExaminedFile]] = {}
     for file in files:
         if file.ours and file.span is not None:
             nodes.setdefault(file.node, []).append(file)
@@ -41,12 +41,12 @@ def check_series(files: Sequence[Examined]) -> None:
             _check_frames(microphone, [file for file in same if microphone in file.frames])
 
 
-def _start(file: Examined) -> int:
+def _start(file: ExaminedFile) -> int:
     assert file.span is not None
     return file.span[0]
 
 
-def _check_overlaps(files: Sequence[Examined]) -> None:
+def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
     """Two logs of one node speak of the same time only where its clock was set back."""
     latest = files[0]
     for file in files[1:]:
@@ -60,16 +60,16 @@ def _check_overlaps(files: Sequence[Examined]) -> None:
             latest = file
 
 
-def _set_back(file: Examined) -> bool:
+def _set_back(file: ExaminedFile) -> bool:
     return any(_begins_back(frames) for frames in file.frames.values())
 
 
-def _begins_back(frames: Frames) -> bool:
+def _begins_back(frames: FrameSequence) -> bool:
     """Tell whether a file begins with the setting back of the clock."""
     return frames.gap_before is not None and frames.gap_before[1] < frames.gap_before[0]
 
 
-def _check_frames(microphone: str, files: Sequence[Examined]) -> None:
+def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
     """Frame numbers go on from file to file, or begin at 0 again."""
     by_end = {}
     for file in files:
@@ -90,7 +90,7 @@ def _check_frames(microphone: str, files: Sequence[Examined]) -> None:
             _say_missing(microphone, previous, file, missing)
 
 
-def _say_missing(microphone: str, previous: Examined, file: Examined, missing: int) -> None:
+def _say_missing(microphone: str, previous: ExaminedFile, file: ExaminedFile, missing: int) -> None:
     frames, last = file.frames[microphone], previous.frames[microphone].last
     assert frames.first is not None
     assert last is not None

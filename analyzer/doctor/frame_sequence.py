@@ -1,49 +1,22 @@
 """Frame numbers, stamps and gaps of one microphone: what the messages must say together."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
+from hearthlog.analyzer.doctor.frame_steps import Steps, check_gaps, check_steps
+from hearthlog.analyzer.doctor.topic_types import FEATURES, GAP, LABEL, SEGMENT, STATISTICS
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
-# Behind a sound server stamps are steered by when blocks arrive, at first by up to 45 % (ns).
-_STEP_TOLERANCE = FRAME_NANOSECONDS // 2
 _RATE_TOLERANCE = 2e-3  # of a sound card's clock
 _DELAY = 1_000_000_000  # ns; of a block that comes late
-_GAP_TOLERANCE = 1_000_000  # ns
 _NONE = np.empty((0, 3), np.int64)
 
-FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
 
-
-class _Steps(NamedTuple):
-    """The way to each frame from the one before it; arrays of one row a frame.
-
-    Attributes
-    ----------
-    rows : np.ndarray [shape=(n, 3)]
-        Log time, frame and stamp.
-    known : np.ndarray [shape=(n,)], bool
-        Whether there is one before it.
-    numbers, elapsed : np.ndarray [shape=(n,)], int64
-        By how much the frame number and the stamp (ns) have grown.
-    gaps, lost : np.ndarray [shape=(n,)], int64
-        How many gaps lie between, and the frames that they lost.
-    """
-
-    rows: Int64
-    known: NDArray[np.bool_]
-    numbers: Int64
-    elapsed: Int64
-    gaps: Int64
-    lost: Int64
-
-
-class Frames:
+class FrameSequence:
     """Follows one microphone through a file.
 
     Messages are added as rows of three numbers: log time, frame and stamp; of segments log time,
@@ -54,9 +27,9 @@ class Frames:
     findings : Findings
     microphone : str
     statistics_every : int or None
-        Frames from one statistics message to the next, if that is known.
+        Frames from one statistics message to the next, if the file has that.
     window_frames : int
-        Which end with a frame that has a label.
+        Frames of a window, at whose end there is a label.
     labelled : bool
         Whether there is a model.
 
@@ -91,7 +64,7 @@ class Frames:
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
         self._run: tuple[int, int] | None = None  # the first frame since the last gap
-        self._heard = 0  # frames since then
+        self._run_frames = 0  # since then, at most a window
         self._segment_end: int | None = None
         self._gap_ends: Int64 = np.empty(0, np.int64)
         self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
@@ -140,7 +113,7 @@ class Frames:
         return rows[done]
 
     def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
-        """Compare frame numbers, stamps and gaps; return at which frames a known gap ends."""
+        """Compare frame numbers, stamps and gaps; return at which frames a gap ends."""
         following = np.searchsorted(rows[:, 2], gaps[:, 0])
         waiting = following == len(rows)
         if waiting.any():  # for the next frame
@@ -158,64 +131,19 @@ class Frames:
             self.lost_before = int(lost[0])
             if count[0]:
                 self.gap_before = int(gaps[0, 1]), int(gaps[0, 0])
-        # Before the first frame of which the one before is not known, one is made up.
+        # Before the first frame whose previous one was not read, one is made up.
         before = self._previous or (int(rows[0, 1]) - 1, int(rows[0, 2]))
-        known = np.ones(len(rows), bool)
-        known[0] = self._previous is not None
+        has_previous = np.ones(len(rows), bool)
+        has_previous[0] = self._previous is not None
         numbers = np.diff(rows[:, 1], prepend=before[0])
         elapsed = np.diff(rows[:, 2], prepend=before[1])
-        steps = _Steps(rows, known, numbers, elapsed, count, lost)
-        self._check_steps(steps)
-        self._check_gaps(steps, gaps, following)
-        self._begins = (count > 0) | (numbers != 1) | ~known
+        steps = Steps(rows, has_previous, numbers, elapsed, count, lost)
+        check_steps(self._report, steps)
+        check_gaps(self._report, steps, gaps, following)
+        self._begins = (count > 0) | (numbers != 1) | ~has_previous
         self._check_rate(rows)
         self._previous = self.last = int(rows[-1, 1]), int(rows[-1, 2])
         return (count > 0) | (rows[:, 1] == 0)
-
-    def _check_steps(self, steps: _Steps) -> None:
-        """Check numbers and stamps, and that a gap speaks of every jump."""
-        rows, known, numbers, elapsed, gaps, lost = steps
-        times, frames, _ = rows.T
-        report = self._report
-        report(
-            "frame-order",
-            known & (numbers <= 0),
-            times,
-            lambda i: f"frame {frames[i]} follows frame {frames[i] - numbers[i]}",
-        )
-        report(
-            "frame-jump",
-            known & (numbers > 1) & (gaps == 0),
-            times,
-            lambda i: f"frame {frames[i]} comes after {numbers[i] - 1} others that no gap explains",
-        )
-        report(
-            "gap-frames",
-            known & (gaps > 0) & (numbers > 0) & (numbers != lost + 1),
-            times,
-            lambda i: f"a gap of {lost[i]} frames where the numbers jump by {numbers[i] - 1}",
-        )
-        wrong = np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
-        report(
-            "stamp-step",
-            known & (numbers == 1) & (gaps == 0) & wrong,
-            times,
-            lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
-        )
-
-    def _check_gaps(self, steps: _Steps, gaps: Int64, following: NDArray[np.intp]) -> None:
-        """Check that gaps begin where the frame before them ends, and end where the next begins."""
-        alone = steps.gaps[following] == 1
-        stamps = steps.rows[following, 2]
-        early = stamps - steps.elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
-        wrong = steps.known[following] & (np.abs(early) > _GAP_TOLERANCE)
-        wrong |= np.abs(stamps - gaps[:, 0]) > _GAP_TOLERANCE
-        self._report(
-            "gap-times",
-            alone & wrong,
-            gaps[:, 0],
-            lambda _: "a gap does not lie between the frames before and behind it",
-        )
 
     def _check_rate(self, rows: Int64) -> None:
         """Compare stamps with frame numbers, from the last gap on."""
@@ -225,11 +153,11 @@ class Frames:
             self._run = int(frames[starts[-1]]), int(stamps[starts[-1]])
         if self._run is None:
             return
-        heard = (int(frames[-1]) - self._run[0]) * FRAME_NANOSECONDS
+        duration = (int(frames[-1]) - self._run[0]) * FRAME_NANOSECONDS
         elapsed = int(stamps[-1]) - self._run[1]
-        if abs(elapsed - heard) > _RATE_TOLERANCE * heard + _DELAY:
+        if abs(elapsed - duration) > _RATE_TOLERANCE * duration + _DELAY:
             what = (
-                f"{self._name}: {heard / 1e9:.2f} s of frames lie {elapsed / 1e9:.2f} s apart "
+                f"{self._name}: {duration / 1e9:.2f} s of frames lie {elapsed / 1e9:.2f} s apart "
                 "by their stamps"
             )
             self._findings.error("stamp-rate", what, DISTRUST, time=int(times[-1]))
@@ -243,34 +171,34 @@ class Frames:
     def _with_label(
         self, features: Int64, labels: Int64, known_start: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Tell which frames end a second that was heard as a whole."""
-        heard = np.empty(len(features), np.int64)
+        """Tell which frames end a window without a gap."""
+        run_frames = np.empty(len(features), np.int64)
         if not len(features):
-            return heard > 0
+            return run_frames > 0
         starts = np.flatnonzero(self._begins).tolist()
         for start, end in zip([0, *starts], [*starts, len(features)], strict=True):
             if start == end:
                 continue
             if self._begins[start]:
                 first = int(features[start, 1])
-                self._heard = 0 if known_start[start] else self._guess(first, labels)
-            heard[start:end] = self._heard + np.arange(1, end - start + 1)
-            self._heard = min(int(heard[end - 1]), self._window)
-        return heard >= self._window
+                self._run_frames = 0 if known_start[start] else self._guess(first, labels)
+            run_frames[start:end] = self._run_frames + np.arange(1, end - start + 1)
+            self._run_frames = min(int(run_frames[end - 1]), self._window)
+        return run_frames >= self._window
 
     def _guess(self, frame: int, labels: Int64) -> int:
-        """Guess how many frames were heard before one of which that is not known."""
+        """Guess, by the next label, how many frames of its run precede a frame."""
         first = np.searchsorted(labels[:, 1], frame)
         if first == len(labels):
             return 0
         return int(max(self._window - 1 - (labels[first, 1] - frame), 0))
 
     def _check_same(
-        self, features: Int64, rows: Int64, kind: str, wanted: NDArray[np.bool_] | None
+        self, features: Int64, rows: Int64, kind: str, expects: NDArray[np.bool_] | None
     ) -> None:
         """Compare messages of another kind with the features of the same frames."""
         times, frames, stamps = rows.T
-        expected = features if wanted is None else features[wanted]
+        expected = features if expects is None else features[expects]
         extra = ~np.isin(frames, expected[:, 1])
         report = self._report
         report(
@@ -285,7 +213,7 @@ class Frames:
             times,
             lambda i: f"there should be no {kind} of frame {frames[i]}",
         )
-        if wanted is not None:
+        if expects is not None:
             report(
                 f"{kind}-frames",
                 ~np.isin(expected[:, 1], frames),

@@ -11,10 +11,12 @@ from typing import Any
 from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
-from hearthlog.analyzer.doctor.mcap.data_section import ATTACHMENTS, Data
-from hearthlog.analyzer.doctor.message_checks import NAME, Contract, place_of, type_of
+from hearthlog.analyzer.doctor.mcap.data_section import DataSection
+from hearthlog.analyzer.doctor.message_checks import MessageChecks
+from hearthlog.analyzer.doctor.topic_types import LOG_NAME, split_topic, topic_type
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
+from hearthlog.models.modelfile.card import CARD, DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.provenance import METADATA, schema_version
@@ -28,16 +30,17 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
-_CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS
+_CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
 
 
-class About:
-    """Checks what is said once in a file, when all of it was read.
+class MetadataChecks:
+    """Checks what stands once in a file, when all of it was read.
 
     Parameters
     ----------
-    data : Data
-    contract : Contract
+    data : DataSection
+    messages : MessageChecks
+        The checks of its messages, which are over.
     findings : Findings
     finished : bool
         Whether the file was completed.
@@ -46,10 +49,16 @@ class About:
     """
 
     def __init__(
-        self, data: Data, contract: Contract, findings: Findings, *, finished: bool, whole: bool
+        self,
+        data: DataSection,
+        messages: MessageChecks,
+        findings: Findings,
+        *,
+        finished: bool,
+        whole: bool,
     ) -> None:
         self._data = data
-        self._contract = contract
+        self._infos = messages.infos
         self._findings = findings
         self._finished = finished
         self._whole = whole
@@ -63,7 +72,7 @@ class About:
         self._check_name()
         if not self._data.counts:
             return
-        for microphone, info in self._contract.infos.items():
+        for microphone, info in self._infos.items():
             self._check_info(microphone, info)
         self._check_topics()
         if self._finished:
@@ -81,16 +90,16 @@ class About:
             return
         if missing := sorted(_KEYS - records[0].keys()):
             self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
-        found = self._data.attachments
+        attachments = self._data.attachments
         one = 1 if records[0].get("model") else 0
         counts = {_CONFIGURATION: (1, 1), _MODEL_CARD: (one, one), _MODEL: (0, one)}
         for name, (least, most) in counts.items():
-            count = len(found.get(name, ()))
+            count = len(attachments.get(name, ()))
             if not least <= count <= most:
                 what = f"there are {count} attachments {name}, not {most}"
                 self._error("attachments", what)
-        if len(found.get(_CONFIGURATION, ())) == 1:
-            digest = hashlib.sha256(found[_CONFIGURATION][0]).hexdigest()
+        if len(attachments.get(_CONFIGURATION, ())) == 1:
+            digest = hashlib.sha256(attachments[_CONFIGURATION][0]).hexdigest()
             if records[0].get("configuration_sha256") != digest:
                 self._error(
                     "attachments", f"{_CONFIGURATION} is not the one of metadata {METADATA}"
@@ -99,7 +108,7 @@ class About:
     def _check_name(self) -> None:
         """Compare the name, if it is one as the recorder gives it, with the contents."""
         path = self._findings.path
-        named = NAME.fullmatch(path.name)
+        named = LOG_NAME.fullmatch(path.name)
         if named is None:
             return
         records = self._data.metadata.get(METADATA, [])
@@ -123,7 +132,7 @@ class About:
             "sample_rate": SAMPLE_RATE,
             "frame_seconds": FRAME_SECONDS,
         }
-        with suppress(ModelError):  # of a set that is not installed nothing is known
+        with suppress(ModelError):  # the set is not installed here
             features = feature_set(str(info["feature_set"]))
             expected["window_seconds"] = features.window_seconds
             expected["feature_names"] = list(features.feature_names)
@@ -133,30 +142,30 @@ class About:
             if _plain(info[name]) != value:
                 what = f"{microphone}: info says {name} {_plain(info[name])}, not {value}"
                 self._error("info", what)
-        said = {bool(info["model"]), len(info["labels"]) > 0, bool(info["model_sha256"])}
-        if len(said) > 1:
+        has = {bool(info["model"]), len(info["labels"]) > 0, bool(info["model_sha256"])}
+        if len(has) > 1:
             what = f"{microphone}: info has only some of model, model_sha256 and labels"
             self._error("info", what)
 
     def _check_topics(self) -> None:
         """Compare the channels with those that a recorder writes."""
         expected: dict[str, Topic] = {}
-        for microphone, info in self._contract.infos.items():
+        for microphone, info in self._infos.items():
             classes = list(info["labels"]) or None
-            found = topics_of(microphone, list(info["feature_names"]), classes)
-            expected |= {topic.name: topic for topic in found}
+            topics = topics_of(microphone, list(info["feature_names"]), classes)
+            expected |= {topic.name: topic for topic in topics}
         for name, topic in expected.items():
-            if name not in self._channels and place_of(name)[0]:
+            if name not in self._channels and split_topic(name)[0]:
                 self._error("topics", f"{name} is missing")
             if name in self._channels:
                 self._check_arrays(self._channels[name], topic)
-        topics = Counter(c.topic for c in self._data.definitions.channels.values())
+        counts = Counter(c.topic for c in self._data.definitions.channels.values())
         for name, channel in self._channels.items():
-            if topics[name] > 1:
-                self._error("topics", f"{name} has {topics[name]} channels")
-            if place_of(name)[0] and expected and name not in expected:
+            if counts[name] > 1:
+                self._error("topics", f"{name} has {counts[name]} channels")
+            if split_topic(name)[0] and expected and name not in expected:
                 self._error("topics", f"{name} should not be there")
-            typename = type_of(name)
+            typename = topic_type(name)
             if typename is None:
                 self._findings.warning("other-topic", f"{name} is no topic of hearthlog")
             else:
@@ -165,7 +174,7 @@ class About:
     def _check_type(self, channel: Channel, typename: str) -> None:
         schema = self._data.definitions.schemas.get(channel.schema_id)
         if schema is None:
-            return  # which is said already
+            return  # is reported already
         if (schema.name, schema.encoding) != (typename, SCHEMA_ENCODING):
             what = f"{channel.topic} is of type {schema.name} ({schema.encoding}), not {typename}"
             self._error("type", what)
@@ -180,7 +189,7 @@ class About:
             self._error("qos", f"{channel.topic}: offered_qos_profiles is no list of profiles")
 
     def _check_definition(self, channel: Channel, schema: Schema) -> None:
-        """Compare a definition with those that were released, and its hash with what is said."""
+        """Compare a definition with those of released versions, and its hash with the channel's."""
         records = self._data.metadata.get(METADATA, [{}])
         try:
             kind = message_type(schema.name, schema.encoding, schema.data)
@@ -204,14 +213,14 @@ class About:
             self._error("rosbag2", f"there are {len(records)} metadata records {ROSBAG2}, not one")
             return
         try:
-            said = json.loads(records[0]["serialized_metadata"])
+            metadata = json.loads(records[0]["serialized_metadata"])
             counts = {
                 topic["topic_metadata"]["name"]: topic["message_count"]
-                for topic in said["topics_with_message_count"]
+                for topic in metadata["topics_with_message_count"]
             }
-            start = said["starting_time"]["nanoseconds_since_epoch"]
-            span = start, start + said["duration"]["nanoseconds"]
-            total = said["message_count"]
+            start = metadata["starting_time"]["nanoseconds_since_epoch"]
+            span = start, start + metadata["duration"]["nanoseconds"]
+            total = metadata["message_count"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             self._error("rosbag2", f"metadata {ROSBAG2} cannot be read ({error!r})")
             return

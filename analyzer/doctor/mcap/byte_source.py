@@ -11,7 +11,7 @@ _PIECE = 1 << 20  # bytes
 _READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and has no end
 
 
-class Source:
+class ByteSource:
     """The bytes of a file, as many as it had when it was opened.
 
     Attributes

@@ -11,8 +11,8 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of
-from hearthlog.analyzer.doctor.mcap.walk import Record
+from hearthlog.analyzer.doctor.mcap.checked_definitions import CheckedDefinitions, name_of
+from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import (
@@ -30,7 +30,7 @@ from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import ChunkHead, McapError, chunk_head, decompress
 
 
-class Content(NamedTuple):
+class ChunkContent(NamedTuple):
     """The records of a chunk: their bytes, where messages begin in them, and the heads of these."""
 
     records: bytes
@@ -43,14 +43,14 @@ class Chunk:
 
     Attributes
     ----------
-    content : Content or None
+    content : ChunkContent or None
         None if the chunk is too damaged to be read.
     whole : bool
         Whether all of its messages are in `content`.
     """
 
-    def __init__(self, record: Record, findings: Findings, definitions: Definitions) -> None:
-        self.content: Content | None = None
+    def __init__(self, record: Record, findings: Findings, definitions: CheckedDefinitions) -> None:
+        self.content: ChunkContent | None = None
         self.whole = False
         self.offset = record.offset
         self._length = record.length
@@ -130,7 +130,7 @@ class Chunk:
         new: dict[int, int] = {}
         for opcode, start, last in others:
             new |= self._other(opcode, start, records[start + HEAD.size : last])
-        self.content = Content(records, starts, gather_heads(records, starts))
+        self.content = ChunkContent(records, starts, gather_heads(records, starts))
         check_channels(self._findings, self._definitions, self.content, new, self.offset)
 
     def _other(self, opcode: int, start: int, content: bytes) -> dict[int, int]:
@@ -141,7 +141,7 @@ class Chunk:
         elif opcode not in {Opcode.SCHEMA, Opcode.CHANNEL}:
             self._error("chunk-opcode", f"{name_of(opcode)} inside a chunk")
         else:
-            channel = self._definitions.add(opcode, self.offset, content)
+            channel = self._definitions.read(opcode, self.offset, content)
             return {} if channel is None else {channel: start}
         return {}
 
@@ -149,11 +149,12 @@ class Chunk:
         assert self.content is not None
         assert self._head is not None
         times = self.content.heads["log_time"].astype(np.uint64)
-        said = self._head.start, self._head.end
+        claimed = self._head.start, self._head.end
         span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
-        if said != span:
-            what = f"a chunk says that it spans {said[0]} to {said[1]} ns, and spans {span[0]} to "
-            self._error("chunk-times", f"{what}{span[1]} ns", REINDEX)
+        if claimed != span:
+            what = f"a chunk says that it spans {claimed[0]} to {claimed[1]} ns"
+            what += f", and spans {span[0]} to {span[1]} ns"
+            self._error("chunk-times", what, REINDEX)
 
     def _check_index(self, entries: NDArray[np.void], channels: Int64) -> None:
         """Compare the message indexes, in the order of their offsets, with the messages."""
@@ -214,10 +215,10 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
         ).all():
             others: list[tuple[int, int, int]] = []
             for place in np.flatnonzero(firsts < lasts).tolist():
-                starts, found, end = _walk(records, int(firsts[place]), int(lasts[place]))
+                starts, between, end = _walk(records, int(firsts[place]), int(lasts[place]))
                 if len(starts) or end != lasts[place]:
                     break  # a message that the index does not know, or no whole records
-                others += found
+                others += between
             else:
                 return hints, others, len(records)
     return _walk(records, 0, len(records))
@@ -239,8 +240,8 @@ def _walk(content: bytes, start: int, end: int) -> tuple[Int64, list[tuple[int, 
 
 def check_channels(
     findings: Findings,
-    definitions: Definitions,
-    content: Content,
+    definitions: CheckedDefinitions,
+    content: ChunkContent,
     new: dict[int, int],
     offset: int,
 ) -> None:
@@ -249,8 +250,8 @@ def check_channels(
     Parameters
     ----------
     findings : Findings
-    definitions : Definitions
-    content : Content
+    definitions : CheckedDefinitions
+    content : ChunkContent
     new : dict of int to int
         Channels that were defined among these messages, and where.
     offset : int

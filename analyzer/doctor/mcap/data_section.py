@@ -2,7 +2,7 @@
 
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,21 +11,20 @@ from mcap.records import Attachment, AttachmentIndex, DataEnd, Header, Metadata,
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
-from hearthlog.analyzer.doctor.mcap.batch import BATCH_SIZE, Batch, batches
-from hearthlog.analyzer.doctor.mcap.chunk import Chunk, Content, check_channels
-from hearthlog.analyzer.doctor.mcap.definitions import Definitions, name_of, parse_strictly
-from hearthlog.analyzer.doctor.mcap.walk import Record
-from hearthlog.models.modelfile.card import CARD, DESCRIPTION
+from hearthlog.analyzer.doctor.mcap.checked_definitions import (
+    CheckedDefinitions,
+    name_of,
+    parse_strictly,
+)
+from hearthlog.analyzer.doctor.mcap.chunk import Chunk, ChunkContent, check_channels
+from hearthlog.analyzer.doctor.mcap.message_batch import BATCH_SIZE, MessageBatch, batches
+from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64
 from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import encode
 
-ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
-_NAMES = {METADATA, ROSBAG2, *ATTACHMENTS}  # of what is kept
 _KEPT_SIZE = 1 << 20  # bytes
 _INDEX_SIZE = 4096  # bytes; what has a longer name is not compared with its index
 _RESERVED = 0x80
@@ -39,16 +38,24 @@ _INDEXES = {
 }
 
 
-class Data:
-    """What the data section of a file holds.
+class DataSection:
+    """The data section of a file, checked record by record.
+
+    Parameters
+    ----------
+    findings : Findings
+    names : collection of str
+        Names of the metadata records and attachments that are kept.
+    ours : bool
+        Whether hearthlog made this file.
 
     Attributes
     ----------
     findings : Findings
-    definitions : Definitions
+    definitions : CheckedDefinitions
     header : mcap.records.Header or None
     metadata : dict of str to list of dict
-        Of ours, by name: the first two records, if they are not too large.
+        By name: the first two records of the names to keep, if they are not too large.
     attachments : dict of str to list of bytes
         Likewise.
     counts : Counter of int
@@ -66,8 +73,8 @@ class Data:
         Whether there was a Data End.
     """
 
-    def __init__(self, findings: Findings, *, ours: bool) -> None:
-        self.definitions = Definitions(findings, ours=ours)
+    def __init__(self, findings: Findings, names: Collection[str], *, ours: bool) -> None:
+        self.definitions = CheckedDefinitions(findings, ours=ours)
         self.header: Header | None = None
         self.metadata: dict[str, list[dict[str, str]]] = {}
         self.attachments: dict[str, list[bytes]] = {}
@@ -82,6 +89,7 @@ class Data:
         self.loose = False
         self.ended = False
         self.findings = findings
+        self._names = names
         self._chunk: Chunk | None = None
         self._run = bytearray()  # of messages outside of chunks
         self._run_offset = 0
@@ -89,7 +97,7 @@ class Data:
         self._size = 0
         self._first = True
 
-    def add(self, record: Record) -> Iterator[Batch | None]:
+    def add(self, record: Record) -> Iterator[MessageBatch | None]:
         """Take the next record.
 
         Parameters
@@ -98,7 +106,7 @@ class Data:
 
         Yields
         ------
-        Batch or None
+        MessageBatch or None
             Messages, whenever a few megabytes of them have come together; None where some are
             missing, because a chunk is damaged.
         """
@@ -118,7 +126,7 @@ class Data:
         if self._size >= BATCH_SIZE:
             yield from self._batches()
 
-    def finish(self, *, cut: bool) -> Iterator[Batch | None]:
+    def finish(self, *, cut: bool) -> Iterator[MessageBatch | None]:
         """Hand out the last messages; `cut`: something is missing behind them."""
         self._end_run()
         yield from self._end_chunk(cut=cut)
@@ -143,52 +151,56 @@ class Data:
                 self.findings.warning("reserved-opcode", what, offset=record.offset)
             return
         if record.opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            self.definitions.add(record.opcode, record.offset, record.content)
+            self.definitions.read(record.opcode, record.offset, record.content)
             return
-        found = parse_strictly(self.findings, record.opcode, record.offset, record.content)
-        if isinstance(found, Header):
-            self.header = self.header or found
+        content = parse_strictly(self.findings, record.opcode, record.offset, record.content)
+        if isinstance(content, Header):
+            self.header = self.header or content
             self.definitions.profile = self.header.profile
-        elif isinstance(found, Metadata):
-            self._add_metadata(found, record)
-        elif isinstance(found, Attachment):
-            self._add_attachment(found, record)
-        elif isinstance(found, DataEnd):
+        elif isinstance(content, Metadata):
+            self._add_metadata(content, record)
+        elif isinstance(content, Attachment):
+            self._add_attachment(content, record)
+        elif isinstance(content, DataEnd):
             self.ended = True
-            if found.data_section_crc and record.crc not in {None, found.data_section_crc}:
+            if content.data_section_crc and record.crc not in {None, content.data_section_crc}:
                 what = "the data section has another checksum than its Data End says"
                 self.findings.error("data-crc", what, RECOVER, offset=record.offset)
         else:
             self.whole = False
 
-    def _add_metadata(self, found: Metadata, record: Record) -> None:
-        index = encode(MetadataIndex(record.offset, record.length, found.name))
+    def _add_metadata(self, metadata: Metadata, record: Record) -> None:
+        index = encode(MetadataIndex(record.offset, record.length, metadata.name))
         self._expect_index(Opcode.METADATA_INDEX, record.offset, index)
-        _keep(self.metadata, found.name, found.metadata, record)
+        self._keep(self.metadata, metadata.name, metadata.metadata, record)
 
-    def _add_attachment(self, found: Attachment, record: Record) -> None:
+    def _add_attachment(self, attachment: Attachment, record: Record) -> None:
         index = AttachmentIndex(
             record.offset,
             record.length,
-            found.log_time,
-            found.create_time,
-            len(found.data),
-            found.name,
-            found.media_type,
+            attachment.log_time,
+            attachment.create_time,
+            len(attachment.data),
+            attachment.name,
+            attachment.media_type,
         )
         self._expect_index(Opcode.ATTACHMENT_INDEX, record.offset, encode(index))
-        _keep(self.attachments, found.name, found.data, record)
-        texts = len(found.name.encode()) + len(found.media_type.encode())
-        end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + len(found.data)
+        self._keep(self.attachments, attachment.name, attachment.data, record)
+        texts = len(attachment.name.encode()) + len(attachment.media_type.encode())
+        end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + len(attachment.data)
         (crc,) = UINT32.unpack_from(record.content, end)
         if crc and zlib.crc32(record.content[:end]) != crc:
-            what = f"attachment {found.name} has another checksum than it claims"
+            what = f"attachment {attachment.name} has another checksum than it claims"
             self.findings.error("attachment-crc", what, RECOVER, offset=record.offset)
 
     def _expect_index(self, opcode: int, offset: int, index: bytes) -> None:
         """Keep the index record that there should be, unless it is too long to be compared."""
         content = index[HEAD.size :]
         self.places[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
+
+    def _keep(self, kept: dict[str, list[Any]], name: str, content: Any, record: Record) -> None:
+        if name in self._names and record.length <= _KEPT_SIZE and len(kept.get(name, ())) < 2:
+            kept.setdefault(name, []).append(content)
 
     def _add_index(self, record: Record) -> None:
         if self._chunk is None:
@@ -197,7 +209,7 @@ class Data:
         else:
             self._chunk.add_index(record)
 
-    def _end_chunk(self, *, cut: bool = False) -> Iterator[Batch | None]:
+    def _end_chunk(self, *, cut: bool = False) -> Iterator[MessageBatch | None]:
         chunk, self._chunk = self._chunk, None
         if chunk is None:
             return
@@ -230,11 +242,11 @@ class Data:
             return
         records, self._run = bytes(self._run), bytearray()
         starts = np.array([start for _, start, _ in iterate_records(records)], np.int64)
-        content = Content(records, starts, gather_heads(records, starts))
+        content = ChunkContent(records, starts, gather_heads(records, starts))
         check_channels(self.findings, self.definitions, content, {}, self._run_offset)
         self._add_messages(content)
 
-    def _add_messages(self, content: Content) -> None:
+    def _add_messages(self, content: ChunkContent) -> None:
         heads = content.heads
         if not len(heads):
             return
@@ -249,12 +261,7 @@ class Data:
         self._parts.append((content.records, content.starts, heads))
         self._size += len(content.records)
 
-    def _batches(self) -> Iterator[Batch]:
+    def _batches(self) -> Iterator[MessageBatch]:
         parts, self._parts, self._size = self._parts, [], 0
         if parts:
             yield from batches(parts)
-
-
-def _keep(kept: dict[str, list[Any]], name: str, content: Any, record: Record) -> None:
-    if name in _NAMES and record.length <= _KEPT_SIZE and len(kept.get(name, ())) < 2:
-        kept.setdefault(name, []).append(content)

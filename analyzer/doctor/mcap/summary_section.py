@@ -8,9 +8,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Schema, Statistics, SummaryOffset
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.mcap.data_section import Data
-from hearthlog.analyzer.doctor.mcap.definitions import name_of, parse_strictly
-from hearthlog.analyzer.doctor.mcap.walk import Record
+from hearthlog.analyzer.doctor.mcap.checked_definitions import name_of, parse_strictly
+from hearthlog.analyzer.doctor.mcap.data_section import DataSection
+from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.mcap.formats import CHUNK_INDEX, HEAD, INDEX_OFFSET, UINT64
 from hearthlog.schemas.mcap.records import parse
 
@@ -36,18 +36,18 @@ _THINGS = {
 _RESERVED = 0x80
 
 
-class Summary:
+class SummarySection:
     """The summary section, the summary offsets, and the footer.
 
     Parameters
     ----------
-    data : Data
+    data : DataSection
         The whole data section before it.
     whole : bool
         Whether all of that could be read: if not, what the index says is not compared with it.
     """
 
-    def __init__(self, data: Data, findings: Findings, *, whole: bool) -> None:
+    def __init__(self, data: DataSection, findings: Findings, *, whole: bool) -> None:
         self._data = data
         self._findings = findings
         self._whole = whole
@@ -123,22 +123,22 @@ class Summary:
         self._lengths[opcode] += record.length
 
     def _add_other(self, record: Record) -> None:
-        found = parse_strictly(self._findings, record.opcode, record.offset, record.content)
-        if isinstance(found, Schema):
-            self._copy(found, self._data.definitions.schemas, record)
-        elif isinstance(found, Channel):
-            self._copy(found, self._data.definitions.channels, record)
-        elif isinstance(found, SummaryOffset):
-            self._offsets.append((record.offset, found))
-        elif isinstance(found, Statistics):
-            self._add_statistics(found, record.offset)
+        content = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        if isinstance(content, Schema):
+            self._copy(content, self._data.definitions.schemas, record)
+        elif isinstance(content, Channel):
+            self._copy(content, self._data.definitions.channels, record)
+        elif isinstance(content, SummaryOffset):
+            self._offsets.append((record.offset, content))
+        elif isinstance(content, Statistics):
+            self._add_statistics(content, record.offset)
 
-    def _copy(self, found: Any, originals: Any, record: Record) -> None:
-        self._copies[type(found)][found.id] = found
-        if not self._whole or originals.get(found.id) == found:
+    def _copy(self, definition: Any, originals: Any, record: Record) -> None:
+        self._copies[type(definition)][definition.id] = definition
+        if not self._whole or originals.get(definition.id) == definition:
             return
-        name = f"{name_of(record.opcode)} {found.id}"
-        if found.id in originals:
+        name = f"{name_of(record.opcode)} {definition.id}"
+        if definition.id in originals:
             self._error("summary-copy", f"{name} is not that of the data section", record.offset)
         else:
             what = f"{name} is in the summary alone"
@@ -170,44 +170,44 @@ class Summary:
             self._indexed |= {channel for channel, _ in offsets}
 
     def _compare(self, record: Record, expected: bytes) -> None:
-        found = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        index = parse_strictly(self._findings, record.opcode, record.offset, record.content)
         try:
-            wanted = parse(record.opcode, expected)
-        except UnicodeDecodeError:  # the compression of a damaged chunk, of which is said there
+            expected_index = parse(record.opcode, expected)
+        except UnicodeDecodeError:  # the compression of a damaged chunk, is reported there
             return
-        if found is None or wanted is None:
+        if index is None or expected_index is None:
             return
         differing = [
-            f"{name} {getattr(found, name)} and should say {value}"
-            for name, value in vars(wanted).items()
-            if getattr(found, name) != value and not self._without_index(found, name)
+            f"{name} {getattr(index, name)} and should say {value}"
+            for name, value in vars(expected_index).items()
+            if getattr(index, name) != value and not self._without_index(index, name)
         ]
         if differing:
             what = f"{name_of(record.opcode)} says {'; '.join(differing)}"
             self._error("index-differs", what, record.offset)
 
-    def _without_index(self, found: McapRecord, name: str) -> bool:
+    def _without_index(self, index: McapRecord, name: str) -> bool:
         """Tell whether a chunk index leaves out message indexes of no messages, as it may."""
-        if not isinstance(found, ChunkIndex) or name != "message_index_offsets":
+        if not isinstance(index, ChunkIndex) or name != "message_index_offsets":
             return False
-        return not found.message_index_offsets
+        return not index.message_index_offsets
 
-    def _add_statistics(self, found: Statistics, offset: int) -> None:
-        self._statistics.append((offset, found))
+    def _add_statistics(self, statistics: Statistics, offset: int) -> None:
+        self._statistics.append((offset, statistics))
         if len(self._statistics) > 1:
             self._error("statistics", "more than one record of statistics", offset)
             self._statistics.pop()
         channels = self._data.definitions.channels.keys()
-        if found.channel_message_counts and not channels <= self._copies[Channel].keys():
+        if statistics.channel_message_counts and not channels <= self._copies[Channel].keys():
             what = "statistics with counts stand before copies of all channels"
             self._error("statistics-channels", what, offset)
 
-    def _check_statistics(self, offset: int, found: Statistics) -> None:
+    def _check_statistics(self, offset: int, statistics: Statistics) -> None:
         data = self._data
         start, end = data.span or (0, 0)
         schemas = (data.definitions.schemas.keys() | self._copies[Schema].keys()) - {0}
         channels = data.definitions.channels.keys() | self._copies[Channel].keys()
-        wanted: dict[str, Any] = {
+        expected: dict[str, Any] = {
             "message_count": sum(data.counts.values()),
             "schema_count": len(schemas),
             "channel_count": len(channels),
@@ -217,29 +217,29 @@ class Summary:
             "message_start_time": start,
             "message_end_time": end,
         }
-        if counts := found.channel_message_counts:
-            found.channel_message_counts = {k: n for k, n in counts.items() if n}
-            wanted["channel_message_counts"] = {k: n for k, n in data.counts.items() if n}
+        if counts := statistics.channel_message_counts:
+            statistics.channel_message_counts = {k: n for k, n in counts.items() if n}
+            expected["channel_message_counts"] = {k: n for k, n in data.counts.items() if n}
         differing = [
-            f"{name} {getattr(found, name)} and should say {value}"
-            for name, value in wanted.items()
-            if getattr(found, name) != value
+            f"{name} {getattr(statistics, name)} and should say {value}"
+            for name, value in expected.items()
+            if getattr(statistics, name) != value
         ]
         if differing:
             self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
 
     def _check_offsets(self) -> None:
-        for place, found in self._offsets:
-            group = found.group_opcode
-            start, length = self._starts.get(group, 0), self._lengths[group]
-            if not length and not found.group_length:
+        for offset, group in self._offsets:
+            opcode = group.group_opcode
+            start, length = self._starts.get(opcode, 0), self._lengths[opcode]
+            if not length and not group.group_length:
                 continue  # writers say it of groups that are empty, too
-            if (found.group_start, found.group_length) != (start, length):
+            if (group.group_start, group.group_length) != (start, length):
                 what = (
-                    f"Summary offset says {name_of(group)} is at {found.group_start}, "
-                    f"{found.group_length} bytes, and should say {start}, {length} bytes"
+                    f"Summary offset says {name_of(opcode)} is at {group.group_start}, "
+                    f"{group.group_length} bytes, and should say {start}, {length} bytes"
                 )
-                self._error("summary-offset", what, place)
+                self._error("summary-offset", what, offset)
 
     def _check_complete(self, offset: int) -> None:
         for opcode, unseen in self._unseen.items():

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
-from hearthlog.analyzer.doctor.mcap.byte_source import Source
+from hearthlog.analyzer.doctor.mcap.byte_source import ByteSource
 from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.formats import HEAD, MAGIC
 from hearthlog.schemas.mcap.records import LIMIT
@@ -27,7 +27,7 @@ class Record(NamedTuple):
         In bytes, opcode and length included.
     content : bytes
     crc : int or None
-        Checksum of the file up to here, if it is known.
+        CRC-32 of the file up to here, if all of it was read.
     """
 
     opcode: int
@@ -37,12 +37,12 @@ class Record(NamedTuple):
     crc: int | None
 
 
-class Walk:
+class RecordWalk:
     """All records of a file, those inside chunks excepted.
 
     Parameters
     ----------
-    source : Source
+    source : ByteSource
         Behind the magic.
     findings : Findings
     finished : bool
@@ -58,7 +58,7 @@ class Walk:
     """
 
     def __init__(
-        self, source: Source, findings: Findings, places: Sequence[int], *, finished: bool
+        self, source: ByteSource, findings: Findings, places: Sequence[int], *, finished: bool
     ) -> None:
         self.losses = 0
         self._source = source
@@ -98,7 +98,7 @@ class Walk:
         if following is None:
             following = self._search(offset + 1)
         if following is None and not self._finished and rest < _CUT:
-            return False  # that it is unfinished is said elsewhere
+            return False  # which is reported as an unfinished file
         self.losses += 1
         where = "nor behind it" if following is None else f"the next one at byte {following}"
         self._findings.error("framing", f"no record begins here; {where}", RECOVER, offset=offset)

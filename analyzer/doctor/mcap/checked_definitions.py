@@ -7,6 +7,7 @@ from mcap.records import Channel, McapRecord, Schema
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.records import McapError, encode, parse
 from hearthlog.schemas.messages.cdr_layout import message_type
@@ -47,13 +48,11 @@ def name_of(opcode: int) -> str:
         return f"record of opcode {opcode}"
 
 
-class Definitions:
-    """The schemas and channels that were defined so far.
+class CheckedDefinitions(Definitions):
+    """The schemas and channels that were defined so far, each checked when it was added.
 
     Attributes
     ----------
-    schemas : dict of int to Schema
-    channels : dict of int to Channel
     ours : bool
         Whether hearthlog made this file.
     profile : str
@@ -61,15 +60,14 @@ class Definitions:
     """
 
     def __init__(self, findings: Findings, *, ours: bool) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
+        super().__init__()
         self.ours = ours
         self.profile = ""
         self._size = 0
         self._findings = findings
 
-    def add(self, opcode: int, offset: int, content: bytes) -> int | None:
-        """Take a schema or a channel; return the number of a channel that is new."""
+    def read(self, opcode: int, offset: int, content: bytes) -> int | None:
+        """Read and check a schema or a channel; return the number of a channel that is new."""
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
             self._add_schema(record, offset, len(content))
@@ -92,13 +90,13 @@ class Definitions:
             error("schema-id", f"schema {schema.name} has the number 0", RECOVER, offset=offset)
             return
         if schema.id in self.schemas:
-            if schema != self.schemas[schema.id]:
+            if not self.add(schema):
                 what = f"schema {schema.id} ({schema.name}) differs from the first of its number"
                 error("redefined", what, RECOVER, offset=offset)
             return
         if not self._keeps(size, offset):
             return
-        self.schemas[schema.id] = schema
+        self.add(schema)
         if not schema.encoding and schema.data:
             what = f"schema {schema.name} has data, but no encoding"
             error("schema-encoding", what, RECOVER, offset=offset)
@@ -113,13 +111,13 @@ class Definitions:
         error = self._findings.error
         topic = f"channel {channel.id} ({channel.topic})"
         if channel.id in self.channels:
-            if channel != self.channels[channel.id]:
+            if not self.add(channel):
                 what = f"{topic} differs from the first of its number"
                 error("redefined", what, RECOVER, offset=offset)
             return False
         if not self._keeps(size, offset):
             return False
-        self.channels[channel.id] = channel
+        self.add(channel)
         if channel.schema_id and channel.schema_id not in self.schemas:
             what = f"{topic} has schema {channel.schema_id}, which is not defined before it"
             error("schema-missing", what, RECOVER, offset=offset)

@@ -1,4 +1,4 @@
-"""One file, from its first byte to its last."""
+"""Check one file, from its first byte to its last."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -10,17 +10,19 @@ from mcap.opcode import Opcode
 from mcap.records import Footer
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.frame_sequence import Frames
-from hearthlog.analyzer.doctor.mcap.batch import Batch
-from hearthlog.analyzer.doctor.mcap.byte_source import Source
-from hearthlog.analyzer.doctor.mcap.data_section import Data
-from hearthlog.analyzer.doctor.mcap.summary_section import Summary
-from hearthlog.analyzer.doctor.mcap.walk import Walk
-from hearthlog.analyzer.doctor.message_checks import ALWAYS, NAME, Contract, place_of
-from hearthlog.analyzer.doctor.metadata_checks import About
+from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
+from hearthlog.analyzer.doctor.mcap.byte_source import ByteSource
+from hearthlog.analyzer.doctor.mcap.data_section import DataSection
+from hearthlog.analyzer.doctor.mcap.message_batch import MessageBatch
+from hearthlog.analyzer.doctor.mcap.record_walk import RecordWalk
+from hearthlog.analyzer.doctor.mcap.summary_section import SummarySection
+from hearthlog.analyzer.doctor.message_checks import MessageChecks
+from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataChecks
+from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
+from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.records import parse
@@ -29,11 +31,12 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
 _ENCODINGS = ("ros2msg", "ros2idl")
+_KEPT = {METADATA, ROSBAG2, *ATTACHMENTS}
 
 
 @dataclass
-class Examined:
-    """What one file was found to be.
+class ExaminedFile:
+    """A file that was checked.
 
     Attributes
     ----------
@@ -42,8 +45,8 @@ class Examined:
         Whether it is a log of hearthlog, and no layer beside one.
     node : str
     span : tuple of int, or None
-        First and last log time.
-    frames : dict of str to Frames
+        First and last log time, in nanoseconds.
+    frames : dict of str to FrameSequence
         By microphone.
     """
 
@@ -51,45 +54,46 @@ class Examined:
     ours: bool = False
     node: str = ""
     span: tuple[int, int] | None = None
-    frames: dict[str, Frames] = field(default_factory=dict)
+    frames: dict[str, FrameSequence] = field(default_factory=dict)
 
 
-def examine_file(path: Path, progress: Progress = ignore_progress) -> Examined:
+def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFile:
     """Check one file against the specification of MCAP and, if it is ours, against the contract.
 
     Parameters
     ----------
     path : Path
-    progress : callable
-        Told the share of the file that was read.
+    progress : callable, optional
+        Called with the share of the file that was read, 0 to 1.
     """
-    examined = Examined(Findings(path))
+    examined = ExaminedFile(Findings(path))
     try:
-        with Source(path) as source:
+        with ByteSource(path) as source:
             _examine(source, examined, progress)
     except OSError as error:
         examined.findings.error("unreadable", f"cannot be read ({error.strerror})")
     return examined
 
 
-class _Known(NamedTuple):
-    """What can be known of a file before it is read from its beginning.
+class _Outline(NamedTuple):
+    """What the index of a file tells before the file is read from its beginning.
 
     Attributes
     ----------
-    places : list of int
-        Offsets of records, ascending.
+    offsets : list of int
+        Bytes at which records begin, ascending.
     summary_start : int
         0 if there is no summary.
     ours : bool
+        Whether a recorder of hearthlog wrote the file.
     """
 
-    places: list[int]
+    offsets: list[int]
     summary_start: int
     ours: bool
 
 
-def _examine(source: Source, examined: Examined, progress: Progress) -> None:
+def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> None:
     findings = examined.findings
     active = findings.path.name.endswith(ACTIVE_SUFFIX)
     magic = source.take(len(MAGIC))
@@ -97,31 +101,30 @@ def _examine(source: Source, examined: Examined, progress: Progress) -> None:
         findings.error("magic", "is no MCAP file: it does not begin as one")
         return
     finished = source.size > len(MAGIC) and source.at(source.size - len(MAGIC), 8) == MAGIC
-    known = _known(findings.path, source)
-    data = Data(findings, ours=known.ours)
-    contract = Contract(data, findings) if known.ours else _Plain(data, findings)
-    walk = Walk(source, findings, known.places, finished=finished)
-    complete = _walk(walk, data, contract, known, lambda offset: progress(offset / source.size))
+    outline = _outline(findings.path, source)
+    data = DataSection(findings, _KEPT, ours=outline.ours)
+    checks = MessageChecks(data, findings) if outline.ours else ForeignMessages(data, findings)
+    walk = RecordWalk(source, findings, outline.offsets, finished=finished)
+    complete = _walk(walk, data, checks, outline, lambda offset: progress(offset / source.size))
     if complete:
         _check_end(source, findings)
     elif finished:
         findings.error("footer", "there is no Footer at the end", RECOVER)
     else:
-        _say_unfinished(findings, active=active)
+        _report_unfinished(findings, active=active)
     for text in {unknown_version(record) for record in data.metadata.get(METADATA, [])} - {""}:
         findings.warning("newer", text)
-    if isinstance(contract, Contract):
-        contract.finish()
+    if isinstance(checks, MessageChecks):
+        checks.finish()
         whole = data.whole and not walk.damaged
-        About(data, contract, findings, finished=complete, whole=whole).check()
-        examined.ours, examined.frames = True, contract.frames
-        about = data.metadata.get(METADATA, [{}])[0]
-        examined.node = about.get("node", "")
+        MetadataChecks(data, checks, findings, finished=complete, whole=whole).check()
+        examined.ours, examined.frames = True, checks.frames
+        examined.node = data.metadata.get(METADATA, [{}])[0].get("node", "")
     examined.span = data.span
 
 
-def _known(path: Path, source: Source) -> _Known:
-    """Look at the index of a file, as far as it has one."""
+def _outline(path: Path, source: ByteSource) -> _Outline:
+    """Read the index of a file, as far as it has one."""
     start = 0
     tail = source.at(max(source.size - FOOTER_SIZE, 0), FOOTER_SIZE)
     if tail[:1] == bytes([Opcode.FOOTER]) and tail.endswith(MAGIC):
@@ -131,13 +134,13 @@ def _known(path: Path, source: Source) -> _Known:
     try:
         with LogFile(path) as file:
             ours = _is_ours(file)
-            places = file.chunks["offset"].tolist()
-            places += [location.offset for location in file.record_locations]
+            offsets = file.chunks["offset"].tolist()
+            offsets += [location.offset for location in file.record_locations]
     except LogError:
-        places, ours = [], False
+        offsets, ours = [], False
     if HEAD.size < start < source.size:
-        places += [start]
-    return _Known(sorted(places), start, ours)
+        offsets += [start]
+    return _Outline(sorted(offsets), start, ours)
 
 
 def _is_ours(file: LogFile) -> bool:
@@ -145,56 +148,62 @@ def _is_ours(file: LogFile) -> bool:
     if _LAYER.fullmatch(file.path.name):
         return False
     records = provenance_records(file)
-    made = file.header is not None and file.header.library == LIBRARY
-    if NAME.fullmatch(file.path.name):
-        return made or len(records) > 0
-    kinds = {place_of(channel.topic)[1] for channel in file.channels.values()}
-    part = bool(file.channels) and not kinds >= ALWAYS
-    return (made or len(records) > 0) and len(records) < 2 and not part
+    is_made = file.header is not None and file.header.library == LIBRARY
+    if LOG_NAME.fullmatch(file.path.name):
+        return is_made or len(records) > 0
+    kinds = {split_topic(channel.topic)[1] for channel in file.channels.values()}
+    is_part = bool(file.channels) and not kinds >= ALWAYS
+    return (is_made or len(records) > 0) and len(records) < 2 and not is_part
 
 
 def _walk(
-    walk: Walk, data: Data, contract: "Contract | _Plain", known: _Known, at: Callable[[int], None]
+    walk: RecordWalk,
+    data: DataSection,
+    checks: "MessageChecks | ForeignMessages",
+    outline: _Outline,
+    at: Callable[[int], None],
 ) -> bool:
     """Go through all records; tell whether the last one is a footer."""
-    summary: Summary | None = None
+    summary: SummarySection | None = None
     losses = 0
     for record in walk:
         if walk.losses > losses:
             losses = walk.losses
-            _hand_on([*data.finish(cut=True), None], contract)
+            _hand_on([*data.finish(cut=True), None], checks)
         if (
             summary is None
             and not data.ended
-            and (record.opcode == Opcode.FOOTER or record.offset == known.summary_start)
+            and (record.opcode == Opcode.FOOTER or record.offset == outline.summary_start)
         ):
             what = "the data section has no Data End"
             data.findings.error("data-end", what, REINDEX, offset=record.offset)
             data.ended = True
         if summary is None and data.ended:
-            _hand_on(data.finish(cut=False), contract)
-            summary = Summary(data, data.findings, whole=data.whole and not walk.damaged)
+            _hand_on(data.finish(cut=False), checks)
+            summary = SummarySection(data, data.findings, whole=data.whole and not walk.damaged)
         if summary is None:
-            _hand_on(data.add(record), contract)
+            _hand_on(data.add(record), checks)
             at(record.offset)
         elif record.opcode == Opcode.FOOTER:
             summary.finish(record)
             return True
         else:
             summary.add(record)
-    _hand_on(data.finish(cut=True), contract)
+    _hand_on(data.finish(cut=True), checks)
     return False
 
 
-def _hand_on(batches: "Iterable[Batch | None]", contract: "Contract | _Plain") -> None:
+def _hand_on(
+    batches: Iterable[MessageBatch | None], checks: "MessageChecks | ForeignMessages"
+) -> None:
     for batch in batches:
         if batch is None:
-            contract.interrupt()
+            checks.interrupt()
         else:
-            contract.add(batch)
+            checks.add(batch)
 
 
-def _check_end(source: Source, findings: Findings) -> None:
+def _check_end(source: ByteSource, findings: Findings) -> None:
     offset = source.offset
     rest = source.size - offset
     if source.take(len(MAGIC)) != MAGIC:
@@ -204,7 +213,7 @@ def _check_end(source: Source, findings: Findings) -> None:
         findings.error("after-end", what, REINDEX, offset=offset + len(MAGIC))
 
 
-def _say_unfinished(findings: Findings, *, active: bool) -> None:
+def _report_unfinished(findings: Findings, *, active: bool) -> None:
     if active:
         advice = "unless a recorder is writing it, `hearthlog recover` completes it"
         findings.warning("unfinished", "is unfinished", advice)
@@ -213,14 +222,14 @@ def _say_unfinished(findings: Findings, *, active: bool) -> None:
         findings.error("cut", what, "`hearthlog recover` completes it")
 
 
-class _Plain:
-    """The messages of a file that is not ours: they must be of the types that it says."""
+class ForeignMessages:
+    """Checks that the messages of a file that is not ours are of the types that it names."""
 
-    def __init__(self, data: Data, findings: Findings) -> None:
+    def __init__(self, data: DataSection, findings: Findings) -> None:
         self._data = data
         self._findings = findings
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: MessageBatch) -> None:
         """Take the next messages of the file."""
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):

@@ -14,7 +14,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages
 BATCH_SIZE = 4 << 20  # bytes
 
 
-class Batch(NamedTuple):
+class MessageBatch(NamedTuple):
     """Some messages, still encoded.
 
     Attributes
@@ -33,7 +33,7 @@ class Batch(NamedTuple):
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
     ) -> Iterator[RawMessages]:
-        """Sort them by channel; those of unknown channels are left out."""
+        """Group the messages by channel, without those of channels that are not defined."""
         for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
             if identity in channels:
                 channel = channels[identity]
@@ -43,12 +43,12 @@ class Batch(NamedTuple):
                 yield RawMessages(channel, schema, self.buffer, offsets, self.heads[rows])
 
 
-def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[Batch]:
+def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[MessageBatch]:
     """Put chunks together: their contents, where messages begin in them, and the heads of these.
 
     Yields
     ------
-    Batch
+    MessageBatch
         Of a few megabytes each, however large a chunk is.
     """
     sizes = [len(content) for content, _, _ in parts]
@@ -60,4 +60,4 @@ def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[
     for rows in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(number)) + 1):
         if len(rows):
             some = slice(rows[0], rows[-1] + 1)
-            yield Batch(buffer, starts[some], heads[some])
+            yield MessageBatch(buffer, starts[some], heads[some])

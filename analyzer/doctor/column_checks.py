@@ -1,0 +1,165 @@
+"""Columns of one kind of message, checked by themselves against docs/log.md."""
+
+from itertools import repeat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.doctor.findings import Findings
+from hearthlog.analyzer.doctor.topic_types import GAP, SEGMENT
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages.topics import ROSOUT
+
+STAMP = "header.stamp"
+_CLOCK_SET = "the clock was set"
+_SUM_TOLERANCE = 1e-4
+_LONGEST_LAG = 61_000_000_000  # ns; of smoothing, and what stamps may be off in that time
+
+
+def check_stamps(
+    findings: Findings, kind: str, columns: Columns, microphone: str, *, named: bool
+) -> None:
+    """Compare log times with stamps, and `frame_id` with the microphone.
+
+    Parameters
+    ----------
+    findings : Findings
+    kind : str
+    columns : Columns
+    microphone : str
+        Empty for a topic of none.
+    named : bool
+        Whether the file bears the name of a recorder's log.
+    """
+    times = columns.log_times
+    stamps = columns["stamp" if kind == ROSOUT else STAMP]
+    if kind in {SEGMENT, GAP}:
+        stamps = stamps + columns["duration"]
+    late = times - stamps
+    if kind == "info" and not named:
+        late = np.minimum(late, 0)
+    if kind == SEGMENT:  # may be decided later, but never before it is over
+        late[(late >= 0) & (late <= _LONGEST_LAG)] = 0
+    findings.rows(
+        "stamp",
+        late != 0,
+        times,
+        lambda i: (
+            f"{columns.topic}: log time is {late[i] / 1e9:+.3f} s from the time of the message"
+        ),
+    )
+    if microphone:
+        names = columns["header.frame_id"]
+        findings.rows(
+            "frame-id",
+            np.asarray(names != microphone, bool),
+            times,
+            lambda i: f"{columns.topic}: frame_id is {names[i]!r}",
+        )
+
+
+def check_values(findings: Findings, columns: Columns, field: str, width: int) -> None:
+    """Check that an array has so many values, and that they are finite."""
+    values, times = columns[field], columns.log_times
+    report = findings.rows
+    if values.ndim == 1:
+        widths = np.fromiter(map(len, values), np.int64, len(values))
+    else:
+        widths = np.full(len(values), values.shape[1])
+    report(
+        "width",
+        widths != width,
+        times,
+        lambda i: f"{columns.topic}: {field} has {widths[i]} values, and there are {width} names",
+    )
+    if values.ndim == 1 or not len(values):
+        return
+    bad = ~np.isfinite(values).all(axis=1)
+    report("finite", bad, times, lambda _: f"{columns.topic}: {field} is not finite")
+    if field == "std":
+        negative = np.asarray((values < 0).any(axis=1))
+        report("negative-std", negative, times, lambda _: f"{columns.topic}: std is negative")
+
+
+def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> None:
+    """Check the labels of frames: their classes, probabilities and confidence."""
+    times, report = columns.log_times, findings.rows
+    numbers = _check_names(findings, columns, classes)
+    probabilities = columns["probabilities"]
+    if probabilities.ndim == 1 or probabilities.shape[1] != len(classes):
+        return
+    total = probabilities.sum(axis=1, dtype=np.float64)
+    wrong = (np.abs(total - 1) > _SUM_TOLERANCE) | (probabilities < 0).any(axis=1)
+    report(
+        "probabilities",
+        wrong,
+        times,
+        lambda i: f"{columns.topic}: the probabilities are negative, or sum up to {total[i]:.6f}",
+    )
+    given = probabilities[np.arange(len(times)), np.maximum(numbers, 0)]
+    confidence = columns["confidence"]
+    report(
+        "confidence",
+        (numbers >= 0) & (confidence != given),
+        times,
+        lambda i: (
+            f"{columns.topic}: confidence is {confidence[i]:.6f}, and the probability of the "
+            f"label {given[i]:.6f}"
+        ),
+    )
+
+
+def _check_names(findings: Findings, columns: Columns, classes: list[str]) -> Int64:
+    """Return the numbers of the classes, -1 where a label is none of them."""
+    numbers_of = {label: number for number, label in enumerate(classes)}
+    labels = columns["label"].tolist()
+    numbers = np.fromiter(map(numbers_of.get, labels, repeat(-1)), np.int64, len(labels))
+    findings.rows(
+        "class",
+        numbers < 0,
+        columns.log_times,
+        lambda i: f"{columns.topic}: {labels[i]!r} is no class of the model",
+    )
+    return numbers
+
+
+def check_segments(findings: Findings, columns: Columns, classes: list[str] | None) -> None:
+    """Check the durations, confidence and classes of segments; any class if these are None."""
+    times, confidence = columns.log_times, columns["confidence"]
+    no_duration = columns["duration"] <= 0
+    findings.rows("duration", no_duration, times, lambda _: f"{columns.topic}: has no duration")
+    findings.rows(
+        "confidence",
+        ~((confidence >= 0) & (confidence <= 1 + _SUM_TOLERANCE)),
+        times,
+        lambda i: f"{columns.topic}: confidence is {confidence[i]}",
+    )
+    if classes is not None:
+        _check_names(findings, columns, classes)
+
+
+def check_gaps(findings: Findings, columns: Columns) -> None:
+    """Report every gap, and check that its lost frames last as long as it does."""
+    times, durations = columns.log_times, columns["duration"]
+    lost, reasons = columns["frames_lost"], columns["reason"]
+    findings.rows(
+        "gap",
+        np.ones(len(times), bool),
+        times,
+        lambda i: (
+            f"{columns.topic}: {durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: "
+            f"{reasons[i]}"
+        ),
+        level="warning",
+    )
+    moved = np.array([reason.startswith(_CLOCK_SET) for reason in reasons], bool)
+    frames = durations.astype(np.float64) / FRAME_NANOSECONDS
+    differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
+    findings.rows(
+        "gap-duration",
+        differ & ~moved & (durations >= 0),
+        times,
+        lambda i: f"{columns.topic}: {lost[i]} lost frames do not last {durations[i] / 1e9:.3f} s",
+    )

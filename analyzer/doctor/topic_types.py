@@ -1,0 +1,31 @@
+"""The topics of a recorder's log and their message types, as docs/log.md has them."""
+
+import re
+
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT
+
+FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
+TYPES = {
+    "info": message_types.STREAM_INFO,
+    FEATURES: message_types.FEATURES,
+    STATISTICS: message_types.STATISTICS,
+    LABEL: message_types.LABEL,
+    SEGMENT: message_types.SEGMENT,
+    GAP: message_types.GAP,
+}
+ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
+LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
+SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
+_TOPIC = re.compile(r"/([a-z](?:_?[a-z0-9])*)/(\w+)")
+
+
+def split_topic(topic: str) -> tuple[str, str]:
+    """Split a topic into microphone and kind; one of no microphone into nothing and itself."""
+    match = _TOPIC.fullmatch(topic)
+    return ("", topic) if match is None or match[2] not in TYPES else (match[1], match[2])
+
+
+def topic_type(topic: str) -> str | None:
+    """Return the message type that docs/log.md gives to a topic; None if it has no such topic."""
+    return TYPES.get(split_topic(topic)[1], SHARED.get(topic))
