@@ -156,7 +156,7 @@ def by_report(run: Run) -> Any:
 
 
 def by_evaluate(run: Run) -> Any:
-    return json.loads(run("evaluate", "logs", "--reference", "review", "--json").stdout)
+    return json.loads(run("evaluate", "log", "logs", "--reference", "review", "--json").stdout)
 
 
 def by_training(run: Run) -> Any:
@@ -211,7 +211,7 @@ def by_splicing(run: Run) -> Any:
 
 
 def by_catalog(run: Run) -> Any:
-    said = json.loads(run("info", "logs", "--catalog", "--json").stdout)
+    said = json.loads(run("catalog", "logs", "--json").stdout)
     rows = pq.read_table("logs/catalog.parquet").to_pylist()
     Path("logs/catalog.parquet").unlink()
     of_files = {"size", "mtime", "input_sha256"}

@@ -488,7 +488,7 @@ def test_a_catalogue_in_a_store_is_like_one_of_this_machine(fleet, in_memory):
 
 def test_the_command_makes_the_catalogue_of_a_bucket(fleet, bucket, capfd):
     store = put(fleet, bucket)
-    assert run(capfd, "info", store, "--catalog").returncode == 3
+    assert run(capfd, "catalog", store).returncode == 3
     assert load_catalog(store).table.column("path") == write_catalog(fleet).table.column("path")
 
 
@@ -535,7 +535,7 @@ def test_the_homes_of_a_folder_are_summed_up(fleet):
 
 
 def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
-    done = run(capfd, "info", fleet, "--catalog")
+    done = run(capfd, "catalog", fleet)
     assert done.returncode == 3  # a log is cut off
     assert done.stderr == ""
     assert "north/anna" in done.stdout
@@ -543,14 +543,14 @@ def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
     (cut,) = find_logs(fleet / "bert")
     assert f"unfinished: {cut.relative_to(fleet).as_posix()}" in done.stdout
     cut.unlink()
-    assert run(capfd, "info", fleet, "--catalog").returncode == 0
+    assert run(capfd, "catalog", fleet).returncode == 0
     assert {row.home for row in load_catalog(fleet).rows()} == {"north/anna"}
 
 
 def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
     path = find_logs(fleet / "north")[0]
     garbage(path)
-    done = run(capfd, "info", fleet, "--catalog", "--json")
+    done = run(capfd, "catalog", fleet, "--json")
     assert done.returncode == 3
     assert done.stderr == f"hearthlog: {path}: is no MCAP file\n"
     said = json.loads(done.stdout)
@@ -566,7 +566,7 @@ def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
 def test_the_command_says_that_a_catalogue_was_unusable_and_makes_it_anew(fleet, capfd):
     table = write_catalog(fleet).table
     (fleet / CATALOG).write_bytes(b"PAR1")
-    done = run(capfd, "info", fleet, "--catalog")
+    done = run(capfd, "catalog", fleet)
     assert done.stderr.startswith(f"hearthlog: {fleet / CATALOG}: cannot be used as a catalogue")
     assert done.stderr.endswith("; it is made anew\n")
     assert load_catalog(fleet).table == table
@@ -574,9 +574,9 @@ def test_the_command_says_that_a_catalogue_was_unusable_and_makes_it_anew(fleet,
 
 def test_a_catalogue_is_of_a_folder_with_logs(recording, tmp_path, capfd):
     path = find_logs(recording)[0]
-    done = run(capfd, "info", path, "--catalog")
+    done = run(capfd, "catalog", path)
     assert (done.returncode, done.stdout) == (2, "")
     assert "give the folder" in done.stderr
-    done = run(capfd, "info", tmp_path, "--catalog")
+    done = run(capfd, "catalog", tmp_path)
     assert (done.returncode, list(tmp_path.iterdir())) == (1, [])
     assert "no log" in done.stderr

@@ -142,7 +142,7 @@ def test_enrolled_sounds_are_no_time_of_the_home(hearthlog, logs, cough):
     verbs = (
         ("info", logs, "--json"),
         ("cat", logs, "--format", "ndjson", "--topics", "/mic/info"),
-        ("evaluate", logs, "--reference", "review"),
+        ("evaluate", "log", logs, "--reference", "review"),
     )
     first = find_coverage(logs)["mic"].starts[0]
     write_marks(find_logs(logs)[0], [Mark("mic", first, first + 2 * NANOSECONDS, "speech")])

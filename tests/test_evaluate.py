@@ -16,7 +16,6 @@ from hearthlog.analyzer.evaluation.event_scores import (
     laid_out,
     segment_based,
 )
-from hearthlog.analyzer.evaluation.table import class_table, confusion_table
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, common, joined
 from hearthlog.analyzer.training.scores import (
@@ -29,6 +28,7 @@ from hearthlog.analyzer.training.scores import (
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.tools.cli.scores import print_scores
 from hearthlog.tools.home.simulate import write_training_set
 
 SECOND = 1_000_000_000
@@ -343,19 +343,22 @@ def test_a_reference_of_another_time_is_refused():
 # The command
 
 
-def test_no_line_of_a_table_is_too_wide():
+def test_no_line_of_a_table_is_too_wide(capsys):
     rng = np.random.default_rng(8)
     classes = [f"class_of_a_long_name_{i}" for i in range(32)]
     target, predicted, group = rng.integers(0, 32, (3, 5000))
     weight = rng.integers(0, 10**5, 5000)
     found = score(target, predicted, group, classes, weight)
-    lines = [*class_table(found), *confusion_table(found)]
+    print_scores(found)
+    lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 100
+    assert lines[-1].startswith("confusion: too many classes")
 
 
 def test_a_model_is_scored_on_real_household_sound(household, model_file, tmp_path, hearthlog):
-    picture, words = tmp_path / "scores.png", ("--model", model_file, "--data", household)
-    result = hearthlog("evaluate", *words, "--scenario", "general", "--json", "--plot", picture)
+    picture, words = tmp_path / "scores.png", (model_file, "--data", household)
+    options = ("--scenario", "general", "--json", "--plot", picture)
+    result = hearthlog("evaluate", "model", *words, *options)
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     more = {"expected_calibration_error", "reliability", "segments", "model", "sha256", "scenario"}
@@ -368,7 +371,7 @@ def test_a_model_is_scored_on_real_household_sound(household, model_file, tmp_pa
     low, high = found["macro_f1_interval"]
     assert low < high
     assert picture.read_bytes().startswith(b"\x89PNG")
-    table = hearthlog("evaluate", *words)
+    table = hearthlog("evaluate", "model", *words)
     assert table.returncode == 0
     assert max(map(len, table.stdout.splitlines())) <= 100
     assert f"{found['macro_f1']:.3f}" in table.stdout
@@ -381,22 +384,22 @@ def test_a_log_is_scored_against_a_label_file_and_against_its_review(recorded, t
     track = tmp_path / "labels.txt"
     assert hearthlog("export", copy, "-o", track, "--topics", "/mic/segment").returncode == 0
     picture = tmp_path / "scores.png"
-    result = hearthlog("evaluate", copy, "--reference", track, "--json", "--plot", picture)
+    result = hearthlog("evaluate", "log", copy, "--reference", track, "--json", "--plot", picture)
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
     assert TOP_LEVEL | {"frames", "unknown_labels", "evaluated_seconds"} <= found.keys()
     assert found["macro_f1"] > 0.99
     assert found["event_based"]["f1"] > 0.99
     assert picture.read_bytes().startswith(b"\x89PNG")
-    nothing = hearthlog("evaluate", copy, "--reference", "review")
+    nothing = hearthlog("evaluate", "log", copy, "--reference", "review")
     assert nothing.returncode == 1
     assert "is reviewed" in nothing.stderr
     assert hearthlog("annotate", "import", copy, track).returncode == 0
-    review = hearthlog("evaluate", copy, "--reference", "review", "--json")
+    review = hearthlog("evaluate", "log", copy, "--reference", "review", "--json")
     assert review.returncode == 0, review.stderr
     assert json.loads(review.stdout)["confusion"] == found["confusion"]
     layer = hearthlog(
-        "evaluate", copy, "--topic", "/mic/review/segment", "--reference", track, "--json"
+        "evaluate", "log", copy, "--topic", "/mic/review/segment", "--reference", track, "--json"
     )
     assert json.loads(layer.stdout)["macro_f1"] > 0.99
 
@@ -413,19 +416,19 @@ def test_bad_references_are_one_line(recorded, tmp_path, hearthlog):
     for text, said in cases.items():
         track = tmp_path / "labels.txt"
         track.write_text(text)
-        result = hearthlog("evaluate", log, "--reference", track)
+        result = hearthlog("evaluate", "log", log, "--reference", track)
         assert result.returncode == 1
         assert said in result.stderr
         assert result.stderr.count("\n") == 1
     track.write_text("0\t5\tspeech\n5\t9\tdoorbell\n")
-    result = hearthlog("evaluate", log, "--reference", track)
+    result = hearthlog("evaluate", "log", log, "--reference", track)
     assert result.returncode == 3
     assert "doorbell (4.0 s)" in result.stderr
 
 
 def test_a_model_of_another_scenario_is_refused(household, model_file, hearthlog):
-    words = ("--model", model_file, "--data", household, "--scenario", "bathroom")
-    result = hearthlog("evaluate", *words)
+    words = (model_file, "--data", household, "--scenario", "bathroom")
+    result = hearthlog("evaluate", "model", *words)
     assert result.returncode == 1
     assert "the model lacks flushing_water" in result.stderr
     assert "the scenario lacks speech" in result.stderr
@@ -434,16 +437,17 @@ def test_a_model_of_another_scenario_is_refused(household, model_file, hearthlog
 
 def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
     (tmp_path / "there.png").touch()
+    compared = ("a.mcap", "--reference", "r.txt")
     cases = (
-        ((), 2, "give either"),
-        (("a.mcap", "--model", "m", "--data", "d"), 2, "give either"),
-        (("a.mcap", "--reference", "r.txt", "--plot", "p.pdf"), 2, "*.png"),
-        (("a.mcap", "--reference", "r.txt", "--plot", tmp_path / "there.png"), 1, "exists already"),
-        (("a.mcap", "--reference", "r.txt"), 1, "no such log"),
-        (("--model", "m.safetensors", "--data", "d"), 1, "no such model file"),
+        (("log", "a.mcap"), 2, "--reference"),
+        (("log", *compared, "--plot", "p.pdf"), 2, "*.png"),
+        (("log", *compared, "--plot", tmp_path / "there.png"), 1, "exists already"),
+        (("log", *compared), 1, "no such log"),
+        (("model", "m.safetensors", "--data", "d"), 1, "no such model file"),
+        (("method", "--data", "d", "--scenario", "general", "--plot", "p.pdf"), 2, "*.png"),
     )
     for words, status, said in cases:
-        result = hearthlog("evaluate", *words)
+        result = hearthlog("evaluate", "model", *words)
         assert result.returncode == status
         assert said in result.stderr
 
@@ -461,15 +465,15 @@ def test_clips_are_labelled_as_the_recorder_labels_them(
     (tmp_path / "day.flac").write_bytes(day.read_bytes())
     manifest = tmp_path / "one.csv"
     manifest.write_text("path,label,source_group\nday.flac,speech,a\n")
-    words = ("--model", model_file, "--data", manifest, "--json")
-    of_clip = json.loads(hearthlog("evaluate", *words).stdout)
+    words = (model_file, "--data", manifest, "--json")
+    of_clip = json.loads(hearthlog("evaluate", "model", *words).stdout)
     logs = tmp_path / "logs"
     start = "2026-03-01T08:00:00"
     recording = hearthlog("record", day, "--model", model_file, "-o", logs, "--start", start)
     assert recording.returncode == 0, recording.stderr
     track = tmp_path / "labels.txt"
     track.write_text("0\t180\tspeech\n")
-    result = hearthlog("evaluate", logs, "--reference", track, "--json")
+    result = hearthlog("evaluate", "log", logs, "--reference", track, "--json")
     of_log = json.loads(result.stdout)
     assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.05
     for figure in ("segment_based", "event_based", "false_alarms_per_day"):
@@ -482,9 +486,9 @@ def test_a_model_says_that_it_is_scored_on_what_it_learned_from(tmp_path, hearth
     model = tmp_path / "own.safetensors"
     words = ("--data", manifest, "--scenario", "general")
     assert hearthlog("train", *words, "-o", model).returncode == 0
-    result = hearthlog("evaluate", "--model", model, "--data", manifest)
+    result = hearthlog("evaluate", "model", model, "--data", manifest)
     assert "learned from these very segments" in result.stderr
     lines = manifest.read_text().splitlines(keepends=True)
     manifest.write_text("".join(lines[:1] + lines[2:]))
-    result = hearthlog("evaluate", "--model", model, "--data", manifest)
+    result = hearthlog("evaluate", "model", model, "--data", manifest)
     assert "learned from" not in result.stderr

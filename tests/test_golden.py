@@ -398,7 +398,7 @@ def test_logs_of_two_versions_are_one_series_of_the_earlier(later):
         ["export", "logs", "-o", "tables", "--format", "parquet"],
         ["merge", "logs", "-o", "all.mcap"],
         ["diff", "logs", "live", "merged"],
-        ["evaluate", "logs", "--reference", "review"],
+        ["evaluate", "log", "logs", "--reference", "review"],
         ["replay", "logs", "--model", "models/smoothed.safetensors"],
         ["relabel", "logs", "--model", "models/smoothed.safetensors", "--workers", "1"],
         ["relabel", "logs", "--model", "models/smoothed.safetensors", "--workers", "2"],
@@ -413,7 +413,7 @@ def test_logs_of_two_versions_are_one_series_of_the_earlier(later):
             "x.safetensors",
         ],
         ["review", "logs", "--save", "day.rrd"],
-        ["info", "logs", "--catalog"],
+        ["catalog", "logs"],
     ],
     ids=lambda arguments: f"{arguments[0]} {arguments[-1]}",
 )

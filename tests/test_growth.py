@@ -357,7 +357,7 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
     [
         (["info", "logs"], "1 gap"),
         (["diff", "logs", "live", "merged"], "no labelling 'live'"),
-        (["evaluate", "logs", "--reference", "review"], "choose one with --topic"),
+        (["evaluate", "log", "logs", "--reference", "review"], "choose one with --topic"),
         (["report", "logs", "--day", "2026-03-01", "-o", "day.html"], ""),
         (["review", "logs", "--save", "day.rrd"], "day.rrd"),
     ],

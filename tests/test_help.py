@@ -159,3 +159,23 @@ def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
     assert result.returncode == 1
     assert result.stderr.endswith(f"; try: pip install '.[{extra}]' in a clone of hearthlog\n")
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "verb"),
+    [
+        ("evaluate --model m.safetensors --data clips", "evaluate model"),
+        ("evaluate --data=clips --model=m.safetensors", "evaluate model"),
+        ("evaluate logs --reference review", "evaluate log"),
+        ("evaluate --data clips --scenario general --folds source", "evaluate method"),
+        ("evaluate --data clips --scenario general --folds source --search", "evaluate search"),
+        ("evaluate --data clips --scenario general --adaptation", "evaluate adaptation"),
+        ("info homes --catalog", "catalog"),
+    ],
+)
+def test_what_a_verb_was_called_before_names_the_verb_of_now(hearthlog, words, verb):
+    result = hearthlog(*words.split())
+    assert (result.returncode, result.stdout) == (2, "")
+    assert f"say `hearthlog {verb} " in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert tuple(verb.split()) in VERBS

@@ -131,7 +131,7 @@ def test_names_that_cannot_be_printed_are_none(name):
         "export LOG -o OUT.npz --topics /mic/label",
         "export LOG -o OUT.parquet --topics /mic/label",
         "review LOG --save OUT.rrd",
-        "evaluate LOG --reference LOG",
+        "evaluate log LOG --reference LOG",
         "report LOG -o OUT.html",
     ],
 )
@@ -195,5 +195,5 @@ def test_gaps_of_no_microphone_are_catalogued_and_reported_as_none(hearthlog, lo
     logs.mkdir()
     (logs / log.name).write_bytes(log.read_bytes())
     gap_on(topic, logs / "home_20260301T060000Z.mcap")
-    assert hearthlog("info", logs, "--catalog").returncode == 0
+    assert hearthlog("catalog", logs).returncode == 0
     assert hearthlog("report", logs, "-o", tmp_path / "day.html").returncode in {0, 3}

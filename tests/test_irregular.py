@@ -15,14 +15,14 @@ from hearthlog.schemas.logs.follow import follow_messages
 KINDS = ("pipe", "socket", "device", "folder")
 AMONG = [
     "info LOGS",
-    "info LOGS --catalog",
+    "catalog LOGS",
     "doctor LOGS",
     "cat LOGS --topics /mic/segment",
     "export LOGS -o OUT.csv --topics /mic/segment",
     "diff LOGS live live",
     "diff FIRST live live",
-    "evaluate LOGS --reference LABELS",
-    "evaluate FIRST --reference FIRST",
+    "evaluate log LOGS --reference LABELS",
+    "evaluate log FIRST --reference FIRST",
     "review LOGS --save OUT.rrd",
     "review FIRST --save OUT.rrd",
     "report LOGS -o OUT.html",
@@ -42,7 +42,7 @@ NAMED = [
     "replay NAMED -o OUT",
     "relabel NAMED --model MODEL",
     "diff NAMED live live",
-    "evaluate NAMED --reference LABELS",
+    "evaluate log NAMED --reference LABELS",
     "review NAMED --save OUT.rrd",
     "report NAMED -o OUT.html",
     "annotate export NAMED -o OUT.csv",
@@ -52,7 +52,7 @@ NAMED = [
     "train --data NAMED --scenario general --output OUT.safetensors",
     "train --data LABELS --scenario NAMED.toml --output OUT.safetensors",
     "annotate import LOGS NAMED.csv",
-    "evaluate LOGS --reference NAMED.csv",
+    "evaluate log LOGS --reference NAMED.csv",
 ]
 _TOOK = re.compile(r" in [0-9.]+ s \([0-9]+ times real time\)")
 

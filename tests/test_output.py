@@ -16,7 +16,7 @@ VERBS = {
     "cat as CSV": "cat LOGS --format csv --topics /mic/label",
     "doctor as JSON": "doctor LOGS --json",
     "diff": "diff LOGS live again",
-    "evaluate": "evaluate LOGS --reference LABELS",
+    "evaluate": "evaluate log LOGS --reference LABELS",
     "models": "models show again --folder MODELS",
 }
 

@@ -138,14 +138,16 @@ def test_a_model_learned_with_a_cluster_is_the_same_file(cluster, clips, tmp_pat
 
 
 def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
-    words = ["--data", clips, "--scenario", "bathroom", "--method", "paper"]
-    printed = hearthlog("evaluate", *words, "--search").stdout
-    found = json.loads(hearthlog("evaluate", *words, "--search", "--json").stdout)["tried"]
+    words = ["--data", clips, "--scenario", "bathroom"]
+    printed = hearthlog("evaluate", "search", "paper", *words).stdout
+    result = hearthlog("evaluate", "search", "paper", *words, "--json")
+    found = json.loads(result.stdout)["tried"]
     assert len(found) == 9
     assert found == sorted(found, key=lambda one: -one["macro_f1"])
     best = found[0]
     chosen = ["--cost", f"{best['cost']:g}", "--gamma", f"{best['gamma']:g}"]
     assert " ".join(chosen) in printed
+    words += ["--method", "paper"]
     done = hearthlog("train", *words, *chosen, "-o", tmp_path / "a.safetensors", "--json")
     assert json.loads(done.stdout)["metrics"]["macro_f1"] == pytest.approx(best["macro_f1"])
 
@@ -153,14 +155,8 @@ def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (
-            "evaluate --data d --scenario bathroom --search --adaptation",
-            "--adaptation goes without",
-        ),
-        ("evaluate --data d --scenario bathroom --search --plot p.png", "--plot does not go with"),
-        ("evaluate --data d --search", "goes with --data and --scenario alone"),
-        ("evaluate --data d --scenario bathroom --search --folds x", "choose one of segment"),
-        ("evaluate --data d --model m --scheduler tcp://h:1", "--scheduler goes with --folds"),
+        ("evaluate search --data d --scenario bathroom --folds x", "choose one of segment"),
+        ("evaluate method wires --data d --scenario bathroom", "method 'wires' is not installed"),
         ("train -o m.safetensors --data d --scenario bathroom --cost 0", "--cost 0: it must"),
         ("train -o m.safetensors --data d --scenario bathroom --gamma nan", "--gamma nan: it must"),
         ("train -o m.safetensors --base b --home h --cost 0", "nothing that is about --data"),

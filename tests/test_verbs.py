@@ -33,7 +33,7 @@ MAKING = (
 )
 READING = (
     "info logs",
-    "info logs --catalog",
+    "catalog logs",
     "cat logs --topics /mic/segment",
     "export logs --topics /mic/label --output label.parquet",
     "annotate export logs --output marks.eaf",
@@ -43,7 +43,7 @@ READING = (
     "recover cut.mcap --output whole.mcap",
     "enrol coughing --home home --file clips/coughing/coughing_001.flac",
     "train --base first.safetensors --home logs --output adapted.safetensors",
-    "evaluate --model first.safetensors --data clips",
+    "evaluate model first.safetensors --data clips",
     "diff logs live first",
     "report logs --day 2026-03-01 --output day.html",
     "replay logs --model first.safetensors",

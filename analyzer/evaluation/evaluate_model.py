@@ -50,13 +50,6 @@ class Evaluation:
     learned_from: bool
 
 
-def scenario_of(model: Model) -> Scenario:
-    """Return the scenario that a model was trained for."""
-    about = model.description
-    classes = {name: tuple(labels) for name, labels in about.scenario.items()}
-    return Scenario(about.scenario_name, classes)
-
-
 def evaluate_model(
     model: Model, clips: Sequence[Clip], scenario: Scenario, progress: Progress
 ) -> Evaluation:

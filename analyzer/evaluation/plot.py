@@ -8,9 +8,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hearthlog.analyzer.evaluation.table import shown
 from hearthlog.analyzer.training.scores import Bin, Scores
 from hearthlog.schemas.storage.new_files import new_file
+from hearthlog.schemas.text import shortened
+
+_NAME_WIDTH = 16
 
 
 def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:
@@ -22,7 +24,7 @@ def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) 
         If the file exists, or cannot be written.
     """
     count = len(scores.classes)
-    names = [shown(name).replace("$", r"\$") for name in scores.classes]
+    names = [shortened(name, _NAME_WIDTH).replace("$", r"\$") for name in scores.classes]
     figure = Figure(figsize=(9 + 0.45 * count, 3.5 + 0.45 * count), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)

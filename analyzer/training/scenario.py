@@ -7,6 +7,7 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.models import classes as sound
 from hearthlog.models.classifiers.description import CLASS_NAME, MOST_CLASSES, TEXT
+from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.storage.small_file import read_toml
 
 _GENERAL = (
@@ -71,6 +72,12 @@ BUILTIN = {
     ),
     "general": Scenario("general", {label: (label,) for label in _GENERAL}),
 }
+
+
+def scenario_of(model: Model) -> Scenario:
+    """Return the scenario that a model was trained for."""
+    classes = {name: tuple(labels) for name, labels in model.description.scenario.items()}
+    return Scenario(model.description.scenario_name, classes)
 
 
 def load_scenario(name: str) -> Scenario:

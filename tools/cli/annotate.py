@@ -1,4 +1,4 @@
-"""`hearthlog annotate`: marks of a reviewer, from and to the files of others."""
+"""`hearthlog annotate`: marks of a reviewer, from and to the label files of other programs."""
 
 import time
 from collections import Counter
@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.tools.cli.options import Microphone
 from hearthlog.tools.cli.reviewer import reviewer_name
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.marks.marks import Mark
 
 annotate = typer.Typer(
     no_args_is_help=True,
-    help="Marks of what was heard, from and to label files of others.",
+    help="Take marks from the label files of other programs, or write them to such files.",
 )
 _FORMS = (
     "*.txt (Audacity), *.selections.txt (Raven), *.csv, *.eaf (ELAN), *.json (Label Studio) "
     "or *.rttm"
 )
 _Log = Annotated[Path, typer.Argument(help="A log, or a folder of logs.")]
-_Microphone = Annotated[str | None, typer.Option(help="Its name, where there are several.")]
 
 
 @annotate.command("import")
@@ -31,7 +32,7 @@ def import_labels(
     log: _Log,
     labels: Annotated[Path, typer.Argument(help=f"Labels: {_FORMS}.")],
     *,
-    microphone: _Microphone = None,
+    microphone: Microphone = None,
     reviewer: Annotated[
         str | None,
         typer.Option(help="Who labelled, where the file does not say.", show_default="you"),
@@ -58,9 +59,9 @@ def import_labels(
             print(write_marks(path, new))
         taken += new
     _print_amounts(taken)
-    there = sum(map(len, by_log.values())) - len(taken)
-    if there:
-        typer.echo(f"hearthlog: {_marks_text(there)} stood there already", err=True)
+    existing = sum(map(len, by_log.values())) - len(taken)
+    if existing:
+        tell(f"{number(existing, 'mark')} stood there already")
 
 
 @annotate.command("export")
@@ -68,7 +69,7 @@ def export_labels(
     log: _Log,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to make: {_FORMS}.")],
-    microphone: _Microphone = None,
+    microphone: Microphone = None,
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.errors import DataError
@@ -79,17 +80,18 @@ def export_labels(
 
     _check_suffix(output)
     check_new(output)
-    heard = find_coverage(log)
-    if microphone is not None and microphone not in heard:
-        raise DataError(f"{log}: no microphone {microphone!r}; there is {', '.join(sorted(heard))}")
+    coverage = find_coverage(log)
+    if microphone is not None and microphone not in coverage:
+        names = ", ".join(sorted(coverage))
+        raise DataError(f"{log}: no microphone {microphone!r}; there is {names}")
     marks = {
         mark
-        for name, one in heard.items()
+        for name, one in coverage.items()
         for path in one.logs
         for mark in read_marks(path)
         if mark.microphone == name and microphone in {None, name}
     }
-    write_labels(output, sorted(marks, key=lambda mark: (mark.start, mark)), heard)
+    write_labels(output, sorted(marks, key=lambda mark: (mark.start, mark)), coverage)
     print(output)
 
 
@@ -106,10 +108,8 @@ def _print_amounts(marks: "Sequence[Mark]") -> None:
     for mark in marks:
         counts[mark.label] += 1
         lengths[mark.label] += mark.end - mark.start
-    width = max(map(len, counts), default=0)
-    for label, count in sorted(counts.items()):
-        print(f"{label:{width}}  {_marks_text(count)}, {lengths[label] / 1e9:.2f} s")
-
-
-def _marks_text(count: int) -> str:
-    return "1 mark" if count == 1 else f"{count} marks"
+    rows = [
+        (label, f"{number(count, 'mark')}, {lengths[label] / 1e9:.2f} s")
+        for label, count in sorted(counts.items())
+    ]
+    print_table((), rows, words=2)

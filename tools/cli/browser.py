@@ -1,8 +1,8 @@
-"""A page of this machine, shown to whoever sits before it."""
+"""Opening a page of this machine in a browser."""
 
 import webbrowser
 
-import typer
+from hearthlog.tools.cli.text import tell
 
 
 def show_page(address: str) -> None:
@@ -10,7 +10,7 @@ def show_page(address: str) -> None:
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.review.viewer.process import check_display
 
-    typer.echo(f"hearthlog: open {address}", err=True)
+    tell(f"open {address}")
     try:
         check_display("")
     except DataError:

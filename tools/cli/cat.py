@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
+from hearthlog.tools.cli.options import End, Logs, Start, Topics
+from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def cat(
         _print_table(selection)
     else:
         _print_lines(selection, output_format)
-    report_unfinished(selection)
+    end_with_warnings(unfinished_lines(selection.unfinished))
 
 
 def _print_lines(selection: "Selection", output_format: Format) -> None:

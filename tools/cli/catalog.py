@@ -1,18 +1,17 @@
-"""`hearthlog info --catalog`: the catalogue of a folder, and its homes at a glance."""
+"""`hearthlog catalog`: the catalogue of a folder, and its homes at a glance."""
 
 import json
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.schemas.text import printable
+from hearthlog.tools.cli.options import Json, log_location
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.selection import wrong_use
-from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, tell
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog import Catalog
@@ -21,53 +20,66 @@ if TYPE_CHECKING:
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
 _COUNTS = "logs", "layers", "unfinished", "damaged"
+_FIGURES = "MB", "hours", "gaps", "gap minutes", "from", "to"
 
 
-def make_catalog(folder: Path, *, as_json: bool) -> None:
-    """Make the catalogue of a folder, and show what is in it."""
+def catalog(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder that holds the logs or homes, or a URL such as s3://bucket/homes.",
+            parser=log_location,
+        ),
+    ],
+    *,
+    as_json: Json = False,
+) -> None:
+    """Write FOLDER/catalog.parquet, a row for each file, and show the homes in the folder.
+
+    Files that have not changed since the last catalogue are not read again. Exit status 3: a file
+    is unfinished or damaged.
+    """
     from hearthlog.analyzer.logs.catalog import DAMAGED, UNFINISHED
     from hearthlog.analyzer.logs.catalog.fleet import heard, homes
 
     if folder.is_file():
-        wrong_use(f"--catalog: {folder} is a file; give the folder that holds the logs or homes")
-    catalog = _written(folder)
-    damaged = catalog.of_state(DAMAGED)
+        wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
+    files = _write(folder)
+    damaged = files.of_state(DAMAGED)
     for row in damaged:
         tell(f"{folder / row.path}: {row.error}")
-    unfinished = [row.path for row in catalog.of_state(UNFINISHED)]
-    found, labels = homes(catalog), heard(catalog)
+    unfinished = [row.path for row in files.of_state(UNFINISHED)]
     if as_json:
-        about = {
-            "files": len(catalog),
+        result = {
+            "files": len(files),
             "unfinished": unfinished,
             "damaged": {row.path: row.error for row in damaged},
-            "homes": [_home(home) for home in found],
-            "labels": [asdict(label) for label in labels],
+            "homes": [_home(home) for home in homes(files)],
+            "labels": [asdict(label) for label in heard(files)],
         }
-        print(json.dumps(about, indent=2))
+        print(json.dumps(result, indent=2))
     else:
-        _print(found, labels, unfinished)
+        _print(homes(files), heard(files), unfinished)
     if damaged or unfinished:
         raise typer.Exit(3)
 
 
-def _written(folder: Path) -> "Catalog":
+def _write(folder: Path) -> "Catalog":
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.catalog import load_catalog, write_catalog
 
-    known = None
+    previous = None
     try:
-        known = load_catalog(folder)
+        previous = load_catalog(folder)
     except DataError as error:
-        print(f"hearthlog: {error}; it is made anew", file=sys.stderr)
+        tell(f"{error}; it is made anew")
     try:
-        with share_done("reading logs") as report:
-            return write_catalog(folder, known, report)
+        with share_done("reading logs") as progress:
+            return write_catalog(folder, previous, progress)
     except KeyboardInterrupt:
-        print(
-            "hearthlog: interrupted; what was read is in the catalogue, and the same command goes "
-            "on from there",
-            file=sys.stderr,
+        tell(
+            "interrupted; what was read is in the catalogue, and the same command goes on from "
+            "there"
         )
         raise
 
@@ -78,25 +90,11 @@ def _home(home: "Home") -> dict[str, object]:
 
 
 def _print(homes: Sequence["Home"], labels: Sequence["Heard"], unfinished: Sequence[str]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    width = None if sys.stdout.isatty() else PLAIN_WIDTH
-    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True, width=width)
-    figures = "MB", "hours", "gaps", "gap minutes", "from", "to"
-    table = Table("home", *_COUNTS, *figures, box=None)
-    for row in _home_rows(homes):
-        table.add_row(*map(printable, row))
-    console.print(table, soft_wrap=False)
+    print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
     if len(homes) > _HOMES_SHOWN:
-        console.print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
-    table = Table("labels", "model", "label", "minutes", "segments", box=None)
-    for row in _label_rows(labels):
-        table.add_row(*map(printable, row))
-    if table.rows:
-        console.print(table, soft_wrap=False)
-    for line in first_of("unfinished", unfinished):
-        console.print(printable(line))
+        print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
+    print_table(("labels", "model", "label", "minutes", "segments"), _label_rows(labels), words=3)
+    print_lines(first_of("unfinished", unfinished))
 
 
 def _home_rows(homes: Sequence["Home"]) -> Iterator[Sequence[str]]:

@@ -1,25 +1,14 @@
 """`hearthlog cut`: a part of some logs as a log of its own."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
-from hearthlog.tools.cli.selection import (
-    End,
-    Logs,
-    Start,
-    Topics,
-    check_log_name,
-    report_unfinished,
-)
+from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_log_name
+from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines
 from hearthlog.tools.cli.times import parse_span
 
 
 def cut(
     logs: Logs,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Log to make, *.mcap.")],
+    output: NewLog,
     topics: Topics = None,
     start: Start = None,
     end: End = None,
@@ -38,4 +27,4 @@ def cut(
     with share_done("cutting") as progress:
         merge_logs(selection, output, progress, latched=True)
     print(output)
-    report_unfinished(selection)
+    end_with_warnings(unfinished_lines(selection.unfinished))

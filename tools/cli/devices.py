@@ -2,24 +2,24 @@
 
 import json
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
 
+from hearthlog.tools.cli.options import Json
+from hearthlog.tools.cli.text import tell
 
-def devices(
-    *, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False
-) -> None:
+
+def devices(*, as_json: Json = False) -> None:
     """List the microphones by the names that `hearthlog record --device` takes."""
     from hearthlog.recorder.sources.process import query_devices
 
-    found = query_devices()
+    microphones = query_devices()
     if as_json:
-        print(json.dumps([asdict(device) for device in found], indent=2))
+        print(json.dumps([asdict(device) for device in microphones], indent=2))
         return
-    for device in found:
+    for device in microphones:
         default = "  (default)" if device.is_default else ""
         print(f"{device.name}  {device.channels} channels, {device.default_rate:.0f} Hz{default}")
-    if not found:
-        typer.echo("hearthlog: no microphone found", err=True)
+    if not microphones:
+        tell("no microphone found")
         raise typer.Exit(1)

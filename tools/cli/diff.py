@@ -1,7 +1,7 @@
 """`hearthlog diff`: two labellings of the same logs, and what to review next."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from hearthlog.tools.cli.diff_tables import print_difference, print_queue
+from hearthlog.tools.cli.options import End, Json, Log, Microphone, Start
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.selection import End, Start, log_location, wrong_use
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
@@ -22,13 +23,7 @@ _SHOWN, _QUEUED = 10, 60
 
 
 def diff(
-    log: Annotated[
-        Path,
-        typer.Argument(
-            help="A log, or a folder of logs, or a URL such as s3://bucket/home.",
-            parser=log_location,
-        ),
-    ],
+    log: Log,
     a: Annotated[
         str, typer.Argument(help="A labelling: live, review, or the model of a relabel layer.")
     ],
@@ -46,12 +41,10 @@ def diff(
         Path | None,
         typer.Option("--list", help="File to make, *.csv: the queue, or all disagreements."),
     ] = None,
-    microphone: Annotated[
-        str | None, typer.Option(help="Its name, where there are several.")
-    ] = None,
+    microphone: Microphone = None,
     start: Start = None,
     end: End = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Compare two labellings of some logs, or choose what to review next.
 
@@ -66,7 +59,7 @@ def diff(
     limits = parse_span(start, end)
     sources = find_sources(log)
     name = sources.microphone(microphone)
-    chosen = [sources.find(name, wanted) for wanted in (a, b) if wanted is not None]
+    chosen = [sources.find(name, labelling) for labelling in (a, b) if labelling is not None]
     if len(set(chosen)) < len(chosen):
         wrong_use(f"{a} and {b} are the same; there is {', '.join(sources.names(name))}")
     with share_done("reading segments") as progress:
@@ -79,28 +72,28 @@ def diff(
         _write_list(output, result.spans())
     if as_json:
         spans_as_text = [span.as_text() for span in result.spans()]
-        print(json.dumps({**result.about, "spans": spans_as_text}, allow_nan=False))
+        print(json.dumps({**result.figures, "spans": spans_as_text}, allow_nan=False))
     else:
-        print(*result.table, sep="\n")
-    _report_losses(sources, [labelling_topic(name, each, "segment") for each in chosen])
+        result.print_tables()
+    unfinished = sources.unfinished([labelling_topic(name, each, "segment") for each in chosen])
+    end_with_warnings([*sources.losses, *unfinished_lines(unfinished)])
 
 
 class _Result(NamedTuple):
-    about: dict[str, Any]
+    figures: dict[str, Any]
     spans: "Callable[[], list[ReviewSpan]]"
-    table: Iterable[str]
+    print_tables: Callable[[], None]
 
 
 def _difference(microphone: str, sides: "list[Side]", shown: int) -> _Result:
     from hearthlog.analyzer.evaluation.difference import compare_sides
-    from hearthlog.analyzer.evaluation.difference_table import difference_table
     from hearthlog.analyzer.review.queue.review_list import disagreements
 
-    found = compare_sides(*sides)
-    about = {"microphone": microphone, **asdict(found)}
-    about["disagreements"] = len(found.disagreements.starts)
-    spans = partial(disagreements, found, microphone)  # there may be a hundred thousand
-    return _Result(about, spans, difference_table(found, shown))
+    difference = compare_sides(*sides)
+    figures = {"microphone": microphone, **asdict(difference)}
+    figures["disagreements"] = len(difference.disagreements.starts)
+    spans = partial(disagreements, difference, microphone)  # there may be a hundred thousand
+    return _Result(figures, spans, partial(print_difference, difference, shown))
 
 
 def _queue(
@@ -110,7 +103,6 @@ def _queue(
     limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:
-    from hearthlog.analyzer.review.queue.queue_table import queue_table
     from hearthlog.analyzer.review.queue.ranking import make_queue
     from hearthlog.analyzer.review.queue.review_list import queued
     from hearthlog.schemas.messages.topics import REVIEW
@@ -119,7 +111,7 @@ def _queue(
     if REVIEW in names:
         wrong_use("a queue is of what is not reviewed yet: compare other labellings")
     with share_done("reading labels") as progress:
-        found = make_queue(
+        ranked = make_queue(
             sources,
             microphone,
             sides[0],
@@ -128,33 +120,21 @@ def _queue(
             count=count,
             progress=progress,
         )
-    if not found.sure:
-        typer.echo(
-            f"hearthlog: {names[0]}: no labels with probabilities, so how sure the model was is "
-            "no part of the score",
-            err=True,
+    if not ranked.sure:
+        tell(
+            f"{names[0]}: no labels with probabilities, so how sure the model was is no part of "
+            "the score"
         )
-    about = {"microphone": microphone, "labelling": names[0], "candidates": found.candidates}
-    return _Result(about, partial(queued, found, microphone, *names), queue_table(found))
+    figures = {"microphone": microphone, "labelling": names[0], "candidates": ranked.candidates}
+    spans = partial(queued, ranked, microphone, *names)
+    return _Result(figures, spans, partial(print_queue, ranked))
 
 
 def _write_list(path: Path, spans: "list[ReviewSpan]") -> None:
     from hearthlog.analyzer.review.queue.review_list import write_list
 
     write_list(path, spans)
-    typer.echo(f"hearthlog: {len(spans)} spans are listed in {path}", err=True)
-
-
-def _report_losses(sources: "Sources", topics: list[str]) -> None:
-    lines = list(sources.losses)
-    unfinished = sources.unfinished(topics)
-    if unfinished:
-        names = ", ".join(map(str, unfinished))
-        lines.append(f"unfinished, read up to the last whole chunk: {names}")
-    for line in lines:
-        tell(line)
-    if lines:
-        raise typer.Exit(3)
+    tell(f"{len(spans)} spans are listed in {path}")
 
 
 def _check_list(path: Path | None) -> None:

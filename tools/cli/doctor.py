@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.text import printable
+from hearthlog.tools.cli.options import Json
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 def doctor(
     path: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
     *,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Check logs: MCAP, the contract, and how they follow each other.
 

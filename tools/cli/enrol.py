@@ -1,12 +1,11 @@
 """`hearthlog enrol`: seconds of a sound into the home's own training set."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.text import tell, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
 
@@ -51,8 +50,10 @@ def enrol(
         done = enrolment.enrol_file(home, label, file, seconds)
     elif log is None:
         seconds = seconds or enrolment.SECONDS
-        say = partial(typer.echo, f"hearthlog: listening for {seconds:g} s", err=True)
-        done = enrolment.enrol_microphone(home, label, microphone or "", seconds, say)
+        message = f"listening for {seconds:g} s"
+        done = enrolment.enrol_microphone(
+            home, label, microphone or "", seconds, lambda: tell(message)
+        )
     elif first is None or last is None or seconds is not None:
         wrong_use("--log wants --start and --end, and no --seconds")
     else:

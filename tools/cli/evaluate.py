@@ -1,229 +1,285 @@
-"""`hearthlog evaluate`: how good a model is, or the labels of a log."""
+"""`hearthlog evaluate`: how good a model is, the labels of a log, or a way to learn."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from hearthlog.schemas.text import shortened
 from hearthlog.tools.cli.method import chosen_method
+from hearthlog.tools.cli.options import METHODS, Clips, Json, Scheduler, manifest_path
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.selection import wrong_use
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
+from hearthlog.tools.cli.table import NAME_WIDTH, print_table
+from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import Kind
-    from hearthlog.analyzer.evaluation.event_scores import Detections
+    from hearthlog.analyzer.training import method as learning
     from hearthlog.analyzer.training.dataset import Dataset
-    from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
 
+_MOVED = {  # options of one verb that is several now
+    "--adaptation": "adaptation",
+    "--search": "search",
+    "--folds": "method",
+    "--model": "model",
+    "--reference": "log",
+}
+_MOST_NAMED = 10
 
-def evaluate(
-    log: Annotated[
-        Path | None, typer.Argument(help="A log, or a folder of logs, to compare with --reference.")
-    ] = None,
+
+class _Group(TyperGroup):
+    """Names the new verb to those who use the old one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the words behind `evaluate`."""
+        options = {word.partition("=")[0] for word in args}
+        verb = next((verb for option, verb in _MOVED.items() if option in options), None)
+        if verb and args[0] not in self.commands:
+            wrong_use(f"say `hearthlog evaluate {verb} …`; its --help lists the options")
+        return super().parse_args(ctx, args)
+
+
+evaluate = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    help="Score the labels of a log, a model, or a way to learn.",
+)
+
+_Method = Annotated[str, typer.Argument(help=METHODS)]
+_Scenario = Annotated[
+    str, typer.Option(help="What is told apart: bathroom, general, or a TOML file.")
+]
+_Folds = Annotated[str, typer.Option(help="What is never split: segment, source or collection.")]
+_Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
+
+
+@evaluate.command("log")
+def evaluate_log(
+    log: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
     *,
     reference: Annotated[
-        str | None,
-        typer.Option(help="Label file, as `annotate` reads it; or review, for review layers."),
-    ] = None,
+        str, typer.Option(help="Label file, as `annotate` reads it; or review, for review layers.")
+    ],
     topic: Annotated[
         str | None,
         typer.Option(help="Segments to compare; by default what the recorder labelled."),
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="Model file, to be run on --data.")] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv."),
-    ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help="What is told apart: bathroom, general, or a TOML file; by default what the model "
-            "was trained for."
-        ),
-    ] = None,
-    folds: Annotated[
-        str | None,
-        typer.Option(
-            help="Cross-validate learning from --data; what is never split: segment, source or "
-            "collection."
-        ),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(help="How to learn: bands, or paper (42 statistics).")
-    ] = "bands",
-    adaptation: Annotated[
-        bool,
-        typer.Option(
-            "--adaptation",
-            help="F1 against corrected segments of a home, each collection of --data in its place.",
-        ),
-    ] = False,
-    search: Annotated[
-        bool,
-        typer.Option(
-            "--search", help="Cross-validate learning with other costs and gammas, best first."
-        ),
-    ] = False,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Learn on this Dask cluster, as tcp://host:port.")
-    ] = None,
-    plot: Annotated[Path | None, typer.Option(help="Picture to make, *.png.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    plot: _Plot = None,
+    as_json: Json = False,
 ) -> None:
-    """Score a model, or a way to learn, on labelled clips, or a log against a reference.
+    """Compare the labels of a log with those of a reviewer.
 
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
-    of_log, of_model = (log, reference), (model, data)
-    if folds is not None or adaptation or search:
-        from hearthlog.analyzer.workers.parallel import joblib_on
+    from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
+    from hearthlog.analyzer.logs.labelling import read_labelled
 
-        if not data or not scenario or any((*of_log, topic, model)):
-            wrong_use("--folds, --adaptation or --search goes with --data and --scenario alone")
-        if adaptation and (folds or search):
-            wrong_use("--adaptation goes without --folds and --search")
-        if plot is not None and (adaptation or search):
-            wrong_use("--plot does not go with --adaptation and --search")
-        _check_plot(plot)
-        with joblib_on(scheduler):
-            if adaptation:
-                _evaluate_adaptation(data, scenario, method, as_json=as_json)
-            elif search:
-                _search(data, scenario, folds or "source", method, as_json=as_json)
-            else:
-                assert folds is not None
-                _evaluate_method(data, scenario, folds, method, plot, as_json=as_json)
-    elif scheduler is not None:
-        wrong_use("--scheduler goes with --folds, --adaptation or --search")
-    elif all(of_log) and not any((*of_model, scenario)):
-        _check_plot(plot)
-        assert log is not None
-        assert reference is not None
-        _evaluate_log(log, reference, topic, plot, as_json=as_json)
-    elif all(of_model) and not any((*of_log, topic)):
-        _check_plot(plot)
-        assert model is not None
-        assert data is not None
-        _evaluate_model(model, data, scenario, plot, as_json=as_json)
+    _check_plot(plot)
+    labelled = read_labelled(log, topic)
+    true = read_reference(reference, log, labelled.microphone)
+    result = compare(true, labelled.labelling, labelled.classes)
+    _save_plot(plot, f"{labelled.topic} of {log} against {reference}", result.scores)
+    if as_json:
+        scores = asdict(result.scores)
+        frames = scores.pop("segments")
+        _print_json(
+            {"log": str(log), "topic": labelled.topic, "reference": reference, "frames": frames}
+            | scores
+            | asdict(result.detections)
+            | {
+                "reference_seconds": result.reference_seconds,
+                "evaluated_seconds": result.evaluated_seconds,
+                "ambiguous_seconds": result.ambiguous_seconds,
+                "unknown_labels": dict(result.unknown_labels),
+            }
+        )
     else:
-        wrong_use("give either a log and --reference, or --model and --data, or --folds and --data")
+        print(
+            f"{labelled.topic}: {result.evaluated_seconds:.1f} s are labelled of the "
+            f"{result.reference_seconds:.1f} s of the reference; frames of 50 ms, "
+            f"{number(result.scores.groups, 'block')} of time\n"
+        )
+        print_scores(result.scores, result.detections)
+        if result.ambiguous_seconds:
+            print(f"\n{result.ambiguous_seconds:.1f} s have two labels in the reference", end="")
+            print(": left out of the scores of frames")
+    warnings = unfinished_lines(labelled.unfinished)
+    if result.unknown_labels:
+        warnings.append(_unknown_text(result.unknown_labels))
+    end_with_warnings(warnings)
 
 
-def _evaluate_model(
-    path: Path, data: Path, scenario: str | None, plot: Path | None, *, as_json: bool
+@evaluate.command("model")
+def evaluate_model(
+    model: Annotated[Path, typer.Argument(help="Model file.")],
+    *,
+    data: Clips,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="What is told apart: bathroom, general, or a TOML file.",
+            show_default="what the model was trained for",
+        ),
+    ] = None,
+    plot: _Plot = None,
+    as_json: Json = False,
 ) -> None:
-    from hearthlog.analyzer.evaluation.evaluate_model import (
-        check_classes,
-        evaluate_model,
-        scenario_of,
-    )
-    from hearthlog.analyzer.evaluation.table import reliability_table
+    """Score a model on labelled clips."""
+    from hearthlog.analyzer.evaluation import evaluate_model as evaluation
     from hearthlog.analyzer.training.manifest import read_manifest
-    from hearthlog.analyzer.training.scenario import load_scenario
+    from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
-    model = load_model(path)
-    chosen = scenario_of(model) if scenario is None else load_scenario(scenario)
-    check_classes(model, chosen)
-    clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
+    _check_plot(plot)
+    loaded = load_model(model)
+    classes = load_scenario(scenario) if scenario else scenario_of(loaded)
+    evaluation.check_classes(loaded, classes)
+    clips = read_manifest(manifest_path(data), classes.labels)
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        found = evaluate_model(model, clips, chosen, report)
-    if plot is not None:
-        _save_plot(plot, f"{model.name} on {data} ({chosen.name})", found.scores, found.reliability)
+        result = evaluation.evaluate_model(loaded, clips, classes, report)
+    scores = result.scores
+    _save_plot(plot, f"{loaded.name} on {data} ({classes.name})", scores, result.reliability)
     if as_json:
         _print_json(
-            {"model": str(path), "sha256": model.sha256, "scenario": chosen.name}
-            | asdict(found.scores)
+            {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
+            | asdict(scores)
             | {
-                "expected_calibration_error": found.expected_calibration_error,
-                "reliability": [asdict(one) for one in found.reliability],
-                "evaluated_seconds": found.evaluated_seconds,
-                "skipped": dict(found.skipped),
-                "learned_from": found.learned_from,
+                "expected_calibration_error": result.expected_calibration_error,
+                "reliability": [asdict(one) for one in result.reliability],
+                "evaluated_seconds": result.evaluated_seconds,
+                "skipped": dict(result.skipped),
+                "learned_from": result.learned_from,
             }
-            | asdict(found.detections)
+            | asdict(result.detections)
         )
     else:
-        scores = found.scores
         print(
-            f"model {model.name}, scenario {chosen.name}: {scores.segments} segments of "
-            f"{model.description.window_seconds:g} s from "
-            f"{scores.groups} sources\n"
+            f"model {loaded.name}, scenario {classes.name}: {scores.segments} segments of "
+            f"{loaded.description.window_seconds:g} s from {scores.groups} sources\n"
         )
-        _print_tables(scores, found.detections)
-        print()
-        print(*reliability_table(found.reliability, found.expected_calibration_error), sep="\n")
-        if found.skipped:
-            print("\nclips left out")
-            print(*(f"{count:6}  {reason}" for reason, count in found.skipped.items()), sep="\n")
-    if found.learned_from:
-        typer.echo(
-            "hearthlog: the model learned from these very segments: this says nothing of how good "
-            "it is on others",
-            err=True,
+        print_scores(scores, result.detections)
+        print_reliability(result.reliability, result.expected_calibration_error)
+        print_skipped(result.skipped, "clips")
+    if result.learned_from:
+        tell(
+            "the model learned from these very segments: this says nothing of how good it is on "
+            "others"
         )
 
 
-def _evaluate_method(
-    data: Path, scenario: str, folds: str, method: str, plot: Path | None, *, as_json: bool
+@evaluate.command("method")
+def evaluate_method(
+    method: _Method = "bands",
+    *,
+    data: Clips,
+    scenario: _Scenario,
+    folds: _Folds = "source",
+    scheduler: Scheduler = None,
+    plot: _Plot = None,
+    as_json: Json = False,
 ) -> None:
-    from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method
-    from hearthlog.analyzer.evaluation.table import reliability_table
+    """Cross-validate a way to learn: learn from a part of the clips, and try it on the rest."""
+    from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method as cross_validate
+    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    chosen, by = chosen_method(method), _kind(folds)
-    segments = _segments(data, scenario, chosen)
-    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        found = evaluate_method(segments, chosen, by, report)
-    if plot is not None:
-        _save_plot(
-            plot, f"{method} on {data} ({scenario}), by {folds}", found.scores, found.reliability
-        )
+    _check_plot(plot)
+    by, chosen = _kind(folds), chosen_method(method)
+    with joblib_on(scheduler):
+        segments = _segments(data, scenario, chosen)
+        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
+            result = cross_validate(segments, chosen, by, report)
+    title = f"{method} on {data} ({scenario}), by {folds}"
+    _save_plot(plot, title, result.scores, result.reliability)
     if as_json:
-        about = {"scenario": scenario, "method": method, "by": folds, "folds": found.folds}
         _print_json(
-            about
-            | asdict(found.scores)
+            {"scenario": scenario, "method": method, "by": folds, "folds": result.folds}
+            | asdict(result.scores)
             | {
-                "expected_calibration_error": found.expected_calibration_error,
-                "reliability": [asdict(one) for one in found.reliability],
+                "expected_calibration_error": result.expected_calibration_error,
+                "reliability": [asdict(one) for one in result.reliability],
                 "skipped": dict(segments.skipped),
             }
         )
         return
     print(
-        f"method {method}, scenario {scenario}: {found.scores.segments} segments of "
-        f"{chosen.features.window_seconds:g} s from "
-        f"{found.scores.groups} sources, {found.folds} folds by {folds}\n"
+        f"method {method}, scenario {scenario}: {result.scores.segments} segments of "
+        f"{chosen.features.window_seconds:g} s from {result.scores.groups} sources, "
+        f"{result.folds} folds by {folds}\n"
     )
-    _print_tables(found.scores, None)
-    print()
-    print(*reliability_table(found.reliability, found.expected_calibration_error), sep="\n")
+    print_scores(result.scores)
+    print_reliability(result.reliability, result.expected_calibration_error)
 
 
-def _search(data: Path, scenario: str, folds: str, method: str, *, as_json: bool) -> None:
-    from hearthlog.analyzer.evaluation.grid_search import search
-    from hearthlog.analyzer.evaluation.table import search_table
+@evaluate.command()
+def search(
+    method: _Method = "bands",
+    *,
+    data: Clips,
+    scenario: _Scenario,
+    folds: _Folds = "source",
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Cross-validate a way to learn with other costs and gammas, and list the best first."""
+    from hearthlog.analyzer.evaluation import grid_search
+    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    chosen, by = chosen_method(method), _kind(folds)
-    segments = _segments(data, scenario, chosen)
-    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        tried = search(segments, chosen.variations(), by, report)
+    by, chosen = _kind(folds), chosen_method(method)
+    with joblib_on(scheduler):
+        segments = _segments(data, scenario, chosen)
+        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
+            tried = grid_search.search(segments, chosen.variations(), by, report)
     if as_json:
-        found = [one.method.parameters | asdict(one.scores) for one in tried]
-        _print_json({"scenario": scenario, "method": method, "by": folds, "tried": found})
+        rows = [one.method.parameters | asdict(one.scores) for one in tried]
+        _print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
         return
     print(
         f"method {method}, scenario {scenario}: {len(segments)} segments of "
         f"{chosen.features.window_seconds:g} s, folds by {folds}\n"
     )
-    print(*search_table(tried), sep="\n")
+    print_search(tried)
     best = tried[0].method.parameters
     options = "".join(f" --{name} {value:g}" for name, value in best.items())
     print(f"\nhearthlog train --method {method}{options} …")
+
+
+@evaluate.command()
+def adaptation(
+    method: _Method = "bands",
+    *,
+    data: Clips,
+    scenario: _Scenario,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Show how F1 grows with corrected segments of a home.
+
+    Each collection of the clips stands for a home once, and the others are learned from.
+    """
+    from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
+    from hearthlog.analyzer.workers.parallel import joblib_on
+
+    chosen = chosen_method(method)
+    with joblib_on(scheduler):
+        segments = _segments(data, scenario, chosen)
+        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
+            curve = adaptation_curve(segments, chosen, report)
+    if as_json:
+        _print_json({"scenario": scenario, "method": method} | curve._asdict())
+        return
+    window = f"{chosen.features.window_seconds:g} s"
+    print(f"macro F1 after so many corrected segments of {window}\n")
+    curves = curve.collections | {"mean": curve.mean}
+    print_table(
+        ("collection left out", *map(str, curve.corrected)),
+        [(name, *(f"{value:.3f}" for value in row)) for name, row in curves.items()],
+    )
 
 
 def _kind(folds: str) -> "Kind":
@@ -235,95 +291,23 @@ def _kind(folds: str) -> "Kind":
     return kinds[0]
 
 
-def _evaluate_adaptation(data: Path, scenario: str, method: str, *, as_json: bool) -> None:
-    from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
-
-    chosen = chosen_method(method)
-    segments = _segments(data, scenario, chosen)
-    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        found = adaptation_curve(segments, chosen, report)
-    if as_json:
-        _print_json({"scenario": scenario, "method": method} | found._asdict())
-        return
-    width = max(map(len, (*found.collections, "collection left out")))
-    window = f"{chosen.features.window_seconds:g} s"
-    print(f"macro F1 after so many corrected segments of {window}\n")
-    print(f"{'collection left out':{width}}", *(f"{count:6}" for count in found.corrected))
-    for name, row in (found.collections | {"mean": found.mean}).items():
-        print(f"{name:{width}}", *(f"{value:6.3f}" for value in row))
-
-
-def _segments(data: Path, scenario: str, method: "Method") -> "Dataset":
+def _segments(data: Path, scenario: str, method: "learning.Method") -> "Dataset":
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
 
-    chosen = load_scenario(scenario)
-    clips = read_manifest(data / "manifest.csv" if data.is_dir() else data, chosen.labels)
+    classes = load_scenario(scenario)
+    clips = read_manifest(manifest_path(data), classes.labels)
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        return build_dataset(clips, chosen, report, features=method.features)
+        return build_dataset(clips, classes, report, features=method.features)
 
 
-def _evaluate_log(
-    log: Path, reference: str, topic: str | None, plot: Path | None, *, as_json: bool
-) -> None:
-    from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
-    from hearthlog.analyzer.logs.labelling import read_labelled
-
-    labelled = read_labelled(log, topic)
-    wanted = read_reference(reference, log, labelled.microphone)
-    found = compare(wanted, labelled.labelling, labelled.classes)
-    if plot is not None:
-        _save_plot(plot, f"{labelled.topic} of {log} against {reference}", found.scores, ())
-    if as_json:
-        scores = asdict(found.scores)
-        frames = scores.pop("segments")
-        _print_json(
-            {"log": str(log), "topic": labelled.topic, "reference": reference, "frames": frames}
-            | scores
-            | asdict(found.detections)
-            | {
-                "reference_seconds": found.reference_seconds,
-                "evaluated_seconds": found.evaluated_seconds,
-                "ambiguous_seconds": found.ambiguous_seconds,
-                "unknown_labels": dict(found.unknown_labels),
-            }
-        )
-    else:
-        blocks = f"{found.scores.groups} block{'s' if found.scores.groups > 1 else ''} of time"
-        print(
-            f"{labelled.topic}: {found.evaluated_seconds:.1f} s are labelled of the "
-            f"{found.reference_seconds:.1f} s of the reference; frames of 50 ms, "
-            f"{blocks}\n"
-        )
-        _print_tables(found.scores, found.detections)
-        if found.ambiguous_seconds:
-            print(f"\n{found.ambiguous_seconds:.1f} s have two labels in the reference", end="")
-            print(": left out of the scores of frames")
-    for line in _log_warnings(labelled.unfinished, found.unknown_labels):
-        tell(line)
-    if labelled.unfinished or found.unknown_labels:
-        raise typer.Exit(3)
-
-
-def _log_warnings(unfinished: tuple[Path, ...], unknown: Any) -> list[str]:
-    from hearthlog.analyzer.evaluation.table import shown
-
-    lines = [f"unfinished, read up to the last whole chunk: {path}" for path in unfinished]
-    if unknown:
-        most = sorted(unknown.items(), key=lambda item: -item[1])[:10]
-        names = ", ".join(f"{shown(name)} ({seconds:.1f} s)" for name, seconds in most)
-        more = f" and {len(unknown) - len(most)} more" if len(unknown) > len(most) else ""
-        lines.append(f"the log does not know these labels of the reference: {names}{more}")
-    return lines
-
-
-def _print_tables(scores: "Scores", detections: "Detections | None") -> None:
-    from hearthlog.analyzer.evaluation.table import class_table, confusion_table
-
-    print(*class_table(scores, detections), sep="\n")
-    print()
-    print(*confusion_table(scores), sep="\n")
+def _unknown_text(seconds_of: Any) -> str:
+    """Name the labels that only the reference has, those of the longest time first."""
+    most = sorted(seconds_of.items(), key=lambda item: -item[1])[:_MOST_NAMED]
+    names = ", ".join(f"{shortened(name, NAME_WIDTH)} ({seconds:.1f} s)" for name, seconds in most)
+    more = f" and {len(seconds_of) - len(most)} more" if len(seconds_of) > len(most) else ""
+    return f"the log does not know these labels of the reference: {names}{more}"
 
 
 def _print_json(result: dict[str, Any]) -> None:
@@ -340,7 +324,8 @@ def _check_plot(path: Path | None) -> None:
     check_new(path)
 
 
-def _save_plot(path: Path, title: str, scores: "Scores", bins: "list[Bin] | tuple[()]") -> None:
+def _save_plot(path: Path | None, title: str, scores: "Scores", bins: "Sequence[Bin]" = ()) -> None:
     from hearthlog.analyzer.evaluation.plot import save_plot
 
-    save_plot(path, title, scores, bins)
+    if path is not None:
+        save_plot(path, title, scores, bins)

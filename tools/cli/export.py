@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from hearthlog.tools.cli.selection import End, Logs, Start, Topics, report_unfinished, wrong_use
+from hearthlog.tools.cli.options import End, Logs, Start, Topics
+from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
 _FORMATS = ("parquet", "csv", "npz", "wav", "txt", "bag", "rosbag2")
@@ -60,4 +61,4 @@ def export(
     with share_done("exporting") as progress:
         save(selection, output, form, progress, folder=not one_file)
     print(output)
-    report_unfinished(selection)
+    end_with_warnings(unfinished_lines(selection.unfinished))

@@ -1,18 +1,16 @@
 """`hearthlog info`: what is in a log, or in a folder of logs."""
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.selection import log_location
-from hearthlog.tools.cli.text import PLAIN_WIDTH, first_of, moment, number, tell
+from hearthlog.tools.cli.options import Json, Log
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import Summary
@@ -21,33 +19,17 @@ _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/Diagnostic
 
 
 def info(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            help="A log, or a folder of logs, or a URL such as s3://bucket/home.",
-            parser=log_location,
-        ),
-    ],
+    path: Log,
     *,
-    catalog: Annotated[
-        bool,
-        typer.Option(
-            "--catalog",
-            help="Write FOLDER/catalog.parquet, a row a file, and show the homes in the folder. "
-            "Files that are as it says already are not read again.",
-        ),
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    catalog: Annotated[bool, typer.Option("--catalog", hidden=True)] = False,
+    as_json: Json = False,
 ) -> None:
     """Show what is in a log: span, topics, rates, gaps, labels, model, sizes.
 
-    Exit status 3: a file is unfinished or damaged, or (without --catalog) sound is missing.
+    Exit status 3: a file is unfinished or damaged, or sound is missing.
     """
     if catalog:
-        from hearthlog.tools.cli.catalog import make_catalog
-
-        make_catalog(path, as_json=as_json)
-        return
+        wrong_use("say `hearthlog catalog FOLDER`")
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.schemas.logs.files import find_logs
     from hearthlog.tools.cli.progress import track
@@ -122,36 +104,24 @@ def _health(summary: "Summary") -> dict[str, str] | None:
 
 
 def _print(summary: "Summary") -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    width = None if sys.stdout.isatty() else PLAIN_WIDTH
-    console = Console(highlight=False, markup=False, emoji=False, soft_wrap=True, width=width)
-
-    def show(table: Table) -> None:
-        if table.rows:
-            console.print(table, soft_wrap=False)
-
-    for line in _lines(summary):
-        console.print(printable(line))
-    topics = Table("topic", "type", "messages", "per second", "MB raw", box=None)
-    for name, topic in sorted(summary.topics.items()):
-        encoding = "" if topic.encoding == "cdr" else f" ({topic.encoding})"
-        size = "-" if topic.bytes is None else f"{topic.bytes / 1e6:.2f}"
-        count, rate = str(topic.messages), f"{topic.rate:.3g}"
-        topics.add_row(printable(name), printable(topic.type + encoding), count, rate, size)
-    show(topics)
-    labels = Table("microphone", "label", "minutes", "segments", box=None)
-    for microphone, label, seconds, segments in _label_rows(summary):
-        minutes = f"{seconds / 60:.2f}"
-        labels.add_row(printable(microphone), printable(label), minutes, str(segments))
-    show(labels)
-    for line in _gap_lines(summary):
-        console.print(printable(line))
+    print_lines(_lines(summary))
+    topics = [
+        (
+            name,
+            topic.type if topic.encoding == "cdr" else f"{topic.type} ({topic.encoding})",
+            str(topic.messages),
+            f"{topic.rate:.3g}",
+            "-" if topic.bytes is None else f"{topic.bytes / 1e6:.2f}",
+        )
+        for name, topic in sorted(summary.topics.items())
+    ]
+    print_table(("topic", "type", "messages", "per second", "MB raw"), topics, words=2)
+    print_table(("microphone", "label", "minutes", "segments"), _label_rows(summary), words=2)
+    print_lines(_gap_lines(summary))
 
 
 def _lines(summary: "Summary") -> Iterator[str]:
-    """Say what the files are, and what they say of themselves."""
+    """Describe the files, by what they contain and by what their metadata says."""
     chunks = f", {number(summary.chunks, 'chunk')}" if summary.chunks else ""
     ratio = summary.compression_ratio
     packed = f", compressed {ratio:.2f} to 1" if ratio else ""
@@ -161,14 +131,16 @@ def _lines(summary: "Summary") -> Iterator[str]:
     else:
         start, end = map(moment, summary.span)
         yield f"{start} to {end} ({_duration(summary.seconds)})"
-    about = {
+    origins = {
         "written by": summary.libraries,
         "profile": summary.profiles,
         "metadata": summary.metadata,
         "schema version": summary.schema_versions,
         "attachments": summary.attachments,
     }
-    yield "; ".join(f"{what} {', '.join(sorted(names))}" for what, names in about.items() if names)
+    yield "; ".join(
+        f"{what} {', '.join(sorted(names))}" for what, names in origins.items() if names
+    )
     yield from first_of("unfinished", [str(path) for path in summary.unfinished])
     yield from first_of("layer", [str(path) for path in summary.layers])
     for stream in summary.streams:
@@ -193,12 +165,12 @@ def _gap_lines(summary: "Summary") -> Iterator[str]:
     yield from first_of("gap", lines)
 
 
-def _label_rows(summary: "Summary") -> Iterator[tuple[str, str, float, int]]:
+def _label_rows(summary: "Summary") -> Iterator[tuple[str, ...]]:
     for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
         seconds = summary.label_seconds.get(microphone, Counter())
         segments = summary.segments.get(microphone, Counter())
         for label in dict.fromkeys([*(name for name, _ in seconds.most_common()), *segments]):
-            yield microphone, label, seconds[label], segments[label]
+            yield microphone, label, f"{seconds[label] / 60:.2f}", str(segments[label])
 
 
 def _duration(seconds: float) -> str:

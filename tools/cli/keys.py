@@ -31,10 +31,10 @@ def _read_terminal(keys: "SimpleQueue[str]") -> None:
 
 
 def _read_lines(keys: "SimpleQueue[str]") -> None:
-    found = False
+    pressed = False
     for line in sys.stdin:
         for key in line.strip():
-            found = True
+            pressed = True
             keys.put(key)
-    if found:
+    if pressed:
         keys.put("q")

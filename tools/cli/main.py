@@ -16,6 +16,7 @@ from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.cat import cat
+from hearthlog.tools.cli.catalog import catalog
 from hearthlog.tools.cli.cut import cut
 from hearthlog.tools.cli.demo import demo
 from hearthlog.tools.cli.devices import devices
@@ -47,6 +48,7 @@ for verb in (
     record,
     devices,
     info,
+    catalog,
     cat,
     export,
     merge,
@@ -55,7 +57,6 @@ for verb in (
     recover,
     train,
     enrol,
-    evaluate,
     diff,
     review,
     watch,
@@ -66,11 +67,12 @@ for verb in (
 ):
     app.command()(verb)
 app.add_typer(annotate, name="annotate")
+app.add_typer(evaluate, name="evaluate")
 app.add_typer(models, name="models")
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(shown: bool) -> None:
+    if shown:
         print(f"hearthlog {__version__}")
         raise typer.Exit
 
@@ -136,9 +138,9 @@ def _warnings_shown() -> Iterator[set[str]]:
     warned: set[str] = set()
     others = warnings.showwarning
 
-    def show(message: Any, *about: Any, **more: Any) -> None:
+    def show(message: Any, *arguments: Any, **options: Any) -> None:
         if not isinstance(message, HearthlogWarning):
-            others(message, *about, **more)
+            others(message, *arguments, **options)
         elif str(message) not in warned:
             warned.add(str(message))
             tell(f"{message.where}: {message}")

@@ -1,18 +1,10 @@
 """`hearthlog merge`: several logs in one."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
-from hearthlog.tools.cli.selection import Logs, check_log_name, report_unfinished
+from hearthlog.tools.cli.options import Logs, NewLog, check_log_name
+from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines
 
 
-def merge(
-    logs: Logs,
-    *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Log to make, *.mcap.")],
-) -> None:
+def merge(logs: Logs, *, output: NewLog) -> None:
     """Put logs together, message for message, in the order of their log times.
 
     Exit status 3: a log is unfinished; what is there of it is part of the output.
@@ -26,4 +18,4 @@ def merge(
     with share_done("merging") as progress:
         merge_logs(selection, output, progress)
     print(output)
-    report_unfinished(selection)
+    end_with_warnings(unfinished_lines(selection.unfinished))

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.text import wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.training.method import Method
@@ -13,11 +13,11 @@ def chosen_method(name: str, **parameters: float | None) -> "Method":
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.methods import method_named
 
-    given = {key: value for key, value in parameters.items() if value is not None}
-    for key, value in given.items():
+    chosen = {key: value for key, value in parameters.items() if value is not None}
+    for key, value in chosen.items():
         if not 0 < value < float("inf"):
             wrong_use(f"--{key} {value:g}: it must be more than 0")
     try:
-        return method_named(name).with_parameters(given)
+        return method_named(name).with_parameters(chosen)
     except DataError as error:
-        wrong_use(f"--method {name}: {error}")
+        wrong_use(str(error))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.tools.cli.text import number, tell
 from hearthlog.tools.cli.times import parse_time
 
 if TYPE_CHECKING:
@@ -84,8 +85,8 @@ def record(
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
     (microphone,) = settings.microphone
     stop = Flag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, lambda *_: stop.set())
     asked = _look_at_hangup(stop)
     if files:
         begin = start_time(start, files[0])
@@ -96,7 +97,7 @@ def record(
         raise typer.BadParameter("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
-            typer.echo("hearthlog: listening; Ctrl-C completes the log", err=True)
+            tell("listening; Ctrl-C completes the log")
         recording = record_microphone(settings, microphone, stop, asked)
     _say(recording)
 
@@ -108,13 +109,12 @@ def _say(recording: "Recording") -> None:
     damaged = [old for old in recording.recovered if old.damage]
     for old in recording.recovered:
         if old.completed:
-            typer.echo(f"hearthlog: completed {old.path}, which was left unfinished", err=True)
+            tell(f"completed {old.path}, which was left unfinished")
     for old in damaged:
-        typer.echo(f"hearthlog: {old.damage}", err=True)
+        tell(str(old.damage))
     if recording.gaps:
-        typer.echo(
-            f"hearthlog: {recording.gaps} gaps, {recording.frames_lost} frames not heard", err=True
-        )
+        gaps, frames = number(recording.gaps, "gap"), number(recording.frames_lost, "frame")
+        tell(f"{gaps}, {frames} not heard")
     if damaged or recording.gaps or recording.models_refused:
         raise typer.Exit(3)
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.tools.cli.options import Json
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def recover(
             "--in-place", help="Give it the log's own name; that one is kept as *.damaged."
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Save what is whole in a log that was cut or damaged, and say what is lost.
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.selection import Logs, log_location
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location
+from hearthlog.tools.cli.text import number, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.relabel.run import Relabelled
@@ -25,11 +25,8 @@ def relabel(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes; as many as there are cores by default.")
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(help="Dask scheduler, as tcp://host:port, whose workers do it instead."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
 ) -> None:
     """Label every frame of logs anew, in layers beside them.
 
@@ -49,46 +46,42 @@ def relabel(
         open_workers(count, scheduler) as pool,
         share_done("labelling logs", announce=True) as report,
     ):
-        found = run(logs, loaded, model.resolve(), pool, report)
+        result = run(logs, loaded, model.resolve(), pool, report)
     if as_json:
-        print(json.dumps(_as_json(found, loaded.name, loaded.sha256), indent=2))
+        print(json.dumps(_as_json(result, loaded.name, loaded.sha256), indent=2))
     else:
-        _print(found, loaded.name)
-    if not (found.layers or found.current):
+        _print(result, loaded.name)
+    if not (result.layers or result.current):
         raise typer.Exit(1)
-    if found.failed or found.lost:
+    if result.failed or result.lost:
         raise typer.Exit(3)
 
 
-def _print(found: "Relabelled", model: str) -> None:
-    print(f"{_number(len(found.layers), 'layer')} of {_number(found.frames, 'frame')} by {model}")
-    if found.current:
-        print(f"{_number(len(found.current), 'layer')} there already")
-    if found.active:
-        print(f"{_number(len(found.active), 'log')} still being written")
-    for what, logs in (("not relabelled", found.failed), ("partly relabelled", found.lost)):
+def _print(result: "Relabelled", model: str) -> None:
+    print(f"{number(len(result.layers), 'layer')} of {number(result.frames, 'frame')} by {model}")
+    if result.current:
+        print(f"{number(len(result.current), 'layer')} there already")
+    if result.active:
+        print(f"{number(len(result.active), 'log')} still being written")
+    for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         for log, why in sorted(logs.items())[:_SHOWN]:
-            tell(f"{what}: {_about(log, why)}")
+            tell(f"{what}: {_reason(log, why)}")
         if len(logs) > _SHOWN:
             tell(f"{what}: {len(logs) - _SHOWN} more; see --json")
 
 
-def _about(log: Path, why: str) -> str:
+def _reason(log: Path, why: str) -> str:
     return why if str(log.parent) in why else f"{log}: {why}"
 
 
-def _as_json(found: "Relabelled", model: str, sha256: str) -> dict[str, object]:
+def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:
     return {
         "model": model,
         "model_sha256": sha256,
-        "frames": found.frames,
-        "layers": [str(layer) for layer in sorted(found.layers)],
-        "current": [str(layer) for layer in sorted(found.current)],
-        "active": [str(log) for log in found.active],
-        "lost": {str(log): why for log, why in found.lost.items()},
-        "failed": {str(log): why for log, why in found.failed.items()},
+        "frames": result.frames,
+        "layers": [str(layer) for layer in sorted(result.layers)],
+        "current": [str(layer) for layer in sorted(result.current)],
+        "active": [str(log) for log in result.active],
+        "lost": {str(log): why for log, why in result.lost.items()},
+        "failed": {str(log): why for log, why in result.failed.items()},
     }
-
-
-def _number(count: int, what: str) -> str:
-    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.options import Json
+from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import Origin
@@ -67,7 +68,7 @@ def replay(
     loop: Annotated[
         bool, typer.Option("--loop", "-l", help="Begin anew at the end, until Ctrl-C.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what came of it as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Run logs through the pipeline again: with the recorded model, bit for bit as recorded.
 
@@ -78,13 +79,10 @@ def replay(
     from hearthlog.analyzer.replay.replay import LogSet
     from hearthlog.schemas.logs.files import find_logs
 
-    if not 0 <= start_offset < math.inf:
-        wrong_use(f"--start-offset {start_offset}: not a number of seconds from 0")
-    if playback_duration is not None and not 0 < playback_duration < math.inf:
-        wrong_use(f"--playback-duration {playback_duration}: not a number of seconds above 0")
+    _check_span(start_offset, playback_duration)
     if loop and output is not None:
         wrong_use("--loop writes no log: it would be written again and again; leave out --output")
-    wanted = Wanted(
+    options = Wanted(
         kind="audio" if source is Source.clips else "features",
         output=output,
         start_offset=start_offset,
@@ -93,14 +91,14 @@ def replay(
         loop=loop,
     )
     _check_output(output, path)
-    logs = LogSet(find_logs(path), wanted.kind)
+    logs = LogSet(find_logs(path), options.kind)
     models = _Models(model, (Path(), Path("models"), path if path.is_dir() else path.parent))
-    models.report(logs.chosen(wanted))
+    models.report(logs.chosen(options))
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     began = time.monotonic()
-    result = _run(logs, replace(wanted, model=models), stop)
+    result = _run(logs, replace(options, model=models), stop)
     took = time.monotonic() - began
     if as_json:
         print(json.dumps(_as_json(result, took), indent=2))
@@ -108,12 +106,13 @@ def replay(
         print(*_figures(result, took), sep="\n")
     else:
         _print_output(result, output)
-        typer.echo("\n".join(f"hearthlog: {line}" for line in _figures(result, took)), err=True)
+        for line in _figures(result, took):
+            tell(line)
     warnings = _warnings(result)
     if models.are_recorded and not warnings and not result.compared.identical:
         warnings.append("with the recorded model not all is as recorded: is this another version?")
     for line in warnings:
-        typer.echo(f"hearthlog: {line}", err=True)
+        tell(line)
     if warnings or models.are_lacking:
         raise typer.Exit(3)
 
@@ -129,7 +128,7 @@ class _Models:
 
         self._given = None if given is None else load_model(given)
         self._folders = folders
-        self._found: dict[tuple[str, str], Model | None] = {}
+        self._models: dict[tuple[str, str], Model | None] = {}
         self.are_recorded = True
         self.are_lacking = False
 
@@ -140,9 +139,9 @@ class _Models:
         if self._given is not None:
             return self._given
         key = origin.model, origin.model_sha256
-        if key not in self._found:
-            self._found[key] = find_model(*key, self._folders) if origin.model_sha256 else None
-        return self._found[key]
+        if key not in self._models:
+            self._models[key] = find_model(*key, self._folders) if origin.model_sha256 else None
+        return self._models[key]
 
     def report(self, origins: Sequence["Origin"]) -> None:
         """Say where the model is not the recorded one."""
@@ -161,7 +160,14 @@ class _Models:
                 what = "which was not found; no labels: give it, or another, with --model"
             else:
                 what = f"replayed with {model.name!r} (sha256 {digest[:12]})"
-            typer.echo(f"hearthlog: {recorded}, {what}", err=True)
+            tell(f"{recorded}, {what}")
+
+
+def _check_span(start_offset: float, duration: float | None) -> None:
+    if not 0 <= start_offset < math.inf:
+        wrong_use(f"--start-offset {start_offset}: not a number of seconds from 0")
+    if duration is not None and not 0 < duration < math.inf:
+        wrong_use(f"--playback-duration {duration}: not a number of seconds above 0")
 
 
 def _parse_rate(text: str) -> float | None:
@@ -194,22 +200,22 @@ def _check_output(output: Path | None, source: Path) -> None:
         check_new(output)
 
 
-def _run(logs: "LogSet", wanted: "Wanted", stop: Flag) -> "Replay":
+def _run(logs: "LogSet", options: "Wanted", stop: Flag) -> "Replay":
     from hearthlog.analyzer.replay.replay import replay as replay_logs
     from hearthlog.tools.cli.progress import share_done
 
-    def run(wanted: "Wanted") -> "Replay":
+    def run(options: "Wanted") -> "Replay":
         with share_done("replaying") as progress:
-            return replay_logs(logs, wanted, stop, progress)
+            return replay_logs(logs, options, stop, progress)
 
-    if wanted.output is None or wanted.output.suffix != ".rrd":
-        return run(wanted)
+    if options.output is None or options.output.suffix != ".rrd":
+        return run(options)
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
 
-    output = wanted.output
+    output = options.output
     with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
-        result = run(replace(wanted, output=Path(folder) / "logs"))
+        result = run(replace(options, output=Path(folder) / "logs"))
         save_timeline(read_timeline(result.logs), output)
     return replace(result, logs=[])
 
@@ -265,9 +271,9 @@ def _warnings(result: "Replay") -> list[str]:
 
 
 def _as_json(result: "Replay", took: float) -> dict[str, object]:
-    found = asdict(result)
+    fields = asdict(result)
     for key in ("sources", "logs", "unfinished"):
-        found[key] = [str(path) for path in found[key]]
-    found["compared"] = {k: v for k, v in found["compared"].items() if not k.startswith("_")}
-    found["compared"]["bit_for_bit"] = result.compared.identical
-    return {"seconds": result.seconds, "took_seconds": took} | found
+        fields[key] = [str(path) for path in fields[key]]
+    fields["compared"] = {k: v for k, v in fields["compared"].items() if not k.startswith("_")}
+    fields["compared"]["bit_for_bit"] = result.compared.identical
+    return {"seconds": result.seconds, "took_seconds": took} | fields

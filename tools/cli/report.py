@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.tools.cli.options import Logs, Timezone
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.selection import Logs, wrong_use
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.text import end_with_warnings, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.home_logs import HomeLogs
@@ -35,10 +35,7 @@ def report(
     labels: Annotated[
         str, typer.Option(help="Which labelling: live, or the model of a relabel layer.")
     ] = "live",
-    timezone: Annotated[
-        str | None,
-        typer.Option(help="Of the home, as Europe/Vienna; by default what the logs say, or UTC."),
-    ] = None,
+    timezone: Timezone = None,
 ) -> None:
     """Write a page and a picture of a day or a week, for a carer.
 
@@ -64,23 +61,20 @@ def report(
         made = make_report(shelf, Period(first, count, zone), page, labels, progress)
     print(made.page)
     print(made.picture)
-    for line in made.losses:
-        tell(line)
-    if made.losses:
-        raise typer.Exit(3)
+    end_with_warnings(made.losses)
 
 
 def _first_day(day: str | None, week: str | None) -> date:
     """Read a day, or find the Monday of a week."""
     option, text = ("--day", day) if week is None else ("--week", week)
     try:
-        found = date.fromisoformat(text or "")
+        start = date.fromisoformat(text or "")
     except ValueError:
-        found = None
-    if found is None or found.year not in _YEARS:
+        start = None
+    if start is None or start.year not in _YEARS:
         example = "2026-03-01" if week is None else "2026-W09, or a day in it"
         wrong_use(f"{option} {text}: not a {option[2:]} such as {example}")
-    return found if week is None else found - timedelta(days=found.weekday())
+    return start if week is None else start - timedelta(days=start.weekday())
 
 
 def _name(shelf: "HomeLogs", first: date, count: int) -> str:

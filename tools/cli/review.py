@@ -13,10 +13,10 @@ import typer
 from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.browser import show_page
 from hearthlog.tools.cli.keys import read_keys
+from hearthlog.tools.cli.options import Microphone, Timezone
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.reviewer import reviewer_name
-from hearthlog.tools.cli.selection import wrong_use
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.text import end_with_warnings, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
@@ -55,17 +55,12 @@ def review(
     labels: Annotated[
         str, typer.Option(help="Labelling to correct: live, or the model of a relabel layer.")
     ] = "live",
-    microphone: Annotated[
-        str | None, typer.Option(help="Its name, where there are several.")
-    ] = None,
+    microphone: Microphone = None,
     reviewer: Annotated[
         str | None, typer.Option(help="Who makes the marks.", show_default="the login name")
     ] = None,
-    timezone: Annotated[
-        str | None,
-        typer.Option(help="Of the home, as Europe/Vienna.", show_default="the logs say it"),
-    ] = None,
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Of the viewer.")] = None,
+    timezone: Timezone = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the viewer.")] = None,
 ) -> None:
     """Show a day or any other span in Rerun, and mark what was heard.
 
@@ -86,10 +81,7 @@ def review(
             timeline = _read(logs, limits, timezone)
             chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
             _show(viewer, timeline, logs, chosen)
-    for loss in timeline.losses:
-        tell(loss)
-    if timeline.losses:
-        raise typer.Exit(3)
+    end_with_warnings(timeline.losses)
 
 
 def _end(number: int, _frame: object) -> None:
@@ -176,8 +168,8 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         if not items:
             viewer.draw_frames(timeline, start, end)
             return
-        heard = timeline.heard[microphone]
-        spans = zip(heard.logs, heard.starts, heard.ends, strict=True)
+        coverage = timeline.heard[microphone]
+        spans = zip(coverage.logs, coverage.starts, coverage.ends, strict=True)
         near = [log for log, first, last in spans if first < end and last > start]
         viewer.draw_close_up(read_timeline(near, start, end, zone=timeline.zone))
 
@@ -215,7 +207,7 @@ def _work(
     from hearthlog.analyzer.review.timeline.model import no_spans
     from hearthlog.schemas.messages.topics import LIVE
 
-    known = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
+    segments = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []
     if choice.queue is not None or labelling != LIVE:
         sources = find_sources(*logs)
@@ -229,20 +221,20 @@ def _work(
         timeline.heard[microphone],
         choice.reviewer,
         labelling.removeprefix("relabel/"),
-        known.get(labelling, no_spans()),
+        segments.get(labelling, no_spans()),
     )
     return items, marking
 
 
-def _microphone(timeline: "Timeline", wanted: str | None) -> str:
+def _microphone(timeline: "Timeline", name: str | None) -> str:
     """Return the microphone whose marks are made; of several the first."""
-    known = ", ".join(timeline.microphones)
-    if wanted is not None and wanted not in timeline.microphones:
-        wrong_use(f"--microphone {wanted}: there is {known}")
-    if wanted is None and len(timeline.microphones) > 1:
-        line = f"marks are of the first microphone of {known}; --microphone chooses another one"
+    names = ", ".join(timeline.microphones)
+    if name is not None and name not in timeline.microphones:
+        wrong_use(f"--microphone {name}: there is {names}")
+    if name is None and len(timeline.microphones) > 1:
+        line = f"marks are of the first microphone of {names}; --microphone chooses another one"
         print(printable(line))
-    return wanted or next(iter(timeline.microphones))
+    return name or next(iter(timeline.microphones))
 
 
 def _classes(timeline: "Timeline", microphone: str) -> list[str]:

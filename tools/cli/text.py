@@ -1,12 +1,21 @@
-"""How numbers, times and lists are printed."""
+"""How results, numbers, times and lists are printed, and what goes to standard error."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import typer
 
 from hearthlog.schemas.text import printable
 
-PLAIN_WIDTH = 160  # where there is no terminal to say how wide it is
 _SHOWN = 10  # of a list
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines whose texts may come from any file."""
+    for line in lines:
+        print(printable(line))
 
 
 def tell(text: str) -> None:
@@ -14,9 +23,29 @@ def tell(text: str) -> None:
     print(f"hearthlog: {printable(text)}", file=sys.stderr)
 
 
+def wrong_use(message: str) -> NoReturn:
+    """End with one line, and the exit status of wrong use."""
+    tell(message)
+    raise typer.Exit(2)
+
+
+def unfinished_lines(paths: Sequence[Path]) -> list[str]:
+    """Say in a line which logs were not completed, if any."""
+    names = ", ".join(map(str, paths))
+    return [f"unfinished, read up to the last whole chunk: {names}"] if names else []
+
+
+def end_with_warnings(lines: Sequence[str]) -> None:
+    """Tell each line; end with exit status 3 if there is one."""
+    for line in lines:
+        tell(line)
+    if lines:
+        raise typer.Exit(3)
+
+
 def number(count: int, what: str) -> str:
     """Say how many there are of something."""
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def moment(stamp: int | None) -> str | None:

@@ -1,20 +1,23 @@
 """`hearthlog train`: labelled sound to a model file."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hearthlog.tools.cli.method import chosen_method
+from hearthlog.tools.cli.options import METHODS, Json, Scheduler, manifest_path
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.scores import print_counts, print_skipped
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.training.dataset import Dataset, Recording
     from hearthlog.analyzer.training.method import Method
-    from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.models.classifiers.description import Amount
     from hearthlog.models.classifiers.model import Model
     from hearthlog.models.features.feature_set import FeatureSet
 
@@ -40,22 +43,20 @@ def train(
     base: Annotated[
         Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
     ] = None,
-    method: Annotated[
-        str, typer.Option(help="bands, or paper: the 42 statistics and SVM of the paper.")
-    ] = "bands",
+    method: Annotated[str, typer.Option(help=METHODS)] = "bands",
     cost: Annotated[
-        float | None, typer.Option(help="Of a wrong segment; evaluate --search finds a good one.")
+        float | None,
+        typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
     ] = None,
     gamma: Annotated[
-        float | None, typer.Option(help="Of the kernel, times the number of inputs; as --cost.")
+        float | None,
+        typer.Option(help="Gamma of the kernel times the number of inputs; as --cost."),
     ] = None,
     smoothing: Annotated[
         str, typer.Option(help="How labels become segments: hmm, or merge (the paper's).")
     ] = "hmm",
-    scheduler: Annotated[
-        str | None, typer.Option(help="Learn on this Dask cluster, as tcp://host:port.")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
 ) -> None:
     """Learn a model from labelled sound, and measure it on sources it has not heard."""
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
@@ -76,9 +77,8 @@ def train(
     save_model(model, output)
     saved = load_model(output)
     if as_json:
-        about = saved.description.model_dump()
         result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
-        print(json.dumps(result | about))
+        print(json.dumps(result | saved.description.model_dump()))
     else:
         _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
@@ -95,9 +95,9 @@ def _learned(
     if smoothing not in SMOOTHINGS:
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
-    clips = [clip for path in data for clip in read_manifest(_manifest(path), chosen.labels)]
+    clips = [clip for path in data for clip in read_manifest(manifest_path(path), chosen.labels)]
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        recordings = _heard_at(home, method.features)
+        recordings = _home_recordings(home, method.features)
         segments = build_dataset(clips, chosen, report, recordings, method.features)
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
@@ -107,31 +107,20 @@ def _learned(
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import cut_recordings
     from hearthlog.analyzer.training.home_data import home_sequences
+    from hearthlog.analyzer.training.scenario import scenario_of
     from hearthlog.analyzer.training.train import adapt_model
     from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(base)
     features = feature_set(model.description.feature_set)
-    segments = cut_recordings(_heard_at(home, features), _scenario(model), features)
+    segments = cut_recordings(_home_recordings(home, features), scenario_of(model), features)
     with share_done(f"learning from {len(segments)} segments of the home besides", announce=True):
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         return adapt_model(model, segments, sequences), segments
 
 
-def _scenario(model: "Model") -> "Scenario":
-    from hearthlog.analyzer.training.scenario import Scenario
-
-    about = model.description
-    classes = {name: tuple(labels) for name, labels in about.scenario.items()}
-    return Scenario(about.scenario_name, classes)
-
-
-def _manifest(path: Path) -> Path:
-    return path / "manifest.csv" if path.is_dir() else path
-
-
-def _heard_at(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
+def _home_recordings(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
     from hearthlog.analyzer.training.home_data import home_recordings
 
     for folder in folders:
@@ -141,44 +130,38 @@ def _heard_at(folders: list[Path], features: "FeatureSet") -> Iterator["Recordin
 def _warn_of_few(segments: "Dataset") -> None:
     for name, amount in segments.amounts.items():
         if amount.sources < _FEW_SOURCES or amount.seconds < _FEW_SECONDS:
-            typer.echo(
-                f"hearthlog: class {name} has {amount.sources} sources, {amount.seconds:.0f} s: "
-                f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s",
-                err=True,
+            tell(
+                f"class {name} has {amount.sources} sources, {amount.seconds:.0f} s: "
+                f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s"
             )
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
     from hearthlog.models.classifiers.classifier import classifier_kind
 
-    about, metrics = model.description, model.description.metrics
-    width = max(len(name) for name in (*about.classes, "class"))
-    print(f"{'class':{width}}  sources  seconds  segments  precision  recall     F1")
-    for name in about.classes:
-        amount, result = about.training_data.classes[name], metrics.classes[name]
-        print(
-            f"{name:{width}}  {amount.sources:7}  {amount.seconds:7.0f}  {amount.segments:8}  "
-            f"{result.precision:9.3f}  {result.recall:6.3f}  {result.f1:5.3f}"
-        )
-    print(f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error ", end="")
-    print(f"{metrics.expected_calibration_error:.3f}", end="")
-    print(f" (cross-validated, {metrics.folds} folds, sources never split)")
-    parameters = [f"{name} {value:.4g}" for name, value in about.parameters.items()]
-    print(*parameters, classifier_kind(about.kind).summary(model), sep=", ", end="\n\n")
-    print("confusion: true class in rows, predicted in columns")
-    size = max(len(str(value)) for row in metrics.confusion for value in row) + 2
-    for name, row in zip(about.classes, metrics.confusion, strict=True):
-        print(f"{name:{width}}", *(f"{value:{size}}" for value in row), sep="")
-    if about.training_data.home:
-        print("\nlearned from the home besides (the figures above are those before)")
-    for name, amount in about.training_data.home.items():
-        if amount.segments:
-            print(f"{name:{width}}  {amount.sources:7}  {amount.seconds:7.1f}  {amount.segments:8}")
-    _print_skipped(segments.skipped)
+    description, metrics = model.description, model.description.metrics
+    data = description.training_data
+    amounts = "sources", "seconds", "segments"
+    rows = []
+    for name in description.classes:
+        amount, result = data.classes[name], metrics.classes[name]
+        figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
+        rows.append((name, *_amounts(amount), *figures))
+    print_table(("class", *amounts, "precision", "recall", "F1"), rows)
+    print(
+        f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error "
+        f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "
+        "sources never split)"
+    )
+    parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]
+    print(*parameters, classifier_kind(description.kind).summary(model), sep=", ", end="\n\n")
+    print_counts(description.classes, metrics.confusion)
+    if data.home:
+        print("\nalso learned from the home (the figures above are those without it)")
+        rows = [(name, *_amounts(one)) for name, one in data.home.items() if one.segments]
+        print_table(("class", *amounts), rows)
+    print_skipped(segments.skipped)
 
 
-def _print_skipped(skipped: Mapping[str, int]) -> None:
-    if skipped:
-        print("\nrecordings left out")
-    for reason, count in skipped.items():
-        print(f"{count:6}  {reason}")
+def _amounts(amount: "Amount") -> tuple[str, str, str]:
+    return str(amount.sources), f"{amount.seconds:.1f}", str(amount.segments)

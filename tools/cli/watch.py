@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.tools.cli.browser import show_page
-from hearthlog.tools.cli.selection import wrong_use
+from hearthlog.tools.cli.options import Timezone
+from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.review.viewer.live import LiveServer
@@ -36,10 +37,7 @@ def watch(
         str, typer.Option(help="With --serve: address of this machine to listen on.")
     ] = _LOOPBACK,
     minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 5,
-    timezone: Annotated[
-        str | None,
-        typer.Option(help="Of the home, as Europe/Vienna.", show_default="the logs say it"),
-    ] = None,
+    timezone: Timezone = None,
 ) -> None:
     """Show in Rerun what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.
 
@@ -67,7 +65,7 @@ def watch(
             viewer = opened.enter_context(_open(server.url, port, web=web))
             Thread(target=_wait_until_closed, args=(viewer, stop), daemon=True).start()
         if newest is None:
-            typer.echo(f"hearthlog: no log in {logs} yet; waiting for a recorder", err=True)
+            tell(f"no log in {logs} yet; waiting for a recorder")
         start = 0 if newest is None else newest - minutes * 60_000_000_000
         troubled = _follow(logs, start, timezone, server, stop)
         if viewer is not None:
@@ -99,12 +97,11 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
 
 
 def _say_where(url: str, bind: str) -> None:
-    typer.echo(f"hearthlog: look with: rerun --bind {_LOOPBACK} --connect {url}", err=True)
+    tell(f"look with: rerun --bind {_LOOPBACK} --connect {url}")
     if bind != _LOOPBACK:
-        typer.echo(
-            f"hearthlog: listening on {bind}: whoever reaches this port sees what is heard here; "
-            "without --bind, only those who log in to this machine do",
-            err=True,
+        tell(
+            f"listening on {bind}: whoever reaches this port sees what is heard here; "
+            "without --bind, only those who log in to this machine do"
         )
 
 
@@ -125,18 +122,18 @@ def _follow(
 
     told: deque[str] = deque(maxlen=_MOST_TROUBLES)
 
-    def tell(error: LogError) -> None:
+    def tell_once(error: LogError) -> None:
         if str(error) not in told:
             told.append(str(error))
-            typer.echo(f"hearthlog: {error}", err=True)
+            tell(str(error))
 
     live: Live | None = None
-    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell):
+    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell_once):
         live = live or Live(zone_of([logs], timezone))
         try:
             server.show(live.take(path, batch))
         except LogError as error:
-            tell(error)
+            tell_once(error)
         if stop.is_set():
             break
     return bool(told)
