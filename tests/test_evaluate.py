@@ -447,7 +447,7 @@ def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
         (("method", "--data", "d", "--scenario", "general", "--plot", "p.pdf"), 2, "*.png"),
     )
     for words, status, said in cases:
-        result = hearthlog("evaluate", "model", *words)
+        result = hearthlog("evaluate", *words)
         assert result.returncode == status
         assert said in result.stderr
 

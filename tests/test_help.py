@@ -62,8 +62,8 @@ def test_the_help_of_a_verb_shows_the_defaults_that_it_documents(verb):
         ("record", "the first file's modification time"),
         ("recover", "LOG.recovered.mcap"),
         ("review", "the login name"),
-        ("review", "the logs say it"),
-        ("watch", "the logs say it"),
+        ("review", "what the logs say, or UTC"),
+        ("watch", "what the logs say, or UTC"),
         ("models list", "that of the configured model, else models"),
     ],
 )
