@@ -11,6 +11,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from hearthlog.analyzer.logs.health import Status, statuses_of
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -92,16 +93,6 @@ class GapSummary:
     frames_lost: int
 
 
-@dataclass(frozen=True)
-class Health:
-    """What a diagnostic message said, and when (ns of UTC); level 0 is well, higher is worse."""
-
-    level: int
-    time: int
-    name: str
-    message: str
-
-
 @dataclass
 class Summary:
     """What was found in some logs.
@@ -132,7 +123,7 @@ class Summary:
     gaps : list of GapSummary
     streams : list of dict
         What the files say of themselves: microphone, device, feature set, model.
-    health : Health or None
+    health : Status or None
         The worst that was said, and of that the last.
     """
 
@@ -154,7 +145,7 @@ class Summary:
     segments: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[GapSummary] = field(default_factory=list)
     streams: list[dict[str, Any]] = field(default_factory=list)
-    health: Health | None = None
+    health: Status | None = None
 
     @property
     def span(self) -> Span | None:
@@ -331,10 +322,8 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
             if stream not in summary.streams:
                 summary.streams.append(stream)
     else:
-        for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
-            for status in statuses:
-                said = Health(status["level"], time, status["name"], status["message"])
-                summary.health = _worse(summary.health, said)
+        for status in statuses_of(columns):
+            summary.health = _worse(summary.health, status)
 
 
 def _note_marks(seconds: Counter[str], columns: Columns) -> None:
@@ -343,10 +332,10 @@ def _note_marks(seconds: Counter[str], columns: Columns) -> None:
         seconds[label] += duration
 
 
-def _worse(one: Health | None, other: Health | None) -> Health | None:
+def _worse(one: Status | None, other: Status | None) -> Status | None:
     """Return the worse of two, of equal ones the later."""
-    said = [health for health in (one, other) if health is not None]
-    return max(said, key=lambda health: (health.level, health.time), default=None)
+    statuses = [status for status in (one, other) if status is not None]
+    return max(statuses, key=lambda status: (status.level, status.time), default=None)
 
 
 def _hull(one: Span | None, other: Span | None) -> Span | None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from hearthlog.analyzer.logs.health import MicrophoneState, lasting
 from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans, SoundClip, no_spans
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -57,15 +58,10 @@ def runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
         yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
 
 
-def lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
+def trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans:
     """Let a trouble last until the next message says that it is over, or that it is another."""
-    changes = [
-        (stamp, text)
-        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
-        if text != before
-    ]
-    stops = [*(stamp for stamp, _ in changes[1:]), end]
-    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
+    changes = [(state.time, state.text or None) for state in states]
+    spans = [span for span in lasting(changes, end) if span[0] < span[1]]
     if not spans:
         return no_spans()
     starts, ends, texts = zip(*spans, strict=True)
