@@ -17,7 +17,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
 from hearthlog.analyzer.logs.health import Status
-from hearthlog.analyzer.logs.summary import GapSummary, summarise
+from hearthlog.analyzer.logs.summarise import summarise
+from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Microphone, Settings
