@@ -2,15 +2,20 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-wheel test-lowest test-3.13 check bench dist clean
+.PHONY: demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history dist clean
 
 # Sets up, simulates a home, learns, records, labels, and writes demo/day.rrd to look at.
 demo: $(VENV)/.analyzer
 	rm -rf demo
 	$(BIN)/hearthlog demo --output demo
 
+# SEED=7 tries other examples of what tests draw at random; without it they are the same every time.
 test: $(VENV)/.dev
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 $(if $(SEED),--hypothesis-seed=$(SEED))
+
+# A little of every room, in two minutes.
+test-fast: $(VENV)/.dev
+	$(BIN)/pytest -n 2 -m fast $(if $(SEED),--hypothesis-seed=$(SEED))
 
 # Every verb of the wheel, in an environment of its own: without Rerun, and with it.
 test-wheel: dist
@@ -45,11 +50,15 @@ check: $(VENV)/.dev build/checked/hearthlog
 
 # The folders under the name they are installed by, for the linters, which follow no finder of
 # setuptools: links, so they are what is edited. Point the type checker of an editor here too.
-build/checked/hearthlog: Makefile
+build/checked/hearthlog: Makefile $(wildcard tools/package/*.py)
 	mkdir -p $@
 	ln -sfn $(addprefix $(CURDIR)/,analyzer models recorder schemas tools) $@
-	ln -sfn $(CURDIR)/tools/package/__init__.py $(CURDIR)/tools/package/py.typed $@
+	ln -sfn $(filter-out %/__pycache__,$(wildcard $(CURDIR)/tools/package/*)) $@
 	touch $@
+
+# The documentation site, from docs/ and the docstrings of the public API.
+docs: $(VENV)/.dev
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -d build/doctrees docs build/site
 
 # The sdist, and the wheel that is built from it.
 dist: $(VENV)/.dev
@@ -58,6 +67,11 @@ dist: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.bench
+
+# The same, kept, and the course of the figures drawn anew.
+bench-history: $(VENV)/.dev
+	$(BIN)/python -m hearthlog.tools.bench --record docs/benchmarks.jsonl
+	$(BIN)/python -m hearthlog.tools.bench.history docs/benchmarks.jsonl docs/benchmarks.svg
 
 $(VENV)/.analyzer: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

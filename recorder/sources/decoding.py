@@ -3,10 +3,12 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import soundfile
 import soxr
+from numpy.typing import NDArray
 
 from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.arrays import Float32
@@ -33,6 +35,39 @@ def read_audio(path: Path) -> Iterator[Float32]:
     """
     with _opened(path) as audio:
         yield from _resampled(_mono_blocks(audio), audio.samplerate)
+
+
+def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
+    """Convert samples of any rate and channel count, to the same bits as those of an audio file.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,) or (n, channels)]
+        Integers of the full range of their type, or floats in full scale, -1 to 1.
+    rate : int
+        Samples per second.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], float32
+        As `read_audio` gives it, in one piece.
+
+    Raises
+    ------
+    SourceError
+        If there is no such sound.
+    """
+    sound = np.asarray(sound)
+    if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
+        raise SourceError(f"sound of shape {sound.shape} and type {sound.dtype} cannot be heard")
+    if rate not in _RATES:
+        raise SourceError(f"a sample rate of {rate} Hz cannot be recorded")
+    scale = np.float32(1 << 8 * sound.itemsize - 1) if sound.dtype.kind == "i" else np.float32(1)
+    size = int(rate * _BLOCK_SECONDS)
+    starts = range(0, len(sound), size)
+    rows = sound if sound.ndim == 2 else sound[:, np.newaxis]
+    blocks = (_mono(rows[start : start + size].astype(np.float32) / scale) for start in starts)
+    return np.concatenate([np.empty(0, np.float32), *_resampled(blocks, rate)])
 
 
 def audio_seconds(path: Path) -> float:
@@ -69,9 +104,13 @@ def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
 def _mono_blocks(audio: soundfile.SoundFile) -> Iterator[Float32]:
     size = int(audio.samplerate * _BLOCK_SECONDS)
     while len(block := audio.read(size, dtype="float32", always_2d=True)):
-        if not np.isfinite(block).all():
-            np.nan_to_num(block, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-        yield block[:, 0] if block.shape[1] == 1 else block.mean(axis=1)
+        yield _mono(block)
+
+
+def _mono(block: Float32) -> Float32:
+    if not np.isfinite(block).all():
+        np.nan_to_num(block, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    return block[:, 0] if block.shape[1] == 1 else block.mean(axis=1)
 
 
 def _resampled(blocks: Iterator[Float32], rate: int) -> Iterator[Float32]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from hearthlog import __version__
+from hearthlog._version import __version__
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION

@@ -1,3 +1,63 @@
-"""Listens to a home for years: sound to features and labels every 50 ms, in MCAP logs."""
+"""Listens to a home for years: sound to features and labels every 50 ms, in MCAP logs.
 
-__version__ = "0.2.0"
+What is public is in `__all__`; all other modules may change from one version to the next. The names
+are imported when they are used: `import hearthlog` costs a recorder nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from hearthlog._version import __version__
+
+if TYPE_CHECKING:
+    from hearthlog._logs import Columns, Labelling, Logs, Mark, follow, open_logs
+    from hearthlog._sound import (
+        Labels,
+        Model,
+        SoundFeatures,
+        classify,
+        extract_features,
+        load_model,
+        save_model,
+    )
+    from hearthlog._training import Comparison, compare, train
+    from hearthlog.schemas.errors import HearthlogError
+
+__all__ = [
+    "Columns",
+    "Comparison",
+    "HearthlogError",
+    "Labelling",
+    "Labels",
+    "Logs",
+    "Mark",
+    "Model",
+    "SoundFeatures",
+    "__version__",
+    "classify",
+    "compare",
+    "extract_features",
+    "follow",
+    "load_model",
+    "open_logs",
+    "save_model",
+    "train",
+]
+_MODULES = (
+    "hearthlog.schemas.errors",
+    "hearthlog._logs",
+    "hearthlog._sound",
+    "hearthlog._training",
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        for module in map(import_module, _MODULES):
+            if hasattr(module, name):
+                return getattr(module, name)
+    raise AttributeError(f"module 'hearthlog' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,352 @@
+"""The public way to read logs; it says what `hearthlog.analyzer.logs` does in fewer words."""
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import Sources, find_sources
+from hearthlog.analyzer.logs.layers import with_layers
+from hearthlog.analyzer.logs.selection import Selection, select
+from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
+from hearthlog.analyzer.marks.marks import Mark, read_marks
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs import follow as growing
+from hearthlog.schemas.logs.columns import Columns, join, read_columns
+from hearthlog.schemas.logs.files import is_layer
+from hearthlog.schemas.messages.fields import DURATION, TIME
+from hearthlog.schemas.messages.message_types import PACKAGE
+from hearthlog.schemas.messages.topics import microphone_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+_TIMES: Mapping[str, Callable[[Any, Int64], Any]] = {
+    TIME: lambda pandas, times: pandas.to_datetime(times, unit="ns", utc=True),
+    DURATION: lambda pandas, times: pandas.to_timedelta(times, unit="ns"),
+}
+__all__ = ["Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
+
+
+class Logs:
+    """A log or the logs of a folder, with the layers beside them.
+
+    `open_logs` makes it. All times are integers: nanoseconds of UTC since 1970.
+
+    Parameters
+    ----------
+    path : Path
+    start, end : int, optional
+        Log times: from `start` on, before `end`.
+
+    Attributes
+    ----------
+    path : Path
+    start, end : int or None
+    """
+
+    def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
+        self.path = path
+        self.start = start
+        self.end = end
+        self._selection = select(with_layers(path), (), start, end)
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files with messages in the span of time, layers among them, in the order of time."""
+        return list(self._selection.logs)
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Message type of each topic."""
+        channels = self._selection.channels
+        named = {topic: schema for topic, same in channels.items() for _, schema in same}
+        return {topic: schema.name if schema else "" for topic, schema in sorted(named.items())}
+
+    @property
+    def microphones(self) -> list[str]:
+        """Names of the microphones."""
+        ours = (topic for topic, kind in self.topics.items() if kind.startswith(f"{PACKAGE}/"))
+        return sorted({microphone_of(topic) for topic in ours})
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Log times of the first and the last message."""
+        return self._selection.span
+
+    @property
+    def labellings(self) -> dict[str, list[str]]:
+        """Names of the labellings of each microphone that has some, for `segments`."""
+        sources = self._sources
+        return {name: names for name in self.microphones if (names := sources.names(name))}
+
+    def columns(self, topic: str, fields: Collection[str] | None = None) -> Columns:
+        """Read a topic as numpy arrays, one row a message.
+
+        Parameters
+        ----------
+        topic : str
+        fields : collection of str, optional
+            Paths of the fields to read, such as `header.stamp`; all by default.
+
+        Returns
+        -------
+        Columns
+
+        Raises
+        ------
+        LogError
+            If there is no such topic, or a log is damaged.
+
+        Examples
+        --------
+        >>> import hearthlog
+        >>> features = hearthlog.open_logs("logs").columns("/mic/features")
+        >>> features["values"].shape, features["values"].dtype
+        ((3600, 21), dtype('float32'))
+        """
+        selection = self._only(topic)
+        columns = read_columns(selection.logs, [topic], self.start, self.end, fields)
+        if topic not in columns:
+            raise selection.nothing()
+        return columns[topic]
+
+    def arrow(self, topic: str) -> "pa.Table":
+        """Read a topic as an Arrow table, with the types of a Parquet file of `hearthlog export`.
+
+        Numbers are not copied once they are decoded.
+
+        Parameters
+        ----------
+        topic : str
+
+        Returns
+        -------
+        pyarrow.Table
+
+        Raises
+        ------
+        LogError
+            If there is no such topic, a log is damaged, or logs define its type in two ways.
+        ModuleNotFoundError
+            If pyarrow is not installed.
+
+        Examples
+        --------
+        >>> import hearthlog
+        >>> table = hearthlog.open_logs("logs").arrow("/mic/segment")
+        >>> table.schema.field("header.stamp").type, table.schema.field("duration").type
+        (TimestampType(timestamp[ns, tz=UTC]), DurationType(duration[ns]))
+        """
+        table = _optional("pyarrow").Table
+        from hearthlog.analyzer.export.arrow import batch_of, schema_of  # noqa: PLC0415  an extra
+
+        parts = self._pieces(topic)
+        schema = schema_of(topic, parts[0].fields, self._only(topic))
+        return table.from_batches([batch_of(piece, schema) for piece in parts])
+
+    def pandas(self, topic: str) -> "pd.DataFrame":
+        """Read a topic as a DataFrame; arrays become a column for each of their elements.
+
+        Parameters
+        ----------
+        topic : str
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row a message, by log time, which is of type `datetime64[ns, UTC]`. The columns
+            of arrays are called as the log names their elements (`values.energy`,
+            `probabilities.speech`), else `values.0`.
+
+        Raises
+        ------
+        LogError
+            If there is no such topic, or a log is damaged.
+        ModuleNotFoundError
+            If pandas is not installed.
+
+        Examples
+        --------
+        >>> import hearthlog
+        >>> day = hearthlog.open_logs("logs").pandas("/mic/features")
+        >>> day["values.energy"].dtype, int(day["header.stamp"].diff().max().total_seconds() * 1000)
+        (dtype('float32'), 50)
+        """
+        pandas = _optional("pandas")
+        parts = self._pieces(topic)
+        columns, fields = join([piece.columns for piece in parts]), parts[0].fields
+        series: dict[str, Any] = {}
+        for path, values in columns.fields.items():
+            if values.ndim == 2:
+                names = _element_names(columns, path)
+                series |= {f"{path}.{name}": row for name, row in zip(names, values.T, strict=True)}
+            elif fields[path].size is None and fields[path].type in _TIMES:
+                series[path] = _TIMES[fields[path].type](pandas, values)
+            else:
+                series[path] = values
+        index = pandas.Index(_TIMES[TIME](pandas, columns.log_times), name="log_time")
+        return pandas.DataFrame(series, index, copy=False)
+
+    def segments(self, labelling: str = "live", microphone: str | None = None) -> Labelling:
+        """Read the spans of time that a recorder, a relabelling or a reviewer has labelled.
+
+        Parameters
+        ----------
+        labelling : str
+            `live`, `review`, the name of a model, or `relabel` if there is only one.
+        microphone : str, optional
+            By default the only one.
+
+        Returns
+        -------
+        Labelling
+            In the order of time; no two segments overlap.
+
+        Raises
+        ------
+        DataError
+            If there is no such labelling, or there are several microphones.
+        LogError
+            If there is no segment in this span of time, or a log is damaged.
+
+        Examples
+        --------
+        >>> import hearthlog
+        >>> heard = hearthlog.open_logs("logs").segments()
+        >>> heard.labels[0], float(heard.ends[0] - heard.starts[0]) / 1e9
+        ('silence', 5.95)
+        """
+        sources = self._sources
+        microphone = sources.microphone(microphone)
+        side = sources.read(microphone, sources.find(microphone, labelling), self.start, self.end)
+        return side.labelling
+
+    def marks(self) -> list[Mark]:
+        """Read what reviewers have corrected.
+
+        Returns
+        -------
+        list of Mark
+            In the order of time.
+
+        Raises
+        ------
+        LogError
+            If a review layer is damaged.
+
+        Examples
+        --------
+        >>> import hearthlog
+        >>> [(mark.label, mark.reviewer) for mark in hearthlog.open_logs("logs").marks()]
+        [('coughing', 'ada')]
+        """
+        logs = [path for path in self.paths if not is_layer(path)]
+        return sorted((mark for log in logs for mark in read_marks(log)), key=lambda m: m.start)
+
+    @cached_property
+    def _sources(self) -> Sources:
+        return find_sources(self.path)
+
+    def _only(self, topic: str) -> Selection:
+        if topic not in self._selection.channels:
+            raise LogError(f"{self.path}: no topic {topic}; there are {', '.join(self.topics)}")
+        return self._selection.only([topic])
+
+    def _pieces(self, topic: str) -> list[TypedColumns]:
+        selection = self._only(topic)
+        found = [piece for batch in selection.messages() for piece in decode_all(batch)]
+        if not found:
+            raise selection.nothing()
+        return found
+
+
+def open_logs(path: Path | str, start: int | None = None, end: int | None = None) -> Logs:
+    """Open a log or a folder of logs.
+
+    Parameters
+    ----------
+    path : Path or str
+        Logs in a folder may lie at any depth. Of a log, the layers beside it belong to it.
+    start, end : int, optional
+        Log times in nanoseconds of UTC: from `start` on, before `end`.
+
+    Returns
+    -------
+    Logs
+
+    Raises
+    ------
+    LogError
+        If there is no log, or one is damaged.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> logs = hearthlog.open_logs("logs")
+    >>> logs.microphones, logs.labellings
+    (['mic'], {'mic': ['live', 'review']})
+    >>> logs.topics["/mic/label"]
+    'hearthlog_msgs/msg/AudioLabel'
+    """
+    return Logs(Path(path), start, end)
+
+
+def follow(
+    path: Path | str,
+    topics: Collection[str] | None = None,
+    start: int | None = None,
+    stop: Event | None = None,
+) -> Iterator[list[Columns]]:
+    """Read the logs of a folder as a recorder writes them, from file to file.
+
+    Parameters
+    ----------
+    path : Path or str
+    topics : collection of str, optional
+        All by default.
+    start : int, optional
+        Log time in nanoseconds of UTC from which on messages are read; by default those that are
+        written from now on.
+    stop : threading.Event, optional
+        Ends it.
+
+    Yields
+    ------
+    list of Columns
+        What was written since the last time, of one log, in the order of time.
+
+    Raises
+    ------
+    LogError
+        If there is no such folder, or a log is damaged.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> for batch in hearthlog.follow("logs", ["/mic/label"], start=0):
+    ...     print(batch[0].topic, batch[0]["label"][0])
+    ...     break
+    /mic/label silence
+    """
+    return growing.follow(Path(path), topics, start, stop=stop)
+
+
+def _element_names(columns: Columns, path: str) -> list[str]:
+    """Name the elements of an array as the log does, else by their place."""
+    names, count = array_names(columns.metadata, path), columns[path].shape[1]
+    return names if len(names) == count else [f"{i}" for i in range(count)]
+
+
+def _optional(module: str) -> Any:
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        message = f"{module} is not installed; try: pip install {module}"
+        raise ModuleNotFoundError(message, name=module) from error

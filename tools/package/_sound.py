@@ -1,0 +1,222 @@
+"""The public way from sound to features and labels, as a recorder goes it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.relabel.stream import Stream
+from hearthlog.analyzer.replay.recorded import Features
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.installed import feature_set as installed
+from hearthlog.models.modelfile import modelfile
+from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.sources.decoding import convert_sound
+from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+
+__all__ = [
+    "Labels",
+    "Model",
+    "SoundFeatures",
+    "classify",
+    "extract_features",
+    "load_model",
+    "save_model",
+]
+
+
+class SoundFeatures(NamedTuple):
+    """Features of sound, one row a frame of 50 ms.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+        Of the d values of a frame.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds.
+    values : np.ndarray [shape=(n, d)], float32
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    times: Int64
+    values: Float32
+
+
+class Labels(NamedTuple):
+    """Labels of sound, one a frame of 50 ms, from the end of the first whole window on.
+
+    Attributes
+    ----------
+    classes : tuple of str
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds.
+    labels : np.ndarray [shape=(n,)] of str
+        The likeliest class of each.
+    probabilities : np.ndarray [shape=(n, C)], float32
+        In the order of `classes`.
+    novelty : np.ndarray [shape=(n,)], float32
+        From 0 to 1; NaN where the model does not know it.
+    segments : Labelling
+        The spans of time that they become by the model's smoothing.
+    """
+
+    classes: tuple[str, ...]
+    times: Int64
+    labels: NDArray[np.object_]
+    probabilities: Float32
+    novelty: Float32
+    segments: Labelling
+
+
+def extract_features(
+    sound: NDArray[np.generic], rate: int, feature_set: str = "auros21", start: int = 0
+) -> SoundFeatures:
+    """Compute the features of sound, to the bits that a recorder would log.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,) or (n, channels)]
+        Integers of the full range of their type, or floats in full scale, -1 to 1. Channels are
+        averaged; what fills no frame at the end is left out.
+    rate : int
+        Samples per second; other than 16000 are resampled.
+    feature_set : str
+    start : int
+        Time of the first sample in nanoseconds.
+
+    Returns
+    -------
+    SoundFeatures
+
+    Raises
+    ------
+    ModelError
+        If there is no such feature set.
+    SourceError
+        If the sound is shorter than a frame, or is none.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> import numpy as np
+    >>> tone = 0.1 * np.sin(2 * np.pi * 440 * np.arange(8000) / 16000)
+    >>> features = hearthlog.extract_features(tone, 16000)
+    >>> features.values.shape, features.names[:2]
+    ((10, 21), ('energy', 'zero_crossing_rate'))
+    >>> features.values[0, :2].round(3)
+    array([0.005, 0.054], dtype=float32)
+    """
+    described = installed(feature_set)
+    samples = convert_sound(sound, rate)
+    count = len(samples) // FRAME_SAMPLES
+    if count == 0:
+        raise SourceError("the sound is shorter than one frame of 50 ms")
+    values = described.extractor()(samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES))
+    times = start + np.arange(count) * FRAME_NANOSECONDS
+    return SoundFeatures(described.feature_names, described.units, times, values)
+
+
+def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> Labels:
+    """Label sound, to the bits that a recorder would log with this model.
+
+    Parameters
+    ----------
+    model : Model
+    sound, rate, start
+        Those of `extract_features`.
+
+    Returns
+    -------
+    Labels
+        Empty if the sound is shorter than the window of the model's feature set.
+
+    Raises
+    ------
+    ModelError
+        If the model's feature set is not installed.
+    SourceError
+        If the sound is shorter than a frame, or is none.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> import soundfile
+    >>> sound, rate = soundfile.read("sound.flac", dtype="int16")
+    >>> heard = hearthlog.classify(hearthlog.load_model("home.safetensors"), sound, rate)
+    >>> heard.times[:2] / 1e9, heard.probabilities.shape
+    (array([0.95, 1.  ]), (3581, 9))
+    >>> heard.labels[0], heard.segments.labels[0]
+    ('silence', 'silence')
+    """
+    classifier = Classifier(model)
+    features = extract_features(sound, rate, classifier.feature_set.name, start)
+    stream = Stream(classifier)
+    labels = stream.push(Features(0, features.values, features.times))
+    stream.close()
+    assert labels is not None
+    names = np.array(labels.classes, object)
+    starts, ends, states = (
+        np.array([getattr(segment, name) for segment in stream.segments], np.int64)
+        for name in ("start", "end", "label")
+    )
+    return Labels(
+        labels.classes,
+        labels.stamps,
+        names[labels.probabilities.argmax(axis=1)],
+        labels.probabilities,
+        labels.novelty,
+        Labelling(starts, ends, names[states]),
+    )
+
+
+def load_model(path: Path | str) -> Model:
+    """Read a model file and check all that is in it; nothing of it is executed.
+
+    Parameters
+    ----------
+    path : Path or str
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    ModelError
+        If it is missing, damaged, or needs what is not installed.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> model = hearthlog.load_model("home.safetensors")
+    >>> model.classes[:3], model.description.feature_set
+    (('silence', 'speech', 'music'), 'auros21')
+    """
+    return modelfile.load_model(Path(path))
+
+
+def save_model(model: Model, path: Path | str) -> None:
+    """Write a model file; the same model gives the same bytes.
+
+    Parameters
+    ----------
+    model : Model
+    path : Path or str
+        Must end in `.safetensors`, and not exist.
+
+    Raises
+    ------
+    ModelError
+        If it exists or cannot be written.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> hearthlog.save_model(hearthlog.load_model("home.safetensors"), "copy.safetensors")
+    """
+    modelfile.save_model(model, Path(path))

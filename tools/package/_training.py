@@ -1,0 +1,94 @@
+"""The public way to learn models and to compare them."""
+
+from pathlib import Path
+
+from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
+from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.methods import method_named
+from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.progress import ignore_progress
+
+__all__ = ["Comparison", "compare", "train"]
+
+
+def train(
+    manifest: Path | str, scenario: str, method: str = "bands", smoothing: str = "hmm"
+) -> Model:
+    """Learn a model from labelled clips, and measure it on sources that it has not heard.
+
+    Parameters
+    ----------
+    manifest : Path or str
+        CSV file with the columns `path`, `label` and `source_group`.
+    scenario : str
+        What to tell apart: `bathroom`, `general`, or a TOML file.
+    method : str
+        `bands`, `paper`, or one that another distribution adds.
+    smoothing : str
+        How labels become segments: `hmm` or `merge`.
+
+    Returns
+    -------
+    Model
+        Its `description.metrics` are those of cross-validation by source group.
+
+    Raises
+    ------
+    DataError
+        If the manifest, the scenario or the method cannot be used.
+    SourceError
+        If a clip cannot be read.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> model = hearthlog.train("clips/manifest.csv", "bathroom", method="paper")
+    >>> model.classes
+    ('silence', 'flushing_water', 'shower', 'tap_water', 'other')
+    >>> model.description.metrics.macro_f1 > 0.5
+    True
+    """
+    chosen, way = load_scenario(scenario), method_named(method)
+    clips = read_manifest(Path(manifest), chosen.labels)
+    data = build_dataset(clips, chosen, ignore_progress, features=way.features)
+    return train_model(data, chosen, ignore_progress, way, smoothing)
+
+
+def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
+    """Compare two models on labelled clips that neither has learned from.
+
+    Parameters
+    ----------
+    a, b : Model
+        Of the same classes and the same feature set.
+    manifest : Path or str
+        As of `train`.
+
+    Returns
+    -------
+    Comparison
+        `difference.macro_f1` is that of b minus that of a; `clear` tells whether it means anything.
+
+    Raises
+    ------
+    DataError
+        If the models cannot be compared, or the clips cannot be used.
+    SourceError
+        If a clip cannot be read.
+
+    Examples
+    --------
+    >>> import hearthlog
+    >>> model = hearthlog.load_model("home.safetensors")
+    >>> hearthlog.compare(model, model, "clips/manifest.csv").clear
+    False
+    """
+    scenario = scenario_of(a)
+    clips = read_manifest(Path(manifest), scenario.labels)
+    features = feature_set(a.description.feature_set)
+    recordings = clip_recordings(clips, scenario, ignore_progress, features)
+    return compare_models(a, b, recordings, scenario)
