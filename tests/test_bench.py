@@ -1,5 +1,6 @@
 """The benchmark runs to its end on a little sound; how fast is not for a test to say."""
 
+import json
 import math
 import re
 import subprocess
@@ -11,7 +12,7 @@ import pytest
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.bench import features, reading, timing, writing
+from hearthlog.tools.bench import features, history, reading, timing, writing
 from hearthlog.tools.bench.labmic import make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.workload import Workload
@@ -141,3 +142,45 @@ def test_columns_and_messages_are_written_at_a_speed(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
     columns, single = writing.measure(Workload(tmp_path, minutes=0.2)).rows
     assert single.ratio == pytest.approx(columns.value / single.value)
+
+
+def test_figures_with_a_target_are_kept_run_by_run_and_drawn(tmp_path):
+    runs, picture = tmp_path / "runs.jsonl", tmp_path / "runs.svg"
+    for value in (12.0, 15.0):
+        rows = [
+            Row("hearthlog, in one call", 700.0, "x real time"),
+            Row("librosa 0.11.0", 60.0, "x real time", value, Target(10.0)),
+            Row("opensmile", None, target=Target(2.0), note="not installed"),
+            Row("memory", 80.0, "MB", target=Target(100.0, at_most=True)),
+        ]
+        history.record(runs, {"features": Table("", rows)}, "the simulated home")
+
+    (first, last) = map(json.loads, runs.read_text("utf-8").splitlines())
+    assert set(first["figures"]) == {"features: librosa", "features: memory"}
+    librosa = {"value": 15.0, "unit": "x", "limit": 10.0, "at_most": False}
+    assert last["figures"]["features: librosa"] == librosa
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", first["date"])
+    assert {"commit", "machine", "sound"} <= set(first)
+    assert {"hearthlog", "numpy", "python"} <= set(first["versions"])
+
+    history.draw(runs, picture)
+    drawn = picture.read_bytes()
+    history.draw(runs, picture)
+    assert drawn.startswith(b"<?xml")
+    assert picture.read_bytes() == drawn
+
+
+def test_a_history_without_a_run_is_drawn_too(tmp_path):
+    (tmp_path / "runs.jsonl").touch()
+    history.draw(tmp_path / "runs.jsonl", tmp_path / "runs.svg")
+    assert (tmp_path / "runs.svg").exists()
+
+
+def test_a_run_is_recorded_where_it_is_asked_for(tmp_path):
+    write_training_set(tmp_path / "sound", 3, seed=1)
+    runs = tmp_path / "runs.jsonl"
+    done = bench("recording", "--audio", tmp_path / "sound", "--record", runs)
+    assert done.returncode == 0, done.stderr
+    (run,) = map(json.loads, runs.read_text("utf-8").splitlines())
+    assert run["sound"] == "sound"
+    assert run["figures"]["recording: hearthlog record"]["value"] > 0

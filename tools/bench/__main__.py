@@ -19,6 +19,7 @@ import typer
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.bench import (
     features,
+    history,
     inference,
     live,
     reading,
@@ -28,6 +29,7 @@ from hearthlog.tools.bench import (
     size,
     writing,
 )
+from hearthlog.tools.bench.table import Table
 from hearthlog.tools.bench.workload import Workload
 
 MEASUREMENTS = {
@@ -44,6 +46,9 @@ def bench(
         Path | None,
         typer.Option(help="Folder of recordings to use instead of the simulated home."),
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="File to append the figures to, as a line of JSON.")
+    ] = None,
 ) -> None:
     """Measure hearthlog against its peers and its targets.
 
@@ -52,16 +57,18 @@ def bench(
     chosen = names or list(MEASUREMENTS)
     if unknown := [name for name in chosen if name not in MEASUREMENTS]:
         raise typer.BadParameter(f"{unknown[0]}: known are {', '.join(MEASUREMENTS)}")
-    missing: list[str] = []
-    source = "the simulated home" if audio is None else audio
+    tables: dict[str, Table] = {}
+    source = "the simulated home" if audio is None else audio.name
     with tempfile.TemporaryDirectory(prefix="hearthlog-bench-") as folder:
         work = Workload(Path(folder), audio)
         typer.echo(f"hearthlog bench: sound of {source}", err=True)
         for number, name in enumerate(chosen, start=1):
             typer.echo(f"hearthlog bench: {number} of {len(chosen)}, {name} ...", err=True)
-            table = MEASUREMENTS[name](work)
-            print(f"{table}\n", flush=True)
-            missing += [f"{what} ({name})" for what in table.missing]
+            tables[name] = MEASUREMENTS[name](work)
+            print(f"{tables[name]}\n", flush=True)
+    if record is not None:
+        history.record(record, tables, source)
+    missing = [f"{what} ({name})" for name, table in tables.items() for what in table.missing]
     if missing:
         typer.echo(f"hearthlog bench: not measured: {'; '.join(missing)}", err=True)
         raise typer.Exit(3)
