@@ -39,6 +39,15 @@ _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
 
+def pytest_configure(config):
+    """Draw the same random examples every time, unless `--hypothesis-seed` asks for others."""
+    installed = config.pluginmanager.hasplugin("hypothesispytest")
+    if installed and config.getoption("--hypothesis-seed") is None:
+        from hypothesis import settings  # noqa: PLC0415
+
+        settings.load_profile("ci")
+
+
 @pytest.fixture(scope="session")
 def household() -> Path:
     """The folder of real labelled recordings, where the machine has it."""

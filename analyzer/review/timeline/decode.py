@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.analyzer.logs.health import MicrophoneState, lasting
 from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans, SoundClip, no_spans
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -58,10 +57,15 @@ def runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
         yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
 
 
-def trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans:
+def lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
     """Let a trouble last until the next message says that it is over, or that it is another."""
-    changes = [(state.time, state.text or None) for state in states]
-    spans = [span for span in lasting(changes, end) if span[0] < span[1]]
+    changes = [
+        (stamp, text)
+        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
+        if text != before
+    ]
+    stops = [*(stamp for stamp, _ in changes[1:]), end]
+    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
     if not spans:
         return no_spans()
     starts, ends, texts = zip(*spans, strict=True)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import checked_array_names
-from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.review.timeline.decode import FIELDS, decibel, shown_topic, spans_of
@@ -247,11 +246,13 @@ def _gaps(microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
 
 
 def _health(columns: Columns) -> Iterator[Lane]:
-    by_microphone: dict[str, list[MicrophoneState]] = {}
-    for state in microphone_states(columns):
-        by_microphone.setdefault(state.microphone, []).append(state)
-    for name, states in sorted(by_microphone.items()):
-        times = np.array([state.time for state in states])
-        levels = (min(state.level, len(TROUBLES)) for state in states)
-        texts = [TROUBLES[level - 1] if level else None for level in levels]
-        yield Lane(name, TROUBLE_LANE, Changes(times, texts))
+    names = columns["header.frame_id"]
+    for name in np.unique(names.astype(str)).tolist():
+        if not shown_topic(f"/{name}/gap"):
+            continue
+        own = names == name
+        levels = [
+            max((status["level"] for status in each), default=0) for each in columns["status"][own]
+        ]
+        states = [TROUBLES[min(level, len(TROUBLES)) - 1] if level else None for level in levels]
+        yield Lane(name, TROUBLE_LANE, Changes(columns["header.stamp"][own], states))

@@ -12,7 +12,6 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.coverage import coverage_of
-from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
 from hearthlog.analyzer.logs.layers import TimedFile, find_timed_files, latest_records
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.typed_columns import decode_types
@@ -21,10 +20,10 @@ from hearthlog.analyzer.review.timeline.decode import (
     FIELDS,
     chained,
     decibel,
+    lasting,
     runs,
     shown_topic,
     spans_of,
-    trouble_spans,
 )
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.model import (
@@ -162,7 +161,7 @@ class _Heard:
     novelty: dict[str, GridMeans] = field(default_factory=dict)
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
     gaps: list[LabelledSpans] = field(default_factory=list)
-    states: list[MicrophoneState] = field(default_factory=list)
+    troubles: list[tuple[int, str]] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
 
@@ -284,8 +283,17 @@ class _Reader:
         self._lines.append(LogLines(columns["stamp"], columns["level"], columns["msg"]))
 
     def _take_health(self, columns: Columns) -> None:
-        for state in microphone_states(self._within(columns)):
-            self._microphone(state.microphone).states.append(state)
+        columns = self._within(columns)
+        rows = zip(
+            columns["header.stamp"].tolist(),
+            columns["header.frame_id"].tolist(),
+            columns["status"],
+            strict=True,
+        )
+        for stamp, name, statuses in rows:
+            bad = [status["message"] for status in statuses if status["level"]]
+            if shown_topic(f"/{name}/gap"):
+                self._microphone(name).troubles.append((stamp, "; ".join(bad)[:200]))
 
     def _read_marks(self, log: Path) -> None:
         for mark in read_marks(log):
@@ -346,7 +354,7 @@ class _Reader:
             level=level,
             level_frames=heard.level_frames,
             gaps=self._joined(heard.gaps),
-            troubles=trouble_spans(heard.states, self._grid.end),
+            troubles=lasting(heard.troubles, self._grid.end),
             clips=chained(heard.clips),
         )
 
