@@ -58,7 +58,7 @@ build/checked/hearthlog: Makefile $(wildcard tools/package/*.py)
 
 # The documentation site, from docs/ and the docstrings of the public API.
 docs: $(VENV)/.dev
-	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -d build/doctrees docs build/site
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env -d build/doctrees docs build/site
 
 # The sdist, and the wheel that is built from it.
 dist: $(VENV)/.dev

@@ -44,11 +44,6 @@ class Logs:
     path : Path
     start, end : int, optional
         Log times: from `start` on, before `end`.
-
-    Attributes
-    ----------
-    path : Path
-    start, end : int or None
     """
 
     def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
