@@ -82,7 +82,7 @@ def shared_home(recorded_home, tmp_path_factory):
 def marking_of(folder, reviewer="Ann"):
     timeline = read_timeline([folder])
     spans = timeline.microphones["mic"].labellings[0].spans
-    return Marking("mic", timeline.heard["mic"], reviewer, "live", spans)
+    return Marking("mic", timeline.coverage["mic"], reviewer, "live", spans)
 
 
 def layers(folder):
@@ -119,13 +119,13 @@ def test_marks_are_what_was_said_last_and_undone_they_are_as_before(shared_home,
         if ".review." in log.name:
             log.unlink()
     marking = marking_of(shared_home)
-    edge = marking.heard.starts[1]
+    edge = marking.coverage.starts[1]
     for log, start, end in ((0, edge - SECOND, edge), (1, edge + SECOND, edge + 2 * SECOND)):
-        write_marks(marking.heard.logs[log], [Mark("mic", start, end, "music", *OLD)])
+        write_marks(marking.coverage.logs[log], [Mark("mic", start, end, "music", *OLD)])
     before = layers(shared_home)
     said = np.array(cells_of(marking.labelled))
     history = [cells_of(marking.marks())]
-    last = int((marking.heard.ends[-1] - START) // CELL)
+    last = int((marking.coverage.ends[-1] - START) // CELL)
     for kind, first, length, label in done:
         now = history[-1].copy()
         cells = slice(first, min(first + length, last))
@@ -170,9 +170,9 @@ def test_a_mark_says_who_made_it_when_and_what_it_corrects(home):
 
 def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
     marking = marking_of(home)
-    first, second = marking.heard.starts[1:3]
+    first, second = marking.coverage.starts[1:3]
     marking.mark(first - SECOND, second + SECOND, "yelling")
-    found = [read_marks(log) for log in marking.heard.logs]
+    found = [read_marks(log) for log in marking.coverage.logs]
     assert [[(m.start, m.end) for m in marks] for marks in found] == [
         [(first - SECOND, first)],
         [(first, second)],
@@ -183,7 +183,9 @@ def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
 
 def test_what_was_not_recorded_cannot_be_marked_and_nothing_changes(home):
     whole = marking_of(home)
-    hole = Coverage(*(list(column[:1]) + list(column[2:]) for column in vars(whole.heard).values()))
+    hole = Coverage(
+        *(list(column[:1]) + list(column[2:]) for column in vars(whole.coverage).values())
+    )
     marking = Marking("mic", hole, "Ann", "live", whole.labelled)
     for start, end in (
         (hole.ends[0] - SECOND, hole.starts[1] + SECOND),
@@ -218,10 +220,10 @@ def test_marks_of_one_of_two_homes_in_a_folder_are_beside_its_own_logs(
     ).logs
     timeline = read_timeline([tmp_path / "both"])
     assert sorted(timeline.microphones) == ["bath", "mic"]
-    assert timeline.heard["bath"].logs == others
+    assert timeline.coverage["bath"].logs == others
     marking = Marking(
         "bath",
-        timeline.heard["bath"],
+        timeline.coverage["bath"],
         "Ann",
         "live",
         timeline.microphones["bath"].labellings[0].spans,
@@ -326,7 +328,7 @@ def test_correct_is_what_the_recorder_said_in_the_span(home):
         for a, b, text in as_rows(sitting.labelled)
         if a < end and b > start
     ]
-    edge = marking_of(home).heard.starts[1]
+    edge = marking_of(home).coverage.starts[1]
     found = [(m.start, m.end, m.label) for m in layers(home)]
     assert len({label for *_, label in found}) > 1
     assert [m for m in found if edge not in m[:2]] == [m for m in said if not m[0] < edge < m[1]]

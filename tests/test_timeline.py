@@ -25,20 +25,16 @@ from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
+from hearthlog.analyzer.review.timeline.clock import clock
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans, time_shares
-from hearthlog.analyzer.review.timeline.lanes import (
-    BLOCKS,
-    changes,
-    clock,
-    disagreements,
-    overview,
-)
+from hearthlog.analyzer.review.timeline.lanes import changes
 from hearthlog.analyzer.review.timeline.model import (
     GridSeries,
     LabelledSpans,
     LabellingTimeline,
     no_spans,
 )
+from hearthlog.analyzer.review.timeline.overview import BLOCKS, disagreements, overview
 from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
@@ -177,7 +173,7 @@ def test_segments_gaps_and_marks_are_the_spans_of_the_log(timeline, folder):
     gaps = [span for log in own for span in spans_of(log, "gap", "reason")]
     assert as_list(microphone.gaps) == gaps
     assert len(gaps) == 2
-    edge = timeline.heard["mic"].starts[1]
+    edge = timeline.coverage["mic"].starts[1]
     assert as_list(review.spans) == [
         (edge - SECOND, edge, "yelling"),
         (edge, edge + SECOND, "my_own"),
@@ -245,7 +241,7 @@ def test_a_span_in_which_there_is_nothing_is_one_line(folder):
 
 def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder, timeline):
     back = read_timeline(find_logs(folder)[::-1])
-    assert (back.grid, back.heard) == (timeline.grid, timeline.heard)
+    assert (back.grid, back.heard) == (timeline.grid, timeline.coverage)
     one, other = back.microphones["mic"], timeline.microphones["mic"]
     np.testing.assert_array_equal(one.features.values, other.features.values)
     for a, b in zip(one.labellings, other.labellings, strict=True):

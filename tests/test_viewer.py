@@ -21,7 +21,7 @@ from viewers import (
 
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.timeline.lanes import overview
+from hearthlog.analyzer.review.timeline.overview import overview
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.review.viewer.web import open_page

@@ -22,17 +22,10 @@ from rerun.experimental import ViewerClient
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import home_zone
-from hearthlog.analyzer.review.timeline.lanes import Changes
-from hearthlog.analyzer.review.timeline.live import (
-    GAP_LANE,
-    LIVE_LANE,
-    NOT_HEARD,
-    Lane,
-    Live,
-    Means,
-    last_time,
-)
+from hearthlog.analyzer.review.timeline.lanes import GAPS, NOT_HEARD, RECORDER, Changes, Lane
+from hearthlog.analyzer.review.timeline.live import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline.model import LogLines
+from hearthlog.analyzer.review.timeline.plots import FEATURES, LEVEL, NOVELTY, SHARES, Plot
 from hearthlog.analyzer.review.viewer.live import LiveServer
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, free_port
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -145,7 +138,7 @@ def is_there(picture, tint, column):
 
 def news(folder, live=None, **options):
     """Give what is new to one who follows finished logs to their end."""
-    live = live or Live(home_zone("UTC"))
+    live = live or LiveTimeline(home_zone("UTC"))
     count = sum(1 for _ in batches(folder, **options))
     found = islice(follow_messages(folder, start=0, **options), count)
     return [each for path, batch in found for each in live.take(path, batch)]
@@ -158,11 +151,11 @@ def batches(folder, **options):
     return follow_messages(folder, start=0, stop=stop, **options)
 
 
-def lane_states(found, name):
+def lane_states(found, kind):
     """Give a lane as it stands in the end: what came last of each time counts."""
     states = {}
     for each in found:
-        if isinstance(each, Lane) and each.name == name:
+        if isinstance(each, Lane) and each.kind is kind:
             states.update(zip(each.changes.times.tolist(), each.changes.states, strict=True))
     times = np.array(sorted(states))
     return times, [states[time] for time in times.tolist()]
@@ -218,8 +211,10 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
     with LiveServer(port, "127.0.0.1", MINUTES, memory="5MB") as server:
         for number in range(600):  # three days
             times = seconds + number * 500 * SECOND
-            shares = Means("mic", "shares", names, times, values)
-            server.show([shares, Lane("mic", LIVE_LANE, Changes(times, ["phone_ring"] * 500))])
+            shares = Plot(SHARES, "mic", "live", names, times, values)
+            server.show(
+                [shares, Lane(RECORDER, "mic", "live", Changes(times, ["phone_ring"] * 500))]
+            )
             taken.append(psutil.Process().memory_info().rss)
         assert taken[-1] - taken[100] < 60_000_000
         with looking(server.url) as eye:
@@ -229,7 +224,7 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
 
 def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
     found = news(logs)
-    times, states = lane_states(found, LIVE_LANE)
+    times, states = lane_states(found, RECORDER)
     segments = read_columns(find_logs(logs))["/mic/segment"]
     starts = segments["header.stamp"]
     ends = starts + segments["duration"]
@@ -238,23 +233,23 @@ def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
         if at >= 0 and time_ < ends[at]:
             assert state == segments["label"][at]
     assert np.isin(starts, times).all()
-    first = next(each for each in found if isinstance(each, Lane) and each.name == LIVE_LANE)
+    first = next(each for each in found if isinstance(each, Lane) and each.kind is RECORDER)
     assert None not in first.changes.states
     assert np.diff(times).max() <= SECOND
 
 
 def test_means_are_those_of_the_frames_of_a_second(logs):
-    found = [each for each in news(logs) if isinstance(each, Means)]
+    found = [each for each in news(logs) if isinstance(each, Plot)]
     columns = read_columns(find_logs(logs))
     stamps, values = (columns["/mic/label"][name] for name in ("header.stamp", "probabilities"))
-    shares = [each for each in found if each.kind == "shares"]
+    shares = [each for each in found if each.kind is SHARES]
     times = np.concatenate([each.times for each in shares])
     means = np.concatenate([each.values for each in shares])
     second = times[40] // SECOND
     assert np.allclose(means[40], values[stamps // SECOND == second].mean(axis=0), atol=1e-6)
     assert len(times) < len(stamps) / 15
-    assert {each.kind for each in found} == {"shares", "level", "novelty", "features"}
-    heat = np.concatenate([each.values for each in found if each.kind == "features"])
+    assert {each.kind for each in found} == {SHARES, LEVEL, NOVELTY, FEATURES}
+    heat = np.concatenate([each.values for each in found if each.kind is FEATURES])
     assert heat.min() >= 0
     assert heat.max() <= 1
     assert (heat.std(axis=0) > 0.05).all()
@@ -263,12 +258,12 @@ def test_means_are_those_of_the_frames_of_a_second(logs):
 def test_what_was_not_heard_is_a_hole_in_lanes_and_lines(recorded):
     found = news(recorded)
     gaps = read_columns(find_logs(recorded))["/mic/gap"]
-    times, states = lane_states(found, GAP_LANE)
+    times, states = lane_states(found, GAPS)
     assert len(gaps)
     assert np.array_equal(times[::2], gaps["header.stamp"])
     assert states == [NOT_HEARD, None] * len(gaps)
-    live_times, live_states = lane_states(found, LIVE_LANE)
-    level = [each for each in found if isinstance(each, Means) and each.kind == "level"]
+    live_times, live_states = lane_states(found, RECORDER)
+    level = [each for each in found if isinstance(each, Plot) and each.kind is LEVEL]
     holes = np.concatenate([each.times[np.isnan(each.values[:, 0])] for each in level])
     for start in gaps["header.stamp"]:
         assert np.abs(holes - start).min() <= FRAME_NANOSECONDS
@@ -287,16 +282,16 @@ def test_another_model_and_none_are_drawn_too(day, model_file, other_model, tmp_
             [*HEARTHLOG, "record", day, "-o", tmp_path, "--start", start, *model], check=True
         )
     found = news(tmp_path)
-    shares = dict.fromkeys(e.names for e in found if isinstance(e, Means) and e.kind == "shares")
+    shares = dict.fromkeys(e.names for e in found if isinstance(e, Plot) and e.kind is SHARES)
     assert len(shares) == 2
-    levels = [each.times for each in found if isinstance(each, Means) and each.kind == "level"]
-    assert np.concatenate(levels)[-1] > lane_states(found, LIVE_LANE)[0][-1] + 3_000 * SECOND
+    levels = [each.times for each in found if isinstance(each, Plot) and each.kind is LEVEL]
+    assert np.concatenate(levels)[-1] > lane_states(found, RECORDER)[0][-1] + 3_000 * SECOND
     with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
         server.show(found)
 
 
 def test_what_is_kept_does_not_grow_with_what_was_watched(logs):
-    live = Live(home_zone("UTC"))
+    live = LiveTimeline(home_zone("UTC"))
     news(logs, live)
     before = len(str(live.__dict__))
     for _ in range(3):

@@ -168,7 +168,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         if not items:
             viewer.draw_frames(timeline, start, end)
             return
-        coverage = timeline.heard[microphone]
+        coverage = timeline.coverage[microphone]
         spans = zip(coverage.logs, coverage.starts, coverage.ends, strict=True)
         near = [log for log, first, last in spans if first < end and last > start]
         viewer.draw_close_up(read_timeline(near, start, end, zone=timeline.zone))
@@ -176,7 +176,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     session = Session(
         viewer,
         marking,
-        _classes(timeline, microphone),
+        timeline.microphones[microphone].classes,
         home_zone(timeline.zone),
         say,
         look_closely,
@@ -218,7 +218,7 @@ def _work(
             )
     marking = Marking(
         microphone,
-        timeline.heard[microphone],
+        timeline.coverage[microphone],
         choice.reviewer,
         labelling.removeprefix("relabel/"),
         segments.get(labelling, no_spans()),
@@ -235,10 +235,3 @@ def _microphone(timeline: "Timeline", name: str | None) -> str:
         line = f"marks are of the first microphone of {names}; --microphone chooses another one"
         print(printable(line))
     return name or next(iter(timeline.microphones))
-
-
-def _classes(timeline: "Timeline", microphone: str) -> list[str]:
-    """List the classes that get a key: those of the models, and those that were marked."""
-    labellings = timeline.microphones[microphone].labellings
-    named = [name for one in labellings if one.probabilities for name in one.probabilities.names]
-    return list(dict.fromkeys([*named, *(text for one in labellings for text in one.spans.texts)]))

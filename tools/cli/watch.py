@@ -116,7 +116,7 @@ def _follow(
 ) -> bool:
     """Draw what is written until it is enough; tell whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
-    from hearthlog.analyzer.review.timeline.live import Live
+    from hearthlog.analyzer.review.timeline.live import LiveTimeline
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 
@@ -127,9 +127,9 @@ def _follow(
             told.append(str(error))
             tell(str(error))
 
-    live: Live | None = None
+    live: LiveTimeline | None = None
     for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell_once):
-        live = live or Live(zone_of([logs], timezone))
+        live = live or LiveTimeline(zone_of([logs], timezone))
         try:
             server.show(live.take(path, batch))
         except LogError as error:

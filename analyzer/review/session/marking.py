@@ -29,7 +29,7 @@ class Marking:
     Parameters
     ----------
     microphone : str
-    heard : Coverage
+    coverage : Coverage
         Which log has what.
     reviewer : str
     corrects : str
@@ -39,7 +39,7 @@ class Marking:
     """
 
     microphone: str
-    heard: Coverage
+    coverage: Coverage
     reviewer: str
     corrects: str
     labelled: LabelledSpans
@@ -101,7 +101,7 @@ class Marking:
 
     def marks(self) -> LabelledSpans:
         """Return all marks of the microphone in these logs."""
-        for log in self.heard.logs:
+        for log in self.coverage.logs:
             if log not in self._known:
                 self._known[log] = read_marks(log)
         marks = (mark for known in self._known.values() for mark in known)
@@ -113,9 +113,9 @@ class Marking:
         )
 
     def _write(self, start: int, end: int, said: Iterable[tuple[int, int, str]]) -> list[Mark]:
-        start = max([start, *self.heard.starts[:1]])
-        end = min([end, *self.heard.ends[-1:]])
-        pieces = self.heard.split(start, end) if start < end else []
+        start = max([start, *self.coverage.starts[:1]])
+        end = min([end, *self.coverage.ends[-1:]])
+        pieces = self.coverage.split(start, end) if start < end else []
         if not pieces:
             raise DataError("not all of this span was recorded: mark a part that was")
         now = time.time_ns()

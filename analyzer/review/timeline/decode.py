@@ -1,17 +1,19 @@
-"""What a timeline takes of logs: topics, fields, and what is made of them."""
+"""Messages of logs as rows of a timeline: fields taken out, names of values checked."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hearthlog.analyzer.review.timeline.model import FrameValues, LabelledSpans, SoundClip, no_spans
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW, TopicName, parse_topic
 
-_KINDS = {"features", "label", "segment", "gap"}
+ENERGY = "energy"
 FIELDS = {
     message_types.FEATURES: ("header.stamp", "values"),
     message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
@@ -20,68 +22,146 @@ FIELDS = {
     message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
     message_types.LOG: ("stamp", "level", "msg"),
 }
+_KINDS = {"features", "label", "segment", "gap"}
 _QUIETEST = 1e-10  # of a mean square: -100 dB
 
 
+class FeatureRows(NamedTuple):
+    """Features of successive frames.
+
+    Attributes
+    ----------
+    microphone : str
+    names : tuple of str
+        Of the columns.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float32
+    """
+
+    microphone: str
+    names: tuple[str, ...]
+    times: Int64
+    values: Float32
+
+
+class LabelRows(NamedTuple):
+    """Probabilities and novelty of successive frames.
+
+    Attributes
+    ----------
+    microphone, labelling : str
+    names : tuple of str
+        Of the classes, which are the columns.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
+    probabilities : np.ndarray [shape=(n, k)], float32
+    novelty : np.ndarray [shape=(n,)], float32
+        NaN where the model has none.
+    """
+
+    microphone: str
+    labelling: str
+    names: tuple[str, ...]
+    times: Int64
+    probabilities: Float32
+    novelty: Float32
+
+
+class SegmentRows(NamedTuple):
+    """Segments of a labelling."""
+
+    microphone: str
+    labelling: str
+    spans: LabelledSpans
+
+
+class GapRows(NamedTuple):
+    """Gaps of a microphone, with their reasons."""
+
+    microphone: str
+    spans: LabelledSpans
+
+
+class StatusRows(NamedTuple):
+    """Diagnostics.
+
+    Attributes
+    ----------
+    times : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    microphones : np.ndarray [shape=(n,)] of str
+        What each message names as its frame; see `is_microphone`.
+    statuses : np.ndarray [shape=(n,)] of sequence of dict
+    """
+
+    times: Int64
+    microphones: NDArray[np.object_]
+    statuses: NDArray[np.object_]
+
+
+Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StatusRows | LogLines
+
+
+def read_rows(path: Path, columns: Columns) -> Rows | None:
+    """Take the fields out of messages of one topic.
+
+    Parameters
+    ----------
+    path : Path
+        The log, for errors.
+    columns : Columns
+        At least one message, with the `FIELDS` of its type.
+
+    Returns
+    -------
+    Rows or None
+        None if a timeline has no place for the topic.
+
+    Raises
+    ------
+    LogError
+        If a channel does not name its values.
+    """
+    if columns.type == message_types.LOG:
+        return LogLines(columns["stamp"], columns["level"], columns["msg"])
+    if columns.type == message_types.DIAGNOSTICS:
+        fields = (columns[name] for name in FIELDS[message_types.DIAGNOSTICS])
+        return StatusRows(*fields)
+    topic = shown_topic(columns.topic)
+    return topic and _microphone_rows(path, columns, topic)
+
+
+def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
+    microphone, labelling = topic.microphone, topic.labelling
+    times = columns["header.stamp"]
+    if columns.type == message_types.FEATURES:
+        names = checked_array_names(path, columns, "values")
+        return FeatureRows(microphone, names, times, columns["values"])
+    if columns.type == message_types.LABEL:
+        names = checked_array_names(path, columns, "probabilities")
+        values = columns["probabilities"], columns["novelty"]
+        return LabelRows(microphone, labelling, names, times, *values)
+    ends = times + columns["duration"]
+    if columns.type == message_types.SEGMENT:
+        return SegmentRows(microphone, labelling, LabelledSpans(times, ends, columns["label"]))
+    return GapRows(microphone, LabelledSpans(times, ends, columns["reason"]))
+
+
 def shown_topic(name: str) -> TopicName | None:
-    """Return the parts of a topic that has a part in the timeline; marks are read otherwise."""
+    """Return the parts of a topic that a timeline shows; marks are read from their layers."""
     topic = parse_topic(name)
     if topic is None or topic.kind not in _KINDS or topic.labelling == REVIEW:
         return None
     return topic
 
 
+def is_microphone(name: str) -> bool:
+    """Tell whether a text can be the name of a microphone."""
+    topic = parse_topic(f"/{name}/gap")
+    return topic is not None and topic.microphone == name
+
+
 def decibel(energy: Any) -> Any:
     """Return the level of a mean square, in dB relative to full scale."""
     return 10 * np.log10(np.maximum(energy, _QUIETEST))
-
-
-def spans_of(columns: Columns, text: str) -> LabelledSpans:
-    """Return the spans that segments or gaps are about; `text` is the field that is shown."""
-    starts = columns["header.stamp"]
-    return LabelledSpans(starts, starts + columns["duration"], columns[text])
-
-
-def runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
-    """Join successive frames whose most probable class is the same, from some time on."""
-    for names, all_times, all_values in parts:
-        later = all_times >= after
-        times, values = all_times[later], all_values[later]
-        if not len(times):
-            continue
-        best = values.argmax(axis=1)
-        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
-        first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
-        last = np.append(first[1:], len(times)) - 1
-        texts = np.array(names, object)[best[first]]
-        yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
-
-
-def lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
-    """Let a trouble last until the next message says that it is over, or that it is another."""
-    changes = [
-        (stamp, text)
-        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
-        if text != before
-    ]
-    stops = [*(stamp for stamp, _ in changes[1:]), end]
-    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
-    if not spans:
-        return no_spans()
-    starts, ends, texts = zip(*spans, strict=True)
-    return LabelledSpans(np.array(starts), np.array(ends), np.array(texts, object))
-
-
-def chained(parts: Sequence[SoundClip]) -> list[SoundClip]:
-    """Join what follows each other."""
-    clips: list[list[SoundClip]] = []
-    for part in sorted(parts, key=lambda clip: clip.start):
-        last = clips[-1][-1] if clips else None
-        if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
-            clips[-1].append(part)
-        else:
-            clips.append([part])
-    return [
-        SoundClip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
-        for run in clips
-    ]

@@ -1,4 +1,4 @@
-"""Equal shares of a span of time, and what falls into them."""
+"""A span of time divided into equal shares, and means of the values in each."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ from hearthlog.schemas.arrays import Float64, Int64
 
 @dataclass(frozen=True)
 class Grid:
-    """A span of time, divided.
+    """A span of time, divided into equal shares.
 
     Attributes
     ----------
     start, end : int
         In nanoseconds of UTC.
     count : int
-        Of its shares.
+        Number of shares.
     """
 
     start: int
@@ -27,24 +27,30 @@ class Grid:
 
     @property
     def edges(self) -> Int64:
-        """Where the shares begin, and where the last one ends; shape (count + 1,)."""
+        """Starts of the shares, and the end of the last one; shape (count + 1,)."""
         shares = np.arange(self.count + 1) / self.count
         return self.start + np.round(shares * (self.end - self.start)).astype(np.int64)
 
+    @property
+    def middles(self) -> Int64:
+        """Middles of the shares; shape (count,)."""
+        edges = self.edges
+        return edges[:-1] + (edges[1:] - edges[:-1]) // 2
+
     def find(self, times: Int64) -> NDArray[np.intp]:
-        """Find the shares that times lie in; those of times outside are cut off to the ends."""
-        found = (times - self.start) * (self.count / (self.end - self.start))
-        return np.clip(found.astype(np.int64), 0, self.count - 1)
+        """Return the index of the share that contains each time; the nearest one outside."""
+        places = (times - self.start) * (self.count / (self.end - self.start))
+        return np.clip(places.astype(np.int64), 0, self.count - 1)
 
 
 class GridMeans:
-    """Means of what falls into the shares of a grid, value by value.
+    """Means of rows of values in each share of a grid.
 
     Parameters
     ----------
     grid : Grid
     width : int
-        Values a row.
+        Values in a row.
     """
 
     def __init__(self, grid: Grid, width: int) -> None:
@@ -53,7 +59,7 @@ class GridMeans:
         self._counts = np.zeros(grid.count, np.int64)
 
     def add(self, times: Int64, values: NDArray[np.floating]) -> None:
-        """Take rows in the order of time; values that are not finite count as 0.
+        """Add rows in the order of time; values that are not finite count as 0.
 
         Parameters
         ----------
@@ -69,7 +75,7 @@ class GridMeans:
 
     @property
     def values(self) -> Float64:
-        """The means, shape (count, width); NaN where nothing fell."""
+        """The means, shape (count, width); NaN in shares without a row."""
         with np.errstate(invalid="ignore"):
             return self._sums / self._counts[:, np.newaxis]
 
@@ -77,15 +83,16 @@ class GridMeans:
 def time_shares(
     starts: Int64, ends: Int64, labels: NDArray[np.intp], width: int, grid: Grid
 ) -> Float64:
-    """Measure how much of each share of a grid each label takes.
+    """Measure which part of each share of a grid each label covers.
 
     Parameters
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
-        Of spans in the order of time; those of one label do not overlap.
+        Spans in nanoseconds of UTC, in the order of time; those of one label do not overlap.
     labels : np.ndarray [shape=(n,)], int
+        The label of each span, 0 to `width` - 1.
     width : int
-        How many labels there are.
+        Number of labels.
     grid : Grid
 
     Returns
@@ -94,8 +101,8 @@ def time_shares(
         0 to 1.
     """
     edges = grid.edges
-    taken = [
+    covered = [
         lengths(Spans(starts[labels == label], ends[labels == label]), edges)
         for label in range(width)
     ]
-    return np.stack(taken, axis=1) / np.diff(edges)[:, np.newaxis]
+    return np.stack(covered, axis=1) / np.diff(edges)[:, np.newaxis]

@@ -1,73 +1,58 @@
-"""What is new in logs that are being written, second by second; what is kept does not grow."""
+"""Follow logs that are being written, second by second; what is kept does not grow."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from datetime import tzinfo
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.channel_names import checked_array_names
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
-from hearthlog.analyzer.review.timeline.decode import FIELDS, decibel, shown_topic, spans_of
+from hearthlog.analyzer.review.timeline.clock import clock
+from hearthlog.analyzer.review.timeline.decode import (
+    ENERGY,
+    FIELDS,
+    FeatureRows,
+    GapRows,
+    LabelRows,
+    Rows,
+    SegmentRows,
+    StatusRows,
+    decibel,
+    is_microphone,
+    read_rows,
+)
 from hearthlog.analyzer.review.timeline.grid import Grid
-from hearthlog.analyzer.review.timeline.lanes import Changes, changes, clock
+from hearthlog.analyzer.review.timeline.lanes import (
+    CLOCK,
+    GAPS,
+    NOT_HEARD,
+    RECORDER,
+    TROUBLE,
+    TROUBLES,
+    Changes,
+    Lane,
+    changes,
+)
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
+from hearthlog.analyzer.review.timeline.plots import FEATURES, LEVEL, NOVELTY, SHARES, Plot
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
-from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 
-LIVE_LANE, GAP_LANE, TROUBLE_LANE = "live", "not heard", "trouble"
-NOT_HEARD = "not heard"
-TROUBLES = ("warning", "error", "stale")  # by the level of a diagnostic status, from 1 on
 _MEMORY = 600  # seconds that the scale of a feature follows
 _SPREAD = 2.0  # standard deviations from its middle to its ends
 _MOST_OPEN = 100_000  # seconds of a segment that may be shown before it closes
 _TINY = np.finfo(np.float64).tiny
 
-
-class Means(NamedTuple):
-    """Means of successive seconds, or of what is there of them.
-
-    Attributes
-    ----------
-    microphone : str
-    kind : str
-        "shares" (of each class, 0 to 1), "novelty", "level" (in dB), "features" (0 to 1).
-    names : tuple of str
-        Of the columns.
-    times : np.ndarray [shape=(n,)], int64
-        Their middles.
-    values : np.ndarray [shape=(n, k)], float64
-        A row of NaN where frames are missing.
-    """
-
-    microphone: str
-    kind: str
-    names: tuple[str, ...]
-    times: Int64
-    values: Float64
-
-
-class Lane(NamedTuple):
-    """What a lane of a microphone shows from when on; the clock is of no microphone."""
-
-    microphone: str
-    name: str
-    changes: Changes
-
-
-News = Means | Lane | LogLines
+Update = Plot | Lane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
@@ -97,97 +82,103 @@ def last_time(folder: Path) -> int | None:
     return None
 
 
-class Live:
-    """Turns messages into what is new on a timeline.
+class LiveTimeline:
+    """Turns messages into updates of lanes and plots.
 
     Parameters
     ----------
     zone : tzinfo
-        Of the home.
+        Time zone of the home.
     """
 
     def __init__(self, zone: tzinfo) -> None:
         self._zone = zone
         self._newest: int | None = None
-        self._ends: dict[tuple[str, ...], int] = {}  # of the last frame, by what was named
+        self._ends: dict[tuple[str, ...], int] = {}  # of the last frame, by topic and names
         self._scales: dict[tuple[str, ...], _Scale] = {}
-        self._open: dict[str, Int64] = {}  # seconds that no segment has settled, by microphone
+        self._open: dict[str, Int64] = {}  # seconds without a segment yet, by microphone
 
-    def take(self, path: Path, batch: Sequence[RawMessages]) -> Iterator[News]:
-        """Take what was written to a log since the last time.
+    def take(self, path: Path, batch: Sequence[RawMessages]) -> Iterator[Update]:
+        """Yield the updates that new messages of a log make.
+
+        Parameters
+        ----------
+        path : Path
+        batch : sequence of RawMessages
+            What was written to the log since the last call.
 
         Raises
         ------
         LogError
-            If its messages are not what they say.
+            If the messages are not of the types of their channels.
         """
         for columns in decode_types(path, batch, FIELDS):
-            if len(columns):
-                yield from self._take(path, columns)
+            rows = read_rows(path, columns) if len(columns) else None
+            if rows is not None:
+                yield from self._update(rows)
 
-    def _take(self, path: Path, columns: Columns) -> Iterator[News]:
-        if columns.type == message_types.LOG:
-            yield LogLines(columns["stamp"], columns["level"], columns["msg"])
-        elif columns.type == message_types.DIAGNOSTICS:
-            yield from _health(columns)
-        elif (topic := shown_topic(columns.topic)) and topic.labelling == LIVE:
-            microphone = topic.microphone
-            if columns.type == message_types.FEATURES:
-                yield from self._clock(columns["header.stamp"])
-                yield from self._features(path, microphone, columns)
-            elif columns.type == message_types.LABEL:
-                yield from self._labels(path, microphone, columns)
-            elif columns.type == message_types.SEGMENT:
-                yield from self._segments(microphone, spans_of(columns, "label"))
-            elif columns.type == message_types.GAP:
-                yield from _gaps(microphone, spans_of(columns, "reason"))
+    def _update(self, rows: Rows) -> Iterator[Update]:
+        match rows:
+            case LogLines():
+                yield rows
+            case StatusRows():
+                yield from _statuses(rows)
+            case FeatureRows():
+                yield from self._clock(rows.times)
+                yield from self._features(rows)
+            case LabelRows(labelling="live"):
+                yield from self._labels(rows)
+            case SegmentRows(labelling="live"):
+                yield from self._segments(rows.microphone, rows.spans)
+            case GapRows():
+                yield _gaps(rows)
 
     def _clock(self, times: Int64) -> Iterator[Lane]:
         first = int(times[0]) if self._newest is None else self._newest
         newest = int(times[-1])
         if newest > first:
             hours = clock(Grid(first, newest, 1), self._zone)
-            yield Lane("", str(self._zone), Changes(hours.starts, list(hours.texts)))
+            yield Lane(CLOCK, "", str(self._zone), Changes(hours.starts, list(hours.texts)))
         self._newest = max(first, newest)
 
-    def _features(self, path: Path, microphone: str, columns: Columns) -> Iterator[Means]:
-        names = checked_array_names(path, columns, "values")
-        _, times, values = self._by_second(
-            (microphone, "features", *names), columns["header.stamp"], columns["values"]
-        )
-        if "energy" in names:
-            level = decibel(values[:, [names.index("energy")]])
-            yield Means(microphone, "level", ("level",), times, level)
-        heard = ~np.isnan(values[:, 0])
+    def _features(self, rows: FeatureRows) -> Iterator[Plot]:
+        microphone, names = rows.microphone, rows.names
+        key = (microphone, "features", *names)
+        _, times, values = self._by_second(key, rows.times, rows.values)
+        if ENERGY in names:
+            level = decibel(values[:, [names.index(ENERGY)]])
+            yield Plot(LEVEL, microphone, "", ("level",), times, level)
+        present = ~np.isnan(values[:, 0])
         scale = self._scales.setdefault((microphone, *names), _Scale())
-        yield Means(microphone, "features", names, times[heard], scale(values[heard]))
+        yield Plot(FEATURES, microphone, "", names, times[present], scale(values[present]))
 
-    def _labels(self, path: Path, microphone: str, columns: Columns) -> Iterator[News]:
-        names = checked_array_names(path, columns, "probabilities")
-        values = np.column_stack([columns["probabilities"], columns["novelty"]])
-        starts, times, means = self._by_second(
-            (microphone, "label", *names), columns["header.stamp"], values
-        )
+    def _labels(self, rows: LabelRows) -> Iterator[Update]:
+        microphone, names = rows.microphone, rows.names
+        values = np.column_stack([rows.probabilities, rows.novelty])
+        starts, times, means = self._by_second((microphone, "label", *names), rows.times, values)
         shares, novelty = means[:, :-1], means[:, -1:]
-        yield Means(microphone, "shares", names, times, shares)
-        if np.isfinite(columns["novelty"]).any():
-            yield Means(microphone, "novelty", ("novelty",), times, novelty)
-        heard = ~np.isnan(shares[:, 0])
-        best = np.where(heard, np.nan_to_num(shares).argmax(axis=1), len(names))
+        yield Plot(SHARES, microphone, LIVE, names, times, shares)
+        if np.isfinite(rows.novelty).any():
+            yield Plot(NOVELTY, microphone, LIVE, ("novelty",), times, novelty)
+        present = ~np.isnan(shares[:, 0])
+        best = np.where(present, np.nan_to_num(shares).argmax(axis=1), len(names))
         states = np.array([*names, None], object)[best]
-        yield Lane(microphone, LIVE_LANE, Changes(starts, states.tolist()))
-        known = self._open.get(microphone, np.empty(0, np.int64))
-        self._open[microphone] = np.append(known, starts[heard])[-_MOST_OPEN:]
+        yield Lane(RECORDER, microphone, LIVE, Changes(starts, states.tolist()))
+        seconds = np.append(self._open_seconds(microphone), starts[present])
+        self._open[microphone] = seconds[-_MOST_OPEN:]
 
     def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
-        """Say again what was heard in the seconds that segments settle: now it is smoothed."""
-        seconds = self._open.get(microphone, np.empty(0, np.int64))
+        """Replace the labels of the seconds in closed segments by those of the segments."""
+        seconds = self._open_seconds(microphone)
         times = np.unique(np.append(seconds, spans.starts))
         rows = rows_at(spans, times)
-        settled = rows >= 0
-        texts = spans.texts[rows[settled]]
-        yield Lane(microphone, LIVE_LANE, Changes(times[settled], texts.tolist()))
+        closed = rows >= 0
+        states = spans.texts[rows[closed]].tolist()
+        yield Lane(RECORDER, microphone, LIVE, Changes(times[closed], states))
         self._open[microphone] = seconds[seconds >= spans.ends[-1]]
+
+    def _open_seconds(self, microphone: str) -> Int64:
+        return self._open.get(microphone, np.empty(0, np.int64))
 
     def _by_second(
         self, key: tuple[str, ...], times: Int64, values: NDArray[np.floating]
@@ -237,22 +228,21 @@ class _Scale:
         return np.clip(scaled + 0.5, 0.0, 1.0)
 
 
-def _gaps(microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
+def _gaps(rows: GapRows) -> Lane:
+    spans = rows.spans
     later = spans.ends > spans.starts  # where the clock was set back nothing is missing
-    spans = LabelledSpans(
-        spans.starts[later], spans.ends[later], np.full(later.sum(), NOT_HEARD, object)
-    )
-    yield Lane(microphone, GAP_LANE, changes(spans))
+    texts = np.full(later.sum(), NOT_HEARD, object)
+    spans = LabelledSpans(spans.starts[later], spans.ends[later], texts)
+    return Lane(GAPS, rows.microphone, NOT_HEARD, changes(spans))
 
 
-def _health(columns: Columns) -> Iterator[Lane]:
-    names = columns["header.frame_id"]
-    for name in np.unique(names.astype(str)).tolist():
-        if not shown_topic(f"/{name}/gap"):
+def _statuses(rows: StatusRows) -> Iterator[Lane]:
+    for name in np.unique(rows.microphones.astype(str)).tolist():
+        if not is_microphone(name):
             continue
-        own = names == name
+        own = rows.microphones == name
         levels = [
-            max((status["level"] for status in each), default=0) for each in columns["status"][own]
+            max((status["level"] for status in each), default=0) for each in rows.statuses[own]
         ]
         states = [TROUBLES[min(level, len(TROUBLES)) - 1] if level else None for level in levels]
-        yield Lane(name, TROUBLE_LANE, Changes(columns["header.stamp"][own], states))
+        yield Lane(TROUBLE, name, "trouble", Changes(rows.times[own], states))

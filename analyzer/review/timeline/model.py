@@ -1,6 +1,6 @@
-"""What a timeline shows: by microphone and labelling, as arrays."""
+"""A timeline as arrays, by microphone and labelling."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 
 
 class LabelledSpans(NamedTuple):
-    """Spans of time that say something.
+    """Spans of time, each with a text: a label, or a reason.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class GridSeries(NamedTuple):
     names : tuple of str
         Of the columns.
     values : np.ndarray [shape=(count, k)], float64
-        NaN where nothing was heard.
+        NaN where nothing was recorded.
     """
 
     names: tuple[str, ...]
@@ -46,13 +46,14 @@ class GridSeries(NamedTuple):
 
 
 class FrameValues(NamedTuple):
-    """Successive frames, 20 a second, as they are in a log.
+    """Values of successive frames, 20 a second, as they are in a log.
 
     Attributes
     ----------
     names : tuple of str
         Of the columns.
     times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float32
     """
 
@@ -62,13 +63,14 @@ class FrameValues(NamedTuple):
 
 
 class LogLines(NamedTuple):
-    """Events in words, in the order of time.
+    """Lines that the recorder logged in words, in the order of time.
 
     Attributes
     ----------
     times : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
     levels : np.ndarray [shape=(n,)], int
-        Of `rcl_interfaces/msg/Log`.
+        Those of `rcl_interfaces/msg/Log`.
     texts : np.ndarray [shape=(n,)] of str
     """
 
@@ -78,7 +80,17 @@ class LogLines(NamedTuple):
 
 
 class SoundClip(NamedTuple):
-    """Sound that was kept: `samples` at `rate` a second, from `start` on, in -1 to 1."""
+    """Kept sound.
+
+    Attributes
+    ----------
+    start : int
+        In nanoseconds of UTC.
+    rate : int
+        Samples a second.
+    samples : np.ndarray [shape=(n,)], float32
+        -1 to 1.
+    """
 
     start: int
     rate: int
@@ -86,19 +98,21 @@ class SoundClip(NamedTuple):
 
     @property
     def end(self) -> int:
-        """When it ends, in nanoseconds of UTC."""
+        """The end, in nanoseconds of UTC."""
         return self.start + len(self.samples) * 1_000_000_000 // self.rate
 
 
 @dataclass
 class LabellingTimeline:
-    """What somebody says that was heard: the recorder (`live`), a model, a reviewer.
+    """The labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`).
 
     Attributes
     ----------
+    name : str
     spans : LabelledSpans
+        The segments or marks.
     probabilities : GridSeries or None
-        Of each class.
+        A column for each class.
     novelty : np.ndarray [shape=(count,)], float64, or None
     frames : list of FrameValues
         The probabilities, frame by frame.
@@ -113,19 +127,22 @@ class LabellingTimeline:
 
 @dataclass
 class MicrophoneTimeline:
-    """What a microphone heard.
+    """What the logs have of a microphone.
 
     Attributes
     ----------
+    name : str
     labellings : list of LabellingTimeline
         The recorder's first, the reviewer's last.
     features : GridSeries or None
     level : np.ndarray [shape=(count,)], float64, or None
-        Of the mean energy, in dB relative to full scale (a square wave of full scale has 0).
+        Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
     level_frames : list of FrameValues
         The level, frame by frame.
-    gaps, troubles : LabelledSpans
-        What was not heard, and what was not well, each with the reason.
+    gaps : LabelledSpans
+        Audio that was lost, with the reasons.
+    troubles : LabelledSpans
+        Warnings and errors of the diagnostics.
     clips : list of SoundClip
     """
 
@@ -138,36 +155,45 @@ class MicrophoneTimeline:
     troubles: LabelledSpans
     clips: list[SoundClip]
 
+    @property
+    def classes(self) -> list[str]:
+        """The classes of the models, then other labels that there are."""
+        series = [one.probabilities for one in self.labellings if one.probabilities is not None]
+        names = [name for each in series for name in each.names]
+        return list(
+            dict.fromkeys([*names, *(t for one in self.labellings for t in one.spans.texts)])
+        )
+
 
 @dataclass
 class Timeline:
-    """What some logs hold.
+    """What some logs hold, at the resolution of a screen.
 
     Attributes
     ----------
     grid : Grid
-        The whole span, in shares as wide as a pixel or two.
+        The whole span, in shares that are a pixel or two wide.
     microphones : dict of str to MicrophoneTimeline
     lines : LogLines
     zone : str
         IANA name of the home's time zone.
-    heard : dict of str to Coverage
-        Which log has what of each microphone.
+    coverage : dict of str to Coverage
+        When each microphone was recording, and in which log.
     every : int
-        One of so many parts of the logs was read.
+        One in so many parts of the logs was read.
     losses : list of str
         What could not be shown, and why.
     """
 
     grid: Grid
-    microphones: dict[str, MicrophoneTimeline]
+    microphones: Mapping[str, MicrophoneTimeline]
     lines: LogLines
     zone: str
-    heard: dict[str, Coverage]
+    coverage: Mapping[str, Coverage]
     every: int = 1
     losses: list[str] = field(default_factory=list)
 
 
 def no_spans() -> LabelledSpans:
-    """Make spans of which there is none."""
+    """Return an empty `LabelledSpans`."""
     return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))

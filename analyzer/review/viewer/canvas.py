@@ -1,7 +1,7 @@
-"""What a Rerun recording is made of: lanes, bands, lines, heat maps, lines of text, clips."""
+"""Draw arrays into a Rerun recording: lanes, bands, lines, heat maps, lines of text, clips."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -16,10 +16,7 @@ from hearthlog.schemas.arrays import Float64, Int64
 TIMELINE = "time"
 _LAYERS = 4  # of translucent bands, one on the other: opaque enough
 _ROWS_AT_ONCE = 72_000  # an hour of frames
-_HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
-_HEAT_PERCENTILES = (2, 98)
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
-_TINY = np.finfo(np.float64).tiny
 _DARK_TO_BRIGHT = np.array(  # through purple and red, as matplotlib's magma
     [(0, 0, 4), (59, 15, 112), (140, 41, 129), (222, 73, 104), (254, 159, 109), (252, 253, 191)]
 )
@@ -27,12 +24,12 @@ _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 
 
 class Canvas:
-    """Draws arrays into a recording, under the names of entities.
+    """Draws arrays into a recording. Times are nanoseconds of UTC, shape (n,).
 
     Parameters
     ----------
     recording : rr.RecordingStream
-        Where it goes: to a file, to a viewer.
+        Goes to a file, or to a viewer.
     """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
@@ -40,45 +37,35 @@ class Canvas:
 
     def configure_lane(self, entity: str, colours: Mapping[str, Colour]) -> None:
         """Give the states of a lane their colours."""
-        about = rr.StateConfiguration(
+        style = rr.StateConfiguration(
             values=list(colours), labels=list(colours), colors=list(colours.values())
         )
-        self.recording.log(entity, about, static=True)
+        self.recording.log(entity, style, static=True)
 
     def change_states(self, entity: str, times: Int64, states: Sequence[str | None]) -> None:
-        """Let a lane be in a state from a time on; None is no state."""
+        """Put a lane into a state at each time; None is no state."""
         column = rr.StateChange.columns(state=pa.array(states, pa.string()))
         self.recording.send_columns(entity, [_time_column(times)], column)
 
-    def draw_bands(
-        self, entity: str, names: Sequence[str], colours: Sequence[Colour], times: Int64,
-        shares: Float64,
-    ) -> None:  # fmt: skip
+    def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
+        """Set names and colours of the bands of an entity, which gets a child for each layer."""
+        for layer in range(_LAYERS):
+            style = rr.Measurements.from_fields(
+                colors=colours, widths=[0.0] * len(names), names=names if layer == 0 else None
+            )
+            self.recording.log(f"{entity}/{layer}", style, static=True)
+
+    def add_bands(self, entity: str, times: Int64, shares: Float64) -> None:
         """Stack shares of one as bands.
 
         Parameters
         ----------
         entity : str
-            Gets one child for each layer.
-        names : sequence of str
-        colours : sequence of Colour
+            Configured by `configure_bands`.
         times : np.ndarray [shape=(n,)], int64
         shares : np.ndarray [shape=(n, k)], float64
             0 to 1; NaN where there is nothing.
         """
-        self.configure_bands(entity, names, colours)
-        self.add_bands(entity, times, shares)
-
-    def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Name the bands, and give them their colours."""
-        for layer in range(_LAYERS):
-            about = rr.Measurements.from_fields(
-                colors=colours, widths=[0.0] * len(names), names=names if layer == 0 else None
-            )
-            self.recording.log(f"{entity}/{layer}", about, static=True)
-
-    def add_bands(self, entity: str, times: Int64, shares: Float64) -> None:
-        """Draw bands that are configured."""
         half = shares / 2
         middles = np.cumsum(shares, axis=1) - half
         lengths = [shares.shape[1]] * len(times)
@@ -89,12 +76,12 @@ class Canvas:
             self.recording.send_columns(f"{entity}/{layer}", [_time_column(times)], columns)
 
     def configure_lines(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Name the lines of a plot, and give them their colours."""
-        about = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
-        self.recording.log(entity, about, static=True)
+        """Set names and colours of the lines of an entity."""
+        style = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
+        self.recording.log(entity, style, static=True)
 
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
-        """Draw a line a column; NaN interrupts it."""
+        """Draw a line for each column of values, shape (n, k); NaN interrupts it."""
         width = values.shape[1]
         for first in range(0, len(times), _ROWS_AT_ONCE):
             part = values[first : first + _ROWS_AT_ONCE]
@@ -102,34 +89,21 @@ class Canvas:
             stamps = _time_column(times[first : first + _ROWS_AT_ONCE])
             self.recording.send_columns(entity, [stamps], column)
 
-    def draw_frames(self, entity: str, names: Sequence[str], parts: Sequence[FrameValues]) -> None:
-        """Draw frames as lines that end where frames are missing."""
+    def draw_frames(self, entity: str, names: Sequence[str], parts: Iterable[FrameValues]) -> None:
+        """Draw frames as lines, interrupted where frames are missing."""
         for part in parts:
             self.draw_lines(entity, *_with_holes(part, names))
 
-    def draw_heat_map(
-        self, entity: str, names: Sequence[str], times: Int64, values: Float64
-    ) -> None:
-        """Show every value as a square, from its low values (dark) to its high ones (bright)."""
-        heard = ~np.isnan(values[:, 0])
-        if not heard.any():
-            return
-        times, values = _thinned(times[heard], values[heard])
-        low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
-        shade = np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
-        self.configure_heat_map(entity, names)
-        self.add_shades(entity, times, shade)
-
     def configure_heat_map(self, entity: str, names: Sequence[str]) -> None:
-        """Name the rows of a heat map."""
+        """Set the names of the rows of a heat map."""
         count = len(names)
-        about = rr.SeriesPoints(
+        style = rr.SeriesPoints(
             names=names, markers=["square"] * count, marker_sizes=[_HEAT_SQUARE] * count
         )
-        self.recording.log(entity, about, static=True)
+        self.recording.log(entity, style, static=True)
 
     def add_shades(self, entity: str, times: Int64, shade: Float64) -> None:
-        """Draw squares of a heat map, from 0 (dark) to 1 (bright)."""
+        """Draw squares of a heat map: shades of 0 (dark) to 1 (bright), shape (n, k)."""
         scale = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
         colours = np.stack([np.interp(shade, scale, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
         count = shade.shape[1]
@@ -143,14 +117,14 @@ class Canvas:
         self.recording.send_columns(entity, [_time_column(times)], columns)
 
     def write_lines(self, entity: str, lines: LogLines) -> None:
-        """List events in words."""
+        """Add lines of text."""
         if len(lines.times):
             levels = [_LEVELS.get(level, "INFO") for level in lines.levels.tolist()]
             column = rr.TextLog.columns(text=lines.texts.tolist(), level=levels)
             self.recording.send_columns(entity, [_time_column(lines.times)], column)
 
     def show_clip(self, entity: str, clip: SoundClip) -> None:
-        """Let a clip be heard and seen from its start on."""
+        """Add a clip of sound at its start."""
         stream = io.BytesIO()
         soundfile.write(stream, clip.samples, clip.rate, format="FLAC", subtype="PCM_16")
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(clip.start, "ns"))
@@ -164,16 +138,8 @@ def _time_column(times: Int64) -> rr.TimeColumn:
     return rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))
 
 
-def _thinned(times: Int64, values: Float64) -> tuple[Int64, Float64]:
-    """Average successive rows until they are few enough."""
-    size = -(-len(times) // _HEAT_COLUMNS)
-    first = np.arange(0, len(times), size)
-    sizes = np.diff(first, append=len(times))
-    return times[first + sizes // 2], np.add.reduceat(values, first) / sizes[:, np.newaxis]
-
-
 def _with_holes(part: FrameValues, names: Sequence[str]) -> tuple[Int64, Float64]:
-    """Bring frames to some columns, and put a row of NaN where frames are missing."""
+    """Bring frames to the named columns, and insert a row of NaN where frames are missing."""
     values = np.full((len(part.times), len(names)), np.nan)
     values[:, [names.index(name) for name in part.names]] = part.values
     length = int(np.median(np.diff(part.times))) if len(part.times) > 1 else 0

@@ -7,7 +7,8 @@ import rerun as rr
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.review.timeline.model import Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
-from hearthlog.analyzer.review.viewer.drawing import APPLICATION, Layout, draw, draw_frames
+from hearthlog.analyzer.review.viewer.drawing import draw, draw_frames
+from hearthlog.analyzer.review.viewer.layout import APPLICATION, review_layout
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.times import time_text
@@ -28,7 +29,7 @@ def check_output(output: Path) -> None:
 def save_timeline(timeline: Timeline, output: Path) -> None:
     """Write a timeline into a Rerun recording (`.rrd`).
 
-    Nothing is sent: Rerun's usage statistics, and the port it opens, are its viewer's.
+    Only Rerun's viewer sends usage statistics and opens a port; this does neither.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
             rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
             recording = rr.RecordingStream(APPLICATION)
             stream = rr.binary_stream(recording)  # for `save` waits for ever where the disk is full
-            recording.send_blueprint(Layout(timeline))
+            recording.send_blueprint(review_layout(timeline))
             canvas = Canvas(recording)
             name_recording(recording, timeline)
             draw(timeline, canvas)
@@ -58,7 +59,7 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
-    """Say when a recording begins, and call it by its span."""
+    """Set the start of a recording, and name it after its span."""
     start, end = timeline.grid.start, timeline.grid.end
     recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")

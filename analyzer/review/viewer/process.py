@@ -1,5 +1,6 @@
-"""Rerun's program: found, started and stopped; it sends no statistics, and only we can reach it."""
+"""The program of Rerun's viewer as a process that only this machine reaches, without statistics."""
 
+import errno
 import json
 import os
 import re
@@ -23,54 +24,68 @@ _BACKTRACE = re.compile(r"\s*\d+: ")
 
 
 def program() -> Path:
-    """Find the program of the package that we use, whatever else is installed.
+    """Return the path of the viewer that belongs to the installed `rerun` package.
 
     Raises
     ------
     DataError
-        If it is not there.
+        If it is not installed.
     """
     spec = find_spec("rerun_cli")
-    found = Path(spec.origin).with_name("rerun") if spec and spec.origin else None
-    if found is None or not found.exists():
+    path = Path(spec.origin).with_name("rerun") if spec and spec.origin else None
+    if path is None or not path.exists():
         raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
-    return found
+    return path
 
 
-def free_port(wanted: int | None = None) -> int:
-    """Choose a port of this machine.
+def free_port(port: int | None = None, bind: str = HOST) -> int:
+    """Return a port on which this machine can listen.
+
+    Parameters
+    ----------
+    port : int, optional
+        The only one that will do; by default any.
+    bind : str
+        Address to listen on.
 
     Raises
     ------
     DataError
-        If the port that is wanted is in use.
+        If one cannot listen there.
     """
-    with socket.socket() as probe:
+    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
+    with socket.socket(family) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((HOST, wanted or 0))
+            probe.bind((bind, port or 0))
         except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise DataError(
+                    f"port {port} is in use, perhaps by another viewer or watcher; choose another "
+                    "one with --port"
+                ) from error
             raise DataError(
-                f"port {wanted} is in use ({error.strerror}); choose another one with --port"
+                f"cannot listen on {bind}, port {port}: {error.strerror or error}"
             ) from error
         return int(probe.getsockname()[1])
 
 
 def check_display(instead: str) -> None:
-    """Raise DataError where a window cannot be opened, which says what else there is."""
+    """Raise DataError where no window can be opened; its message names `--web`, or `instead`."""
     names = ("DISPLAY", "WAYLAND_DISPLAY")
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in names):
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
 
 
 class ViewerProcess:
-    """A run of the program.
+    """A running viewer.
 
     Parameters
     ----------
     arguments : sequence of str
+        Of its command line.
     port : int
-        The one that it listens on, of this machine only.
+        Where it listens, for this machine only.
     """
 
     def __init__(self, arguments: Sequence[str], port: int) -> None:
@@ -84,7 +99,7 @@ class ViewerProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env=os.environ | _apart(Path(self._folder.name)),
+                env=os.environ | _own_configuration(Path(self._folder.name)),
                 start_new_session=True,  # Ctrl-C is for us: we close it in order
             )
 
@@ -96,20 +111,20 @@ class ViewerProcess:
 
     @property
     def url(self) -> str:
-        """Where data for it is sent to."""
+        """Where it takes data."""
         return f"rerun+http://{HOST}:{self.port}/proxy"
 
     def is_running(self) -> bool:
-        """Tell whether it runs; somebody may have closed its window."""
+        """Tell whether it runs; its user may have closed the window."""
         return self._process.poll() is None
 
     def wait_until_it_listens(self) -> None:
-        """Wait until data can be sent to it.
+        """Wait until it takes data.
 
         Raises
         ------
         DataError
-            If it ends instead, or takes too long.
+            If it ends instead, or takes longer than a minute.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while time.monotonic() < deadline:
@@ -122,18 +137,18 @@ class ViewerProcess:
         raise self.failed()
 
     def check(self) -> None:
-        """Raise DataError if it ended because it could not go on."""
+        """Raise DataError if it failed."""
         if (self._process.poll() or 0) > 0:
             raise self.failed()
 
     def failed(self) -> DataError:
-        """Make the error that says why it does not run."""
+        """Return the error that says why it does not run, by its log."""
         lines = self._log.read_text(errors="replace").splitlines()
         lines = [line for line in lines if not _BACKTRACE.match(line)]
-        why = [
+        errors = [
             line for line in lines if "rror" in line or "panick" in line or "No graphics" in line
         ]
-        text = (why or lines or ["it said nothing"])[-1].strip()
+        text = (errors or lines or ["it said nothing"])[-1].strip()
         return DataError(
             f"Rerun's viewer does not run here ({text[:200]}); use --web to look in a browser"
         )
@@ -149,19 +164,19 @@ class ViewerProcess:
         self._folder.cleanup()
 
 
-def _apart(folder: Path) -> dict[str, str]:
-    """Keep the program apart from other runs of it.
+def _own_configuration(folder: Path) -> dict[str, str]:
+    """Return an environment in which the viewer has a configuration of its own.
 
-    It sends nothing to its makers, and does not lay a timeline out as an earlier one was.
+    It sends no statistics, and does not take over the layout of an earlier run.
     """
     configuration = folder / "rerun" / "analytics.json"
     configuration.parent.mkdir()
-    about = {
+    statistics = {
         "analytics_enabled": False,
         "analytics_id": "",
         "metadata": {},
         "config_file_path": str(configuration),
         "data_dir_path": str(folder),
     }
-    configuration.write_text(json.dumps(about), "utf-8")
+    configuration.write_text(json.dumps(statistics), "utf-8")
     return {"XDG_CONFIG_HOME": str(folder), "XDG_DATA_HOME": str(folder)}

@@ -7,21 +7,18 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 import rerun as rr
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.lanes import changes
+from hearthlog.analyzer.review.timeline.lanes import Changes, changes
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
-    APPLICATION,
-    SHARED_AXIS,
-    Layout,
     draw,
     draw_close_up,
     draw_frames,
-    review_lanes,
+    redraw_marks,
 )
 from hearthlog.analyzer.review.viewer.file import name_recording
+from hearthlog.analyzer.review.viewer.layout import APPLICATION, SHARED_AXIS, review_layout
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 
 _PANEL = "/time_panel"
@@ -130,7 +127,7 @@ class Viewer:
         process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
-        layout = Layout(timeline, marking=True, close_up=close_up)
+        layout = review_layout(timeline, marking=True, close_up=close_up)
         self._recording.connect_grpc(process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
         draw(timeline, self._canvas)
@@ -149,18 +146,15 @@ class Viewer:
     def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
         """Show marks as they are now."""
         times, states = changes(marks)
-        known = self._times.setdefault(microphone, set())
-        known |= set(times.tolist())
-        if not known:
+        drawn = self._times.setdefault(microphone, set())
+        drawn |= set(times.tolist())
+        if not drawn:
             return
         # A later row wins over an earlier one of the same time, and none can be taken away.
-        every = np.array(sorted(known))
-        places = np.searchsorted(times, every, side="right") - 1
-        now = [states[place] if place >= 0 else None for place in places.tolist()]
-        colours = {label: colour(label) for label in sorted(set(marks.texts))}
-        for entity in review_lanes(microphone):
-            self._canvas.configure_lane(entity, colours)
-            self._canvas.change_states(entity, every, now)
+        every = np.array(sorted(drawn))
+        rows = np.searchsorted(times, every, side="right") - 1
+        now = [states[row] if row >= 0 else None for row in rows.tolist()]
+        redraw_marks(microphone, Changes(every, now), self._canvas)
         self._flush()
 
     def wait_until_drawn(self) -> ViewerState:

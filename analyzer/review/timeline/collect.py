@@ -1,0 +1,277 @@
+"""Rows of messages, collected on the grid of a timeline."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.analyzer.review.timeline.decode import (
+    ENERGY,
+    FeatureRows,
+    GapRows,
+    LabelRows,
+    Rows,
+    SegmentRows,
+    StatusRows,
+    decibel,
+    is_microphone,
+)
+from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
+from hearthlog.analyzer.review.timeline.model import (
+    FrameValues,
+    GridSeries,
+    LabelledSpans,
+    LabellingTimeline,
+    LogLines,
+    MicrophoneTimeline,
+    SoundClip,
+    no_spans,
+)
+from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.messages.topics import LIVE, REVIEW
+
+_MOST_TROUBLE = 200  # characters
+
+
+@dataclass
+class _NamedMeans:
+    """Means of rows whose columns may differ from log to log."""
+
+    grid: Grid
+    means: dict[tuple[str, ...], GridMeans] = field(default_factory=dict)
+
+    def add(self, names: tuple[str, ...], times: Int64, values: NDArray[np.floating]) -> None:
+        self.means.setdefault(names, GridMeans(self.grid, len(names))).add(times, values)
+
+    def series(self) -> GridSeries | None:
+        """Bring all rows to the same columns; None without rows."""
+        if not self.means:
+            return None
+        names = tuple(dict.fromkeys(name for names in self.means for name in names))
+        values = np.full((self.grid.count, len(names)), np.nan)
+        for own, means in self.means.items():
+            part = means.values
+            present = ~np.isnan(part[:, 0])
+            columns = [names.index(name) for name in own]
+            values[np.flatnonzero(present)[:, np.newaxis], columns] = part[present]
+        return GridSeries(names, values)
+
+
+@dataclass
+class _Microphone:
+    """What is collected of a microphone."""
+
+    features: _NamedMeans
+    level_frames: list[FrameValues] = field(default_factory=list)
+    labels: dict[str, _NamedMeans] = field(default_factory=dict)
+    label_frames: dict[str, list[FrameValues]] = field(default_factory=dict)
+    novelty: dict[str, GridMeans] = field(default_factory=dict)
+    spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
+    gaps: list[LabelledSpans] = field(default_factory=list)
+    troubles: list[tuple[int, str]] = field(default_factory=list)
+    clips: list[SoundClip] = field(default_factory=list)
+    logs: set[Path] = field(default_factory=set)
+
+    @property
+    def is_empty(self) -> bool:
+        return not any((self.features.means, self.labels, self.spans, self.gaps, self.clips))
+
+    @property
+    def labellings(self) -> list[str]:
+        """The names of its labellings: the recorder's first, the reviewer's last."""
+        names = {*self.labels, *self.spans}
+        return sorted(names, key=lambda name: (name == REVIEW, name != LIVE, name))
+
+
+class Collector:
+    """Collects the rows of logs, one after the other in the order of time.
+
+    Parameters
+    ----------
+    grid : Grid
+    sampled : bool
+        Whether only a part of the rows comes: then no single frames are kept.
+    """
+
+    def __init__(self, grid: Grid, *, sampled: bool) -> None:
+        self._grid = grid
+        self._sampled = sampled
+        self._microphones: dict[str, _Microphone] = {}
+        self._lines: list[LogLines] = []
+
+    def add(self, rows: Rows) -> None:
+        """Add the rows of one topic, in the order of time."""
+        match rows:
+            case LogLines():
+                self._lines.append(rows)
+            case StatusRows():
+                self._add_statuses(rows)
+            case FeatureRows():
+                self._add_features(rows)
+            case LabelRows():
+                self._add_labels(rows)
+            case SegmentRows():
+                self._spans(rows.microphone, rows.labelling).append(rows.spans)
+            case GapRows():
+                self._microphone(rows.microphone).gaps.append(rows.spans)
+
+    def add_log(self, microphone: str, log: Path) -> None:
+        """Note that a log or a layer has topics of a microphone."""
+        self._microphone(microphone).logs.add(log)
+
+    def add_marks(self, marks: Iterable[Mark]) -> None:
+        """Add the marks that are in the span of the grid."""
+        for mark in marks:
+            if mark.start < self._grid.end and mark.end > self._grid.start:
+                span = np.array([mark.start]), np.array([mark.end])
+                label = np.array([mark.label], object)
+                self._spans(mark.microphone, REVIEW).append(LabelledSpans(*span, label))
+
+    def add_clip(self, microphone: str, clip: SoundClip) -> None:
+        """Add kept sound."""
+        self._microphone(microphone).clips.append(clip)
+
+    def microphones(self) -> dict[str, MicrophoneTimeline]:
+        """Return the timelines of the microphones that have something to show."""
+        return {
+            name: self._timeline(name, rows)
+            for name, rows in sorted(self._microphones.items())
+            if not rows.is_empty
+        }
+
+    def logs(self, microphone: str) -> set[Path]:
+        """Return the logs and layers that have topics of a microphone."""
+        return self._microphones[microphone].logs
+
+    def lines(self) -> LogLines:
+        """Return the lines of all logs, in the order of time."""
+        if not self._lines:
+            return LogLines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+        times, levels, texts = map(np.concatenate, zip(*self._lines, strict=True))
+        order = np.argsort(times, kind="stable")
+        return LogLines(times[order], levels[order], texts[order])
+
+    def _microphone(self, name: str) -> _Microphone:
+        return self._microphones.setdefault(name, _Microphone(_NamedMeans(self._grid)))
+
+    def _spans(self, microphone: str, labelling: str) -> list[LabelledSpans]:
+        return self._microphone(microphone).spans.setdefault(labelling, [])
+
+    def _add_features(self, rows: FeatureRows) -> None:
+        microphone = self._microphone(rows.microphone)
+        microphone.features.add(rows.names, rows.times, rows.values)
+        if not self._sampled and ENERGY in rows.names:
+            level = decibel(rows.values[:, rows.names.index(ENERGY)])
+            frames = FrameValues(("level",), rows.times, level[:, np.newaxis])
+            microphone.level_frames.append(frames)
+
+    def _add_labels(self, rows: LabelRows) -> None:
+        microphone, name = self._microphone(rows.microphone), rows.labelling
+        means = microphone.labels.setdefault(name, _NamedMeans(self._grid))
+        means.add(rows.names, rows.times, rows.probabilities)
+        if not self._sampled:
+            frames = FrameValues(rows.names, rows.times, rows.probabilities)
+            microphone.label_frames.setdefault(name, []).append(frames)
+        finite = np.isfinite(rows.novelty)
+        if finite.any():
+            novelty = microphone.novelty.setdefault(name, GridMeans(self._grid, 1))
+            novelty.add(rows.times[finite], rows.novelty[finite, np.newaxis])
+
+    def _add_statuses(self, rows: StatusRows) -> None:
+        columns = rows.times.tolist(), rows.microphones.tolist(), rows.statuses
+        for time, name, statuses in zip(*columns, strict=True):
+            messages = [status["message"] for status in statuses if status["level"]]
+            if is_microphone(name):
+                text = "; ".join(messages)[:_MOST_TROUBLE]
+                self._microphone(name).troubles.append((time, text))
+
+    def _timeline(self, name: str, rows: _Microphone) -> MicrophoneTimeline:
+        features = rows.features.series()
+        level = None
+        if features is not None and ENERGY in features.names:
+            level = decibel(features.values[:, features.names.index(ENERGY)])
+        return MicrophoneTimeline(
+            name=name,
+            labellings=[self._labelling(rows, each) for each in rows.labellings],
+            features=features,
+            level=level,
+            level_frames=rows.level_frames,
+            gaps=self._join(rows.gaps),
+            troubles=_lasting(rows.troubles, self._grid.end),
+            clips=_join_clips(rows.clips),
+        )
+
+    def _labelling(self, rows: _Microphone, name: str) -> LabellingTimeline:
+        means, frames = rows.labels.get(name), rows.label_frames.get(name, [])
+        parts = rows.spans.get(name, [])
+        if name == LIVE and self._sampled and means is not None:
+            parts = []  # the segments of a sample have holes between them
+        end = max((int(spans.ends.max()) for spans in parts), default=0)
+        parts = [*parts, *_runs(frames, end)]  # what is open at the end is no segment yet
+        return LabellingTimeline(
+            name,
+            self._join(parts),
+            None if means is None else means.series(),
+            rows.novelty[name].values[:, 0] if name in rows.novelty else None,
+            frames,
+        )
+
+    def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
+        """Chain spans in the order of time, cut off at the ends of the grid."""
+        if not parts:
+            return no_spans()
+        spans = LabelledSpans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        starts = np.maximum(spans.starts, self._grid.start)
+        ends = np.minimum(spans.ends, self._grid.end)
+        inside = np.flatnonzero(starts < ends)
+        order = inside[np.argsort(starts[inside], kind="stable")]
+        return LabelledSpans(starts[order], ends[order], spans.texts[order])
+
+
+def _runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
+    """Join successive frames from some time on whose most probable class is the same."""
+    for names, all_times, all_values in parts:
+        later = all_times >= after
+        times, values = all_times[later], all_values[later]
+        if not len(times):
+            continue
+        best = values.argmax(axis=1)
+        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
+        first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
+        last = np.append(first[1:], len(times)) - 1
+        texts = np.array(names, object)[best[first]]
+        yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+
+
+def _lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
+    """Let each trouble last until the next message with another text; an empty one ends it."""
+    changes = [
+        (stamp, text)
+        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
+        if text != before
+    ]
+    stops = [*(stamp for stamp, _ in changes[1:]), end]
+    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
+    if not spans:
+        return no_spans()
+    starts, ends, texts = zip(*spans, strict=True)
+    return LabelledSpans(np.array(starts), np.array(ends), np.array(texts, object))
+
+
+def _join_clips(parts: Sequence[SoundClip]) -> list[SoundClip]:
+    """Join clips that follow each other without a hole."""
+    runs: list[list[SoundClip]] = []
+    for part in sorted(parts, key=lambda clip: clip.start):
+        last = runs[-1][-1] if runs else None
+        if last and last.rate == part.rate and abs(part.start - last.end) < FRAME_NANOSECONDS:
+            runs[-1].append(part)
+        else:
+            runs.append([part])
+    return [
+        SoundClip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
+        for run in runs
+    ]

@@ -1,0 +1,137 @@
+"""The plots of a review and of a watch: which there are, how they look, and what they show."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.colours import Colour
+from hearthlog.analyzer.review.timeline.model import MicrophoneTimeline, Timeline
+from hearthlog.schemas.arrays import Float64, Int64
+
+_BRIGHT: Colour = (235, 215, 140)
+_NEW: Colour = (160, 200, 255)
+_HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
+_HEAT_PERCENTILES = (2, 98)
+_TINY = np.finfo(np.float64).tiny
+
+
+class Style(Enum):
+    """How values are drawn."""
+
+    BANDS = auto()  # shares of one, as bands one on the other
+    HEAT_MAP = auto()  # 0 (dark) to 1 (bright), a row a column of the values
+    LINE = auto()
+
+
+@dataclass(frozen=True)
+class PlotKind:
+    """How plots of one kind look; they are shown in the order of `PLOTS`.
+
+    Attributes
+    ----------
+    name : str
+        Of the entity.
+    title : str
+        With `{first}`, `{last}` and `{end}` in the place of the names of the first and the last
+        column, and the number of the latter.
+    height : int
+        In relation to other views.
+    style : Style
+    colour : Colour
+        Of a line.
+    scale : tuple of float or None
+        Lowest and highest value that are shown; None fits the values.
+    live_scale : tuple of float or None
+        The same where values follow that nobody knows yet; by default `scale`.
+    """
+
+    name: str
+    title: str
+    height: int
+    style: Style
+    colour: Colour = _BRIGHT
+    scale: tuple[float, float] | None = None
+    live_scale: tuple[float, float] | None = None
+
+
+SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
+LEVEL = PlotKind("level", "Level in dBFS", 100, Style.LINE, live_scale=(-100.0, 0.0))
+NOVELTY = PlotKind(
+    "novelty", "Novelty: 0 as learnt, 1 never heard", 90, Style.LINE, _NEW, live_scale=(0.0, 1.0)
+)
+FEATURES = PlotKind(
+    "features", "Features: 0 ({first}) to {end} ({last}), dark is low", 180, Style.HEAT_MAP
+)
+PLOTS = (SHARES, LEVEL, NOVELTY, FEATURES)
+
+
+class Plot(NamedTuple):
+    """A plot, or what is new in it.
+
+    Attributes
+    ----------
+    kind : PlotKind
+    microphone : str
+    labelling : str
+        Empty where the plot is of none.
+    names : tuple of str
+        Of the columns.
+    times : np.ndarray [shape=(n,)], int64
+        Middles of the spans that values are means of, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float64
+        NaN where nothing was heard.
+    """
+
+    kind: PlotKind
+    microphone: str
+    labelling: str
+    names: tuple[str, ...]
+    times: Int64
+    values: Float64
+
+
+def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
+    """Make the plots of a timeline, microphone by microphone in the order of `PLOTS`."""
+    times = timeline.grid.middles
+    for microphone in timeline.microphones.values():
+        for kind, labelling, names, values in _values(microphone):
+            if kind is FEATURES:
+                yield Plot(kind, microphone.name, labelling, names, *_shades(times, values))
+            else:
+                yield Plot(kind, microphone.name, labelling, names, times, values)
+
+
+def _values(
+    microphone: MicrophoneTimeline,
+) -> Iterator[tuple[PlotKind, str, tuple[str, ...], Float64]]:
+    for one in microphone.labellings:
+        if one.probabilities is not None:
+            yield SHARES, one.name, *one.probabilities
+    if microphone.level is not None:
+        yield LEVEL, "", ("level",), microphone.level[:, np.newaxis]
+    for one in microphone.labellings:
+        if one.novelty is not None:
+            yield NOVELTY, one.name, (f"novelty, {one.name}",), one.novelty[:, np.newaxis]
+    if microphone.features is not None:
+        yield FEATURES, "", *microphone.features
+
+
+def _shades(times: Int64, values: Float64) -> tuple[Int64, Float64]:
+    """Scale each column from its low values (0) to its high ones (1), in few enough rows."""
+    present = ~np.isnan(values[:, 0])
+    if not present.any():
+        return times[:0], values[:0]
+    times, values = _thin(times[present], values[present])
+    low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
+    return times, np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
+
+
+def _thin(times: Int64, values: Float64) -> tuple[Int64, Float64]:
+    """Average successive rows until they are few enough."""
+    size = -(-len(times) // _HEAT_COLUMNS)
+    first = np.arange(0, len(times), size)
+    sizes = np.diff(first, append=len(times))
+    return times[first + sizes // 2], np.add.reduceat(values, first) / sizes[:, np.newaxis]
