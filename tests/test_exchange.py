@@ -16,9 +16,11 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, Coverage, find_coverage
-from hearthlog.analyzer.marks.formats import SUFFIXES, new_marks, read_labels, write_labels
+from hearthlog.analyzer.marks.formats.label_files import read_labels, write_labels
 from hearthlog.analyzer.marks.formats.labels import seconds_text
+from hearthlog.analyzer.marks.formats.table import FORMATS
 from hearthlog.analyzer.marks.marks import LATEST, Mark, read_marks
+from hearthlog.analyzer.marks.merge_marks import new_marks
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -523,8 +525,8 @@ def test_a_label_that_cannot_be_is_refused_with_its_place(tmp_path, case):
     ],
 )
 def test_a_file_that_is_no_label_file_is_refused(logs, hearthlog, tmp_path, content, reason):
-    for suffix in SUFFIXES:
-        labels = tmp_path / f"labels{suffix}"
+    for form in FORMATS:
+        labels = tmp_path / f"labels{form.suffix}"
         if content is not None:
             labels.write_bytes(content)
         result = hearthlog("annotate", "import", logs, labels)
@@ -653,7 +655,8 @@ _PIECES = st.sampled_from(
 
 
 @given(
-    parts=st.lists(_PIECES | st.binary(max_size=8), max_size=30), suffix=st.sampled_from(SUFFIXES)
+    parts=st.lists(_PIECES | st.binary(max_size=8), max_size=30),
+    suffix=st.sampled_from([form.suffix for form in FORMATS]),
 )
 @settings(deadline=None, max_examples=300)
 def test_whatever_is_in_a_label_file_it_is_read_or_refused_in_one_line(

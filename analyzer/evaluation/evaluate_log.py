@@ -18,7 +18,7 @@ from hearthlog.analyzer.evaluation.event_scores import (
 from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import common, joined
-from hearthlog.analyzer.marks.formats import read_lines
+from hearthlog.analyzer.marks.formats.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64

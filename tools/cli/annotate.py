@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.analyzer.marks.formats.table import PATTERNS, find_format
 from hearthlog.tools.cli.options import Microphone
 from hearthlog.tools.cli.reviewer import reviewer_name
 from hearthlog.tools.cli.table import print_table
@@ -20,17 +21,13 @@ annotate = typer.Typer(
     no_args_is_help=True,
     help="Take marks from the label files of other programs, or write them to such files.",
 )
-_FORMS = (
-    "*.txt (Audacity), *.selections.txt (Raven), *.csv, *.eaf (ELAN), *.json (Label Studio) "
-    "or *.rttm"
-)
 _Log = Annotated[Path, typer.Argument(help="A log, or a folder of logs.")]
 
 
 @annotate.command("import")
 def import_labels(
     log: _Log,
-    labels: Annotated[Path, typer.Argument(help=f"Labels: {_FORMS}.")],
+    labels: Annotated[Path, typer.Argument(help=f"Labels: {PATTERNS}.")],
     *,
     microphone: Microphone = None,
     reviewer: Annotated[
@@ -38,13 +35,14 @@ def import_labels(
         typer.Option(help="Who labelled, where the file does not say.", show_default="you"),
     ] = None,
 ) -> None:
-    """Take the labels of a file as marks into review layers, one beside each log.
+    """Add the labels of a file as marks to review layers, one beside each log.
 
-    Where they overlap older marks, they win; what stands there already stays as it is.
+    Where they overlap older marks, they win; labels that stand there already change nothing.
     """
     from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.marks.formats import new_marks, read_labels
+    from hearthlog.analyzer.marks.formats.label_files import read_labels
     from hearthlog.analyzer.marks.marks import read_marks, write_marks
+    from hearthlog.analyzer.marks.merge_marks import new_marks
 
     _check_suffix(labels)
     name, now = reviewer_name(reviewer), time.time_ns()
@@ -68,13 +66,13 @@ def import_labels(
 def export_labels(
     log: _Log,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to make: {_FORMS}.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to make: {PATTERNS}.")],
     microphone: Microphone = None,
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.marks.formats import write_labels
+    from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
     from hearthlog.schemas.storage.new_files import check_new
 
@@ -96,10 +94,8 @@ def export_labels(
 
 
 def _check_suffix(path: Path) -> None:
-    from hearthlog.analyzer.marks.formats import SUFFIXES
-
-    if path.suffix not in SUFFIXES:
-        wrong_use(f"{path}: a label file is {_FORMS}")
+    if find_format(path) is None:
+        wrong_use(f"{path}: a label file is {PATTERNS}")
 
 
 def _print_amounts(marks: "Sequence[Mark]") -> None:

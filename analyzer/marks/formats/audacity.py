@@ -20,13 +20,13 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, *fields)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
     """Write a track, which has no place for microphones and reviewers."""
     microphones = sorted({mark.microphone for mark in marks})
     if len(microphones) > 1:
         names = ", ".join(microphones)
         raise DataError(f"{path}: is for one microphone: choose one with --microphone ({names})")
-    zero = heard[microphones[0]].starts[0]
+    zero = coverage[microphones[0]].starts[0]
     return "".join(
         f"{seconds_text(mark.start - zero)}\t{seconds_text(mark.end - zero)}\t{mark.label}\n"
         for mark in marks

@@ -32,7 +32,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, *(row.get(name, "") for name in _COLUMNS))
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a table with all that marks say; its times are of UTC."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")

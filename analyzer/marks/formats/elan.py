@@ -150,10 +150,10 @@ def _seconds(path: Path, found: _Annotation, milliseconds: str | None) -> str:
     return seconds_text(int(milliseconds) * _MILLISECOND)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a document whose times begin with the first frame of all its microphones."""
     marks = [mark._replace(reviewer=mark.reviewer.translate(_NO_XML)) for mark in marks]
-    zero = min(heard[mark.microphone].starts[0] for mark in marks)
+    zero = min(coverage[mark.microphone].starts[0] for mark in marks)
     root = ET.Element(
         "ANNOTATION_DOCUMENT",
         {

@@ -1,13 +1,14 @@
-"""Label files: their forms by suffix and content, read and written."""
+"""Label files of any format, read as marks and written from marks."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Protocol, cast
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.text_files import read_text
-from hearthlog.analyzer.marks.formats import audacity, csvfile, elan, labelstudio, raven, rttm
+from hearthlog.analyzer.marks.formats import raven
 from hearthlog.analyzer.marks.formats.labels import (
     FileLabel,
     PlacedMark,
@@ -15,46 +16,37 @@ from hearthlog.analyzer.marks.formats.labels import (
     make_mark,
     place_text,
 )
+from hearthlog.analyzer.marks.formats.table import AUDACITY, RAVEN, LabelFormat, find_format
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.storage.new_files import new_file
 
-_SIZE_LIMIT = 16 << 20  # a hundred thousand labels, or more; what is larger is something else
-_XML_LIMIT = 64 << 20  # as many
-_OBEYED = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # by terminals; names have no others
+_CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # that a name may have
 
 
-class _Form(NamedTuple):
-    read: Callable[[Path, str], Iterator[FileLabel]]
-    write: Callable[[Path, Sequence[Mark], Mapping[str, Coverage]], str]
-    size_limit: int = _SIZE_LIMIT
+class LabelCodec(Protocol):
+    """The functions of the module of a format."""
 
+    def read(self, path: Path, text: str) -> Iterator[FileLabel]:
+        """Yield the labels of a file; raise DataError with file and place if it is none."""
 
-_AUDACITY = _Form(audacity.read, audacity.write)
-_RAVEN = _Form(raven.read, raven.write)
-_FORMS = {
-    ".txt": _AUDACITY,
-    ".csv": _Form(csvfile.read, csvfile.write),
-    ".eaf": _Form(elan.read, elan.write, _XML_LIMIT),
-    ".json": _Form(labelstudio.read, labelstudio.write),
-    ".rttm": _Form(rttm.read, rttm.write),
-}
-SUFFIXES = tuple(_FORMS)
+    def write(self, path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
+        """Return the text of a file that `read` reads again."""
 
 
 def read_labels(
-    path: Path, heard: Mapping[str, Coverage], microphone: str | None = None
+    path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
 ) -> dict[Path, list[Mark]]:
     """Read a label file.
 
     Parameters
     ----------
     path : Path
-        `*.txt` (a label track of Audacity, or a selection table of Raven), `*.csv`, `*.eaf`
-        (ELAN), `*.json` (Label Studio) or `*.rttm`.
-    heard : mapping of str to Coverage
-        By microphone: the logs, and when it was heard.
+        Of one of the formats in `table.FORMATS`, by its suffix; a `*.txt` is a table of Raven or
+        a label track of Audacity by its first line.
+    coverage : mapping of str to Coverage
+        Of each microphone.
     microphone : str, optional
-        Of the labels that do not name theirs; not needed if there is only one.
+        Of labels that do not name theirs; not needed if there is only one.
 
     Returns
     -------
@@ -64,14 +56,14 @@ def read_labels(
     Raises
     ------
     DataError
-        With file and place, if the file is no label file, a time or label cannot be, labels
-        overlap, or one lies where nothing was heard.
+        With file and place, if the file is no label file, a time or a label is invalid, labels
+        overlap, or one lies where nothing was recorded.
     """
-    found = read_lines(path, heard, microphone)
-    check_overlaps(path, found)
+    placed = read_lines(path, coverage, microphone)
+    check_overlaps(path, placed)
     by_log: dict[Path, list[Mark]] = {}
-    for place, mark in found:
-        pieces = heard[mark.microphone].split(mark.start, mark.end)
+    for place, mark in placed:
+        pieces = coverage[mark.microphone].split(mark.start, mark.end)
         if not pieces:
             raise DataError(
                 f"{place_text(path, place)}: {mark.label} lies outside of what {mark.microphone} "
@@ -83,37 +75,39 @@ def read_labels(
 
 
 def read_lines(
-    path: Path, heard: Mapping[str, Coverage], microphone: str | None = None
+    path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
 ) -> list[PlacedMark]:
-    """Read a label file whose labels may overlap, and may lie where nothing was heard.
+    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
 
     Parameters and errors are otherwise those of `read_labels`.
 
     Returns
     -------
-    list of (int or str, Mark)
+    list of PlacedMark
         With their lines, or their places in a file that has none.
     """
-    form = _FORMS.get(path.suffix, _AUDACITY)
-    text = read_text(path, "label file", form.size_limit)
-    if form is _AUDACITY and raven.is_table(text):
-        form = _RAVEN
-    found = [make_mark(path, label, heard, microphone) for label in form.read(path, text)]
-    if not found:
+    format_ = find_format(path) or AUDACITY
+    text = read_text(path, "label file", format_.size_limit)
+    if format_ in {AUDACITY, RAVEN}:
+        format_ = RAVEN if raven.is_table(text) else AUDACITY
+    labels = _codec(format_).read(path, text)
+    placed = [make_mark(path, label, coverage, microphone) for label in labels]
+    if not placed:
         raise DataError(f"{path}: holds no labels")
-    return found
+    return placed
 
 
-def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> None:
+def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> None:
     """Write marks as a label file that `read_labels` reads again.
 
     Parameters
     ----------
     path : Path
-        Named as for `read_labels`; `*.selections.txt` is a table of Raven. Must not exist.
+        With a suffix of `table.FORMATS`. Must not exist.
     marks : sequence of Mark
-        For a label track of Audacity those of one microphone.
-    heard : mapping of str to Coverage
+        Of one microphone for a label track of Audacity.
+    coverage : mapping of str to Coverage
+        Of each microphone.
 
     Raises
     ------
@@ -124,17 +118,23 @@ def write_labels(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage
     """
     if not marks:
         raise DataError("no marks to export: nothing was imported or marked in these logs yet")
-    form = _RAVEN if path.name.endswith(raven.SUFFIX) else _FORMS[path.suffix]
-    raw = form.write(path, [_harmless(mark) for mark in marks], heard).encode()
-    if len(raw) > form.size_limit:
-        limit = form.size_limit >> 20
+    format_ = find_format(path)
+    assert format_ is not None
+    harmless = [_without_controls(mark) for mark in marks]
+    raw = _codec(format_).write(path, harmless, coverage).encode()
+    if len(raw) > format_.size_limit:
+        limit = format_.size_limit >> 20
         raise DataError(f"{path}: would be larger than {limit} MB; export fewer logs")
     with new_file(path) as temporary:
         temporary.write_bytes(raw)
 
 
-def _harmless(mark: Mark) -> Mark:
-    """Leave out of a mark what would steer a terminal."""
+def _codec(format_: LabelFormat) -> LabelCodec:
+    return cast(LabelCodec, import_module(f"{__package__}.{format_.module}"))
+
+
+def _without_controls(mark: Mark) -> Mark:
+    """Replace the characters of names that would steer a terminal."""
     return mark._replace(
-        reviewer=mark.reviewer.translate(_OBEYED), corrects=mark.corrects.translate(_OBEYED)
+        reviewer=mark.reviewer.translate(_CONTROLS), corrects=mark.corrects.translate(_CONTROLS)
     )

@@ -1,4 +1,4 @@
-"""What a label file says, and the marks that this makes."""
+"""Labels as they are in a file, and the marks that they become."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -14,22 +14,28 @@ from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
 
 _SECONDS = re.compile(r"[-+]?[0-9]{1,10}(\.[0-9]{0,18})?([eE][-+]?[0-9]{1,2})?")
-_OTHER_SOUND = NANOSECONDS  # what a recording and the logs of it may differ in length
+_LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and the logs of it
 
 
 class FileLabel(NamedTuple):
-    """A label as it is in a file, all of it text.
+    """A label as it is in a file: text, empty where the file does not say it.
 
     Attributes
     ----------
     place : int or str
-        Its line, or its place in a file that has no lines.
+        The line, or the place in a file without lines.
     start, end : str
-        Seconds from `zero` on, or ISO 8601.
+        Seconds since `zero`, or ISO 8601.
+    label : str
+    microphone, reviewer : str
+    made : str
+        When the label was made, ISO 8601.
+    corrects : str
+        The labelling that it corrects.
     zero : str
-        ISO 8601; by default it is the first frame of the microphone.
+        ISO 8601; by default the first frame of the microphone.
     length : str
-        Of the recording that was labelled, in seconds; empty if nobody knows.
+        Length of the labelled recording, in seconds.
     """
 
     place: int | str
@@ -45,35 +51,46 @@ class FileLabel(NamedTuple):
 
 
 class PlacedMark(NamedTuple):
-    """A mark, and the place in the file where it is."""
+    """A mark, and its line or place in the file."""
 
     place: int | str
     mark: Mark
 
 
 def place_text(path: Path, place: int | str) -> str:
-    """Name a place in a file, for a message."""
+    """Write the place of a label for an error: `file:line`, or `file: place`."""
     return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
 def make_mark(
-    path: Path, label: FileLabel, heard: Mapping[str, Coverage], microphone: str | None
+    path: Path, label: FileLabel, coverage: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
     """Make a mark of a label.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for errors.
+    label : FileLabel
+    coverage : mapping of str to Coverage
+        Of each microphone.
+    microphone : str or None
+        Of a label that does not name one; not needed if there is only one.
 
     Raises
     ------
     DataError
-        With file and place, if it cannot be one.
+        With file and place, if it is no valid mark.
     """
     where = place_text(path, label.place)
-    name = label.microphone or microphone or (next(iter(heard)) if len(heard) == 1 else "")
-    if name not in heard:
-        known = ", ".join(sorted(heard))
+    only = next(iter(coverage)) if len(coverage) == 1 else ""
+    name = label.microphone or microphone or only
+    if name not in coverage:
+        names = ", ".join(sorted(coverage))
         if name:
-            raise DataError(f"{where}: no microphone {name[:64]!r} in the logs; there is {known}")
-        raise DataError(f"{where}: of which microphone? choose one with --microphone ({known})")
-    zero = _zero(where, label, heard[name])
+            raise DataError(f"{where}: no microphone {name[:64]!r} in the logs; there is {names}")
+        raise DataError(f"{where}: of which microphone? choose one with --microphone ({names})")
+    zero = _zero(where, label, coverage[name])
     start, end = _time(where, label.start, zero), _time(where, label.end, zero)
     if not CLASS_NAME.fullmatch(label.label):
         raise DataError(
@@ -86,16 +103,16 @@ def make_mark(
         raise DataError(f"{where}: {label.label} ends before it starts")
     if start < zero and label.start.startswith("-"):
         raise DataError(f"{where}: {label.label} starts at {label.start} s, before the first frame")
-    return PlacedMark(label.place, Mark(name, start, end, label.label, *_says(where, label)))
+    return PlacedMark(label.place, Mark(name, start, end, label.label, *_origin(where, label)))
 
 
-def check_overlaps(path: Path, found: Sequence[PlacedMark]) -> None:
-    """Raise DataError if labels of a microphone overlap."""
-    order = sorted(range(len(found)), key=lambda i: found[i].mark)
+def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
+    """Raise DataError if marks of one microphone overlap."""
+    order = sorted(range(len(placed)), key=lambda i: placed[i].mark)
     for one, other in pairwise(order):
-        earlier, later = found[one].mark, found[other].mark
+        earlier, later = placed[one].mark, placed[other].mark
         if earlier.microphone == later.microphone and later.start < earlier.end:
-            first, last = (found[i].place for i in sorted((one, other)))
+            first, last = (placed[i].place for i in sorted((one, other)))
             name = f"line {first}" if isinstance(first, int) else first
             raise DataError(f"{place_text(path, last)}: overlaps the label in {name}")
 
@@ -106,7 +123,7 @@ def read_seconds(where: str, text: str) -> Decimal:
     Raises
     ------
     DataError
-        If it is none.
+        If it is no number.
     """
     if not _SECONDS.fullmatch(text):
         raise DataError(f"{where}: {text[:64]!r} is no number of seconds")
@@ -114,33 +131,33 @@ def read_seconds(where: str, text: str) -> Decimal:
 
 
 def seconds_text(nanoseconds: int) -> str:
-    """Write a time as seconds, none of whose digits is lost."""
+    """Write nanoseconds as seconds with all nine decimals."""
     seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
     return f"{'-' if nanoseconds < 0 else ''}{seconds}.{rest:09}"
 
 
 def made_text(mark: Mark) -> str:
-    """Write when a mark was made; empty if nobody knows."""
+    """Write the time at which a mark was made; empty if it is unknown."""
     return time_text(mark.made) if mark.made else ""
 
 
-def _zero(where: str, label: FileLabel, heard: Coverage) -> int:
-    """Return the time that seconds are counted from."""
+def _zero(where: str, label: FileLabel, coverage: Coverage) -> int:
+    """Return the time from which seconds are counted."""
     if label.zero:
         return _time(where, label.zero, 0)
     if label.length:
-        length = round(read_seconds(where, label.length) * NANOSECONDS)
-        known = heard.ends[-1] - heard.starts[0]
-        if abs(length - known) > _OTHER_SOUND:
+        labelled = round(read_seconds(where, label.length) * NANOSECONDS)
+        recorded = coverage.ends[-1] - coverage.starts[0]
+        if abs(labelled - recorded) > _LENGTH_TOLERANCE:
             raise DataError(
                 f"{where}: labels a recording of {label.length} s, and these logs are of "
-                f"{known / NANOSECONDS:.3f} s; name the logs of that recording, no others"
+                f"{recorded / NANOSECONDS:.3f} s; name the logs of that recording, no others"
             )
-    return heard.starts[0]
+    return coverage.starts[0]
 
 
-def _says(where: str, label: FileLabel) -> tuple[str, int, str]:
-    """Return who says so, when, and what is corrected."""
+def _origin(where: str, label: FileLabel) -> tuple[str, int, str]:
+    """Return the reviewer, when the label was made, and the labelling that it corrects."""
     reviewer, corrects = label.reviewer.strip(), label.corrects.strip()
     for text in (reviewer, corrects):
         if not PERSON_NAME.fullmatch(text):
@@ -152,7 +169,7 @@ def _says(where: str, label: FileLabel) -> tuple[str, int, str]:
 
 
 def _time(where: str, text: str, zero: int) -> int:
-    """Read seconds from `zero` on, or a time of day and date."""
+    """Read seconds since `zero`, or ISO 8601, in nanoseconds of UTC."""
     if _SECONDS.fullmatch(text):
         return zero + round(Decimal(text) * NANOSECONDS)
     try:

@@ -29,16 +29,18 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield from _of_task(path, place, task)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a task for each microphone."""
-    microphones = sorted({mark.microphone for mark in marks})
-    tasks = [_task(name, [m for m in marks if m.microphone == name], heard) for name in microphones]
+    tasks = [
+        _task(name, [mark for mark in marks if mark.microphone == name], coverage[name])
+        for name in sorted({mark.microphone for mark in marks})
+    ]
     return "[\n" + ",\n".join(tasks) + "\n]\n"
 
 
-def _task(microphone: str, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:
-    zero = heard[microphone].starts[0]
-    length = seconds_text(heard[microphone].ends[-1] - zero)
+def _task(microphone: str, marks: Sequence[Mark], coverage: Coverage) -> str:
+    zero = coverage.starts[0]
+    length = seconds_text(coverage.ends[-1] - zero)
     data = {"audio": f"{microphone}.wav", "microphone": microphone, "start": time_text(zero)}
     items = ",\n".join(_item(number, mark, zero, length) for number, mark in enumerate(marks, 1))
     return f'{{"data": {dumps(data)}, "annotations": [{{"result": [\n{items}\n]}}]}}'

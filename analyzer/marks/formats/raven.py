@@ -8,7 +8,6 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
-SUFFIX = ".selections.txt"
 _BAND = ("0.000", "8000.000")  # Hz; of the sound that is listened to
 _COLUMNS = (
     "Selection",
@@ -58,12 +57,12 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
             yield FileLabel(number, *fields)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a table; what Raven has no column for is in columns of our own, which it keeps."""
     channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
     lines = ["\t".join(_COLUMNS)]
     for number, mark in enumerate(marks, 1):
-        zero = heard[mark.microphone].starts[0]
+        zero = coverage[mark.microphone].starts[0]
         fields = [
             str(number),
             "Spectrogram 1",

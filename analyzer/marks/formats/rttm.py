@@ -28,11 +28,11 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         yield FileLabel(number, onset, f"{end:f}", label, microphone)
 
 
-def write(path: Path, marks: Sequence[Mark], heard: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
     """Write a line for each mark."""
     lines = []
     for mark in marks:
-        onset = seconds_text(mark.start - heard[mark.microphone].starts[0])
+        onset = seconds_text(mark.start - coverage[mark.microphone].starts[0])
         duration = seconds_text(mark.end - mark.start)
         lines.append(
             f"{_TYPE} {mark.microphone} 1 {onset} {duration} <NA> <NA> {mark.label} <NA> <NA>\n"

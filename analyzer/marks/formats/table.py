@@ -1,0 +1,54 @@
+"""The formats of label files: the one table that readers, writers and the command line use.
+
+A format is a module of this folder, with the functions of `label_files.LabelCodec`, and a row here.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+_MEGABYTE = 1 << 20
+
+
+class LabelFormat(NamedTuple):
+    """A format of label files.
+
+    Attributes
+    ----------
+    name : str
+        Of the program, or of the format.
+    suffix : str
+    module : str
+        In this folder.
+    size_limit : int
+        In bytes; the default is enough for a hundred thousand labels.
+    """
+
+    name: str
+    suffix: str
+    module: str
+    size_limit: int = 16 * _MEGABYTE
+
+    @property
+    def pattern(self) -> str:
+        """How its files are named, and what they are: `*.eaf (ELAN)`."""
+        named = self.suffix == f".{self.name.lower()}"
+        return f"*{self.suffix}" if named else f"*{self.suffix} ({self.name})"
+
+
+AUDACITY = LabelFormat("Audacity", ".txt", "audacity")
+RAVEN = LabelFormat("Raven", ".selections.txt", "raven")
+FORMATS = (
+    AUDACITY,
+    RAVEN,
+    LabelFormat("CSV", ".csv", "csvfile"),
+    LabelFormat("ELAN", ".eaf", "elan", 64 * _MEGABYTE),  # XML takes more for as many labels
+    LabelFormat("Label Studio", ".json", "labelstudio"),
+    LabelFormat("RTTM", ".rttm", "rttm"),
+)
+PATTERNS = f"{', '.join(each.pattern for each in FORMATS[:-1])} or {FORMATS[-1].pattern}"
+
+
+def find_format(path: Path) -> LabelFormat | None:
+    """Return the format of a file by its name; None if it is none of them."""
+    fitting = [each for each in FORMATS if path.name.endswith(each.suffix)]
+    return max(fitting, key=lambda each: len(each.suffix), default=None)
