@@ -241,7 +241,7 @@ def test_a_span_in_which_there_is_nothing_is_one_line(folder):
 
 def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder, timeline):
     back = read_timeline(find_logs(folder)[::-1])
-    assert (back.grid, back.heard) == (timeline.grid, timeline.coverage)
+    assert (back.grid, back.coverage) == (timeline.grid, timeline.coverage)
     one, other = back.microphones["mic"], timeline.microphones["mic"]
     np.testing.assert_array_equal(one.features.values, other.features.values)
     for a, b in zip(one.labellings, other.labellings, strict=True):
