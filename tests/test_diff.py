@@ -19,7 +19,7 @@ from hearthlog.analyzer.evaluation.difference import compare_sides
 from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import Side, find_sources
+from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans, other_labels
 from hearthlog.analyzer.review.queue.ranking import make_queue
@@ -88,7 +88,7 @@ def write_layer(log, other, name, kinds=("label", "segment"), change=lambda _: {
 def side(name, rows, classes=CLASSES):
     starts, ends, labels = zip(*rows, strict=True)
     labelling = Labelling(np.array(starts), np.array(ends), np.array(labels, object))
-    return Side(name, classes, labelling)
+    return NamedLabelling(name, classes, labelling)
 
 
 def events(*rows):
@@ -335,7 +335,7 @@ def test_what_the_model_is_unsure_of_or_finds_new_comes_first(logs, uncertain, r
     lengths = [end - start for start, end, _ in own]
     start, end, _ = own[int(np.argsort(lengths)[-2])]
     write_layer(log, log, "odd", change=doubtful(start, end, own, uncertain=uncertain))
-    sources = find_sources(log)
+    sources = find_labellings(log)
     found = sources.read("mic", "relabel/odd")
     queue = make_queue(sources, "mic", found, other=None, marks=None, count=5)
     assert start <= queue.windows.starts[0] < queue.windows.ends[0] <= end
@@ -380,14 +380,14 @@ def write_home(path, rows, probabilities):
 
 
 def queue_of(log, count):
-    sources = find_sources(log)
+    sources = find_labellings(log)
     live = sources.read("mic", "live")
     return make_queue(sources, "mic", live, other=None, marks=None, count=count)
 
 
 def test_another_name_for_a_class_is_no_reason_to_review_it(tmp_path):
     rows = [(0, 4, "speech"), (4, 8, "coughing"), (8, 12, "speech")]
-    sources = find_sources(write_home(tmp_path / "home.mcap", rows, lambda *_: [0.0, 1.0, 0.0]))
+    sources = find_labellings(write_home(tmp_path / "home.mcap", rows, lambda *_: [0.0, 1.0, 0.0]))
     said = [
         *((MIDNIGHT + 4 * NANOSECONDS, MIDNIGHT + 8 * NANOSECONDS, "cough"),),
         *((MIDNIGHT + 8 * NANOSECONDS, MIDNIGHT + 12 * NANOSECONDS, "laughter"),),

@@ -25,7 +25,7 @@ from viewers import Window, browsing, display, free_port, patiently, reviewing, 
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.logs.labellings import find_sources
+from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.queue.review_list import write_list
@@ -494,7 +494,7 @@ def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
 
 @pytest.mark.parametrize("ranking", ["uncertain", "novel", "disagreeing", "random"])
 def test_a_queue_has_spans_of_the_labelling_that_do_not_overlap(recorded_home, timeline, ranking):
-    sources = find_sources(recorded_home)
+    sources = find_labellings(recorded_home)
     found = queue_items(ranking, sources, ("mic", "live"), (None, None), 8)
     assert 2 <= len(found) <= 8
     ordered = sorted(found)
@@ -514,9 +514,9 @@ def test_a_queue_has_spans_of_the_labelling_that_do_not_overlap(recorded_home, t
 
 
 def test_what_was_reviewed_is_not_in_the_queue(home):
-    (first, *_) = queue_items("uncertain", find_sources(home), ("mic", "live"), (None, None), 5)
+    (first, *_) = queue_items("uncertain", find_labellings(home), ("mic", "live"), (None, None), 5)
     marking_of(home).mark(first.start, first.end, "yelling")
-    found = queue_items("uncertain", find_sources(home), ("mic", "live"), (None, None), 5)
+    found = queue_items("uncertain", find_labellings(home), ("mic", "live"), (None, None), 5)
     assert all(item.end <= first.start or item.start >= first.end for item in found)
 
 
@@ -537,7 +537,7 @@ def test_a_list_of_diff_is_gone_through_in_its_order(recorded_home, tmp_path):
     ]
     other = spans[0]._replace(microphone="bath")
     write_list(tmp_path / "list.csv", [other, *spans])
-    arguments = (str(tmp_path / "list.csv"), find_sources(recorded_home), ("mic", "live"))
+    arguments = (str(tmp_path / "list.csv"), find_labellings(recorded_home), ("mic", "live"))
     found = queue_items(*arguments, (None, None), 60)
     assert [item[:2] for item in found] == [span[1:3] for span in spans]
     part = queue_items(*arguments, (START + 21 * SECOND, START + 60 * SECOND), 60)

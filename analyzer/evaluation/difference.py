@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, events_of
-from hearthlog.analyzer.logs.labellings import Side
+from hearthlog.analyzer.logs.labellings import NamedLabelling
 from hearthlog.analyzer.logs.spans import Overlay, overlay
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -114,7 +114,7 @@ class Difference:
     disagreements: Runs
 
 
-def compare_sides(a: Side, b: Side) -> Difference:
+def compare_sides(a: NamedLabelling, b: NamedLabelling) -> Difference:
     """Compare two labellings where both have a label.
 
     What b has by another name (see `hearthlog.models.classes`) is called as a calls it.

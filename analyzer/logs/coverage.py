@@ -7,7 +7,6 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.mcap.statistics import time_span
@@ -74,14 +73,11 @@ def find_coverage(path: Path) -> dict[str, Coverage]:
     """
     selection = select([path])
     coverage: dict[str, Coverage] = {}
-    for name, channels in selection.channels.items():
+    for name in selection.topics_of(message_types.FEATURES, _FIELDS):
         microphone = name.removeprefix("/").removesuffix(f"/{_KIND}")
-        if name == topic(microphone, _KIND) and all(
-            is_compatible(*described, message_types.FEATURES, _FIELDS) for described in channels
-        ):
-            spans = sorted(_spans(selection.logs, name))
-            if spans:
-                coverage[microphone] = coverage_of(spans)
+        spans = sorted(_spans(selection.logs, name))
+        if spans and name == topic(microphone, _KIND):
+            coverage[microphone] = coverage_of(spans)
     if not coverage:
         raise DataError(f"{path}: no features of a microphone; name a log, or a folder of logs")
     return coverage

@@ -1,4 +1,4 @@
-"""Labellings of a log: its own segments, a layer's, a reviewer's, or those of a label file."""
+"""A labelling: labelled spans of time by one source, as arrays, and how segments become one."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.models.classes import translation
+from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import microphone_of
 
 FIELDS = {"header.stamp", "duration", "label"}
-_MOST_CLASSES = 100
+MOST_CLASSES = 100
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class Labelling:
 
 
 @dataclass(frozen=True)
-class Labelled:
-    """What a log is labelled with.
+class TopicLabelling:
+    """The labelling that some logs have on a topic of segments.
 
     Attributes
     ----------
@@ -67,10 +68,10 @@ class Labelled:
     @property
     def microphone(self) -> str:
         """Name of the microphone."""
-        return self.topic.strip("/").split("/")[0]
+        return microphone_of(self.topic)
 
 
-def read_labelled(path: Path, topic: str | None = None) -> Labelled:
+def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     """Read the segments of a log, or of a folder of logs, and of their layers.
 
     Parameters
@@ -92,11 +93,18 @@ def read_labelled(path: Path, topic: str | None = None) -> Labelled:
     labelling = labelling_of(columns)
     channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
     named = [array_names(channel.metadata, "probabilities") for channel, _ in channels]
-    classes = all_classes(topic, named, labelling)
-    return Labelled(topic, classes, labelling, tuple(selection.unfinished))
+    classes = all_classes(topic, named, labelling.labels)
+    return TopicLabelling(topic, classes, labelling, tuple(selection.unfinished))
 
 
 def labelling_of(segments: Columns) -> Labelling:
+    """Make a labelling of segments; raises as `segments_in_order`."""
+    segments = segments_in_order(segments)
+    starts = segments["header.stamp"]
+    return Labelling(starts, starts + segments["duration"], segments["label"])
+
+
+def segments_in_order(segments: Columns) -> Columns:
     """Put segments in the order of time; those that are over at once are left out.
 
     Raises
@@ -106,17 +114,17 @@ def labelling_of(segments: Columns) -> Labelling:
     """
     segments = segments.take(np.flatnonzero(segments["duration"] > 0))
     segments = segments.take(np.argsort(segments["header.stamp"], kind="stable"))
-    starts = segments["header.stamp"]
-    ends = starts + segments["duration"]
+    starts, ends = segments["header.stamp"], segments["header.stamp"] + segments["duration"]
     if (starts[1:] < ends[:-1]).any():
         raise LogError(
-            f"{segments.topic}: segments overlap; is a log there twice, or those of two homes?"
+            f"{segments.topic}: segments overlap; is a log there twice, or those of two homes? "
+            "name the folder of one"
         )
-    return Labelling(starts, ends, segments["label"])
+    return segments
 
 
 def all_classes(
-    topic: str, named: Iterable[Sequence[str]], labelling: Labelling
+    topic: str, named: Iterable[Sequence[str]], labels: Iterable[str]
 ) -> tuple[str, ...]:
     """List the labels that there may be: those that logs name, and those that there are.
 
@@ -125,26 +133,30 @@ def all_classes(
     LogError
         If they are too many.
     """
-    names = [name for names in named for name in names]
-    classes = tuple(dict.fromkeys([*names, *labelling.labels]))
-    if len(classes) > _MOST_CLASSES:
+    classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
+    if len(classes) > MOST_CLASSES:
         raise LogError(f"{topic}: has {len(classes)} different labels; no classifier has so many")
     return classes
 
 
-def _segment_topic(selection: Selection, wanted: str | None) -> str:
+def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
+    """Raise LogError if a label cannot be the name of a class, or the time of the first span."""
+    for label in labels:
+        if not CLASS_NAME.fullmatch(label):
+            raise LogError(f"{topic}: {label[:64]!r} cannot be the name of a class")
+    if len(starts) and starts[0] < 0:
+        raise LogError(f"{topic}: has a segment before 1970")
+
+
+def _segment_topic(selection: Selection, asked: str | None) -> str:
     """Find the topic of a recorder's segments."""
-    known = sorted(
-        topic
-        for topic, channels in selection.channels.items()
-        if all(is_compatible(*described, message_types.SEGMENT, FIELDS) for described in channels)
-    )
-    recorded = [topic for topic in known if topic.count("/") == 2]
-    if not known:
+    topics = sorted(selection.topics_of(message_types.SEGMENT, FIELDS))
+    recorded = [topic for topic in topics if topic.count("/") == 2]
+    if not topics:
         raise LogError("no segments; if the log was recorded without a model, relabel it with one")
-    if wanted is None and len(recorded) != 1:
-        raise LogError(f"choose one with --topic: {', '.join(known)}")
-    topic = recorded[0] if wanted is None else wanted
-    if topic not in known:
-        raise LogError(f"{topic}: no such segments; there are {', '.join(known)}")
+    if asked is None and len(recorded) != 1:
+        raise LogError(f"choose one with --topic: {', '.join(topics)}")
+    topic = recorded[0] if asked is None else asked
+    if topic not in topics:
+        raise LogError(f"{topic}: no such segments; there are {', '.join(topics)}")
     return topic

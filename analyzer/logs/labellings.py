@@ -1,20 +1,23 @@
-"""The labellings that some logs have: what the recorder said, relabellings, a reviewer's marks."""
+"""The labellings that some logs have: the recorder's, those of models, a reviewer's."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.labelling import FIELDS, Labelling, all_classes, labelling_of
+from hearthlog.analyzer.logs.labelling import (
+    FIELDS,
+    Labelling,
+    all_classes,
+    check_labelling,
+    labelling_of,
+)
 from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
-from hearthlog.analyzer.logs.typed_columns import is_compatible
+from hearthlog.analyzer.logs.spans import one, pieces
 from hearthlog.models.classes import translation
-from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -32,16 +35,17 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
 LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
+_EVER = 1 << 62  # nanoseconds
 
 
-class Log(NamedTuple):
+class LabelledLog(NamedTuple):
     """A log or a layer, and what labels it has.
 
     Attributes
     ----------
     path : Path
     first, last : int
-        Log times in nanoseconds.
+        LabelledLog times in nanoseconds.
     complete : bool
     segments : frozenset of str
         Topics of segments.
@@ -57,7 +61,7 @@ class Log(NamedTuple):
     classes: Mapping[str, Sequence[str]]
 
 
-class Side(NamedTuple):
+class NamedLabelling(NamedTuple):
     """One labelling of one microphone.
 
     Attributes
@@ -74,57 +78,57 @@ class Side(NamedTuple):
     classes: tuple[str, ...]
     labelling: Labelling
 
-    def called_as(self, classes: Sequence[str]) -> "Side":
+    def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
         """Give classes that are among some by another name the name that they have there."""
         names = translation(self.classes, classes)
         own = tuple(dict.fromkeys(names.values()))
-        return Side(self.name, own, self.labelling.called_as(classes))
+        return NamedLabelling(self.name, own, self.labelling.called_as(classes))
 
 
 @dataclass
-class Sources:
+class Labellings:
     """The labellings of a log, or of a folder of logs.
 
     Attributes
     ----------
-    logs : list of Log
+    logs : list of LabelledLog
         With their layers, in the order of time.
     losses : list of str
         What could not be used, and why.
     """
 
-    logs: Sequence[Log]
+    logs: Sequence[LabelledLog]
     losses: list[str] = field(default_factory=list)
 
-    def microphone(self, wanted: str | None) -> str:
-        """Return the only microphone, or check the one that is wanted."""
-        found = {topic.microphone for topic in self._topics()}
-        known = ", ".join(sorted(found))
-        if not found:
+    def microphone(self, name: str | None) -> str:
+        """Return the only microphone, or the named one if there is one of this name."""
+        names = {topic.microphone for topic in self._topics()}
+        there = ", ".join(sorted(names))
+        if not names:
             raise LogError(
                 "no segments; if the log was recorded without a model, relabel it with one"
                 f"{self._first_loss()}"
             )
-        if wanted is None and len(found) > 1:
-            raise DataError(f"choose one with --microphone: {known}")
-        if wanted is not None and wanted not in found:
+        if name is None and len(names) > 1:
+            raise DataError(f"choose one with --microphone: {there}")
+        if name is not None and name not in names:
             raise DataError(
-                f"no segments of a microphone {wanted[:64]!r}; there is {known}{self._first_loss()}"
+                f"no segments of a microphone {name[:64]!r}; there is {there}{self._first_loss()}"
             )
-        return wanted or found.pop()
+        return name or names.pop()
 
     def names(self, microphone: str) -> list[str]:
         """List the labellings of a microphone; what the recorder said comes first."""
-        found = {t.labelling for t in self._topics() if t.microphone == microphone}
-        return sorted(found, key=lambda name: (name != LIVE, name))
+        names = {t.labelling for t in self._topics() if t.microphone == microphone}
+        return sorted(names, key=lambda name: (name != LIVE, name))
 
-    def find(self, microphone: str, wanted: str) -> str:
+    def find(self, microphone: str, text: str) -> str:
         """Find the labelling that a user means.
 
         Parameters
         ----------
         microphone : str
-        wanted : str
+        text : str
             `live`, `review`, the name of a model, or `relabel` if there is only one.
 
         Raises
@@ -132,15 +136,15 @@ class Sources:
         DataError
             If it is none of them.
         """
-        known = self.names(microphone)
-        layers = [name for name in known if name.startswith(f"{RELABEL}/")]
-        if wanted == RELABEL and len(layers) == 1:
+        names = self.names(microphone)
+        layers = [name for name in names if name.startswith(f"{RELABEL}/")]
+        if text == RELABEL and len(layers) == 1:
             return layers[0]
-        for name in (wanted, relabelling(wanted.removeprefix(f"{RELABEL}/"))):
-            if name in known:
+        for name in (text, relabelling(text.removeprefix(f"{RELABEL}/"))):
+            if name in names:
                 return name
-        there = f"there is {', '.join(known)}{self._first_loss()}"
-        raise DataError(f"{microphone}: no labelling {wanted[:64]!r}; {there}")
+        there = f"there is {', '.join(names)}{self._first_loss()}"
+        raise DataError(f"{microphone}: no labelling {text[:64]!r}; {there}")
 
     def read(
         self,
@@ -149,18 +153,16 @@ class Sources:
         start: int | None = None,
         end: int | None = None,
         progress: Progress = ignore_progress,
-    ) -> Side:
+    ) -> NamedLabelling:
         """Read the segments of a labelling; of a log that is damaged `losses` tell.
 
         Parameters
         ----------
-        microphone : str
-        name : str
-            As `find` returns it.
+        microphone, name : str
+            As `microphone` and `find` return them.
         start, end : int, optional
             In nanoseconds: what is before and after is cut off.
         progress : callable, optional
-            Is called with the share that is done.
 
         Raises
         ------
@@ -174,20 +176,18 @@ class Sources:
             raise LogError(f"{topic}: there is no segment{limited}{self._first_loss()}")
         labels = labelling_topic(microphone, name, "label")
         named = [log.classes.get(labels, ()) for log in self.logs]
-        classes = all_classes(topic, named, labelling)
-        for label in classes:
-            if not CLASS_NAME.fullmatch(label):
-                raise LogError(f"{topic}: {label[:64]!r} cannot be the name of a class")
-        if labelling.starts[0] < 0:
-            raise LogError(f"{topic}: has a segment before 1970")
-        return Side(name, classes, labelling)
+        classes = all_classes(topic, named, labelling.labels)
+        check_labelling(topic, labelling.starts, classes)
+        return NamedLabelling(name, classes, labelling)
 
     def marks(self, microphone: str, start: int | None, end: int | None) -> Labelling | None:
         """Read what was reviewed in a span of time, if anything was; as `read` otherwise."""
         topic = labelling_topic(microphone, REVIEW, "segment")
-        return self._labelling(topic, start, end, lambda _: None)
+        return self._labelling(topic, start, end, ignore_progress)
 
-    def with_topic(self, topic: str, start: int | None = None, end: int | None = None) -> list[Log]:
+    def with_topic(
+        self, topic: str, start: int | None = None, end: int | None = None
+    ) -> list[LabelledLog]:
         """List the logs that have a topic, and messages at a span of time."""
         return [
             log
@@ -213,8 +213,12 @@ class Sources:
         self, topic: str, start: int | None, end: int | None, progress: Progress
     ) -> Labelling | None:
         parts = list(self._segments(topic, start, end, progress))
-        found = _cut(labelling_of(join(parts)), start, end) if parts else None
-        return found or None
+        if not parts:
+            return None
+        whole = labelling_of(join(parts))
+        span = one(-_EVER if start is None else start, _EVER if end is None else end)
+        spans, rows, _ = pieces(whole, span)
+        return Labelling(*spans, whole.labels[rows]) if len(rows) else None
 
     def _segments(
         self, topic: str, start: int | None, end: int | None, progress: Progress
@@ -238,8 +242,8 @@ class Sources:
         return [topic for topic in topics if topic.kind == "segment"]
 
 
-def find_sources(*paths: Path) -> Sources:
-    """Look what labellings there are in logs and their layers, or in folders of logs.
+def find_labellings(*paths: Path) -> Labellings:
+    """Find the labellings of logs and their layers, or of folders of logs.
 
     Raises
     ------
@@ -247,14 +251,14 @@ def find_sources(*paths: Path) -> Sources:
         If there is no log, or none that can be read.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
-    logs = [log for log in opened if isinstance(log, Log)]
+    logs = [log for log in opened if isinstance(log, LabelledLog)]
     losses = [str(error) for error in opened if isinstance(error, LogError)]
     if not logs:
         raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
-    return Sources(sorted(logs, key=lambda log: log.first), losses)
+    return Labellings(sorted(logs, key=lambda log: log.first), losses)
 
 
-def _opened(path: Path) -> Log | LogError | None:
+def _opened(path: Path) -> LabelledLog | LogError | None:
     """Look into a log; None if it is sound, and empty."""
     try:
         selection = select([path])
@@ -267,23 +271,14 @@ def _opened(path: Path) -> Log | LogError | None:
     return None if complete else LogError(f"{path}: unfinished, and nothing of it is whole")
 
 
-def _log(path: Path, selection: Selection) -> Log:
-    segments, classes = set(), {}
-    for topic, same in selection.channels.items():
-        if all(is_compatible(*described, message_types.SEGMENT, FIELDS) for described in same):
-            segments.add(topic)
-        elif all(
-            is_compatible(*described, message_types.LABEL, LABEL_FIELDS) for described in same
-        ):
-            names = [array_names(channel.metadata, "probabilities") for channel, _ in same]
-            classes[topic] = [name for each in names for name in each]
-    return Log(path, *selection.span, not selection.unfinished, frozenset(segments), classes)
-
-
-def _cut(labelling: Labelling, start: int | None, end: int | None) -> Labelling:
-    """Leave of a labelling what is in a span of time."""
-    starts, ends = labelling.starts, labelling.ends
-    starts = starts if start is None else np.maximum(starts, start)
-    ends = ends if end is None else np.minimum(ends, end)
-    left = starts < ends
-    return Labelling(starts[left], ends[left], labelling.labels[left])
+def _log(path: Path, selection: Selection) -> LabelledLog:
+    classes = {
+        topic: [
+            name
+            for channel, _ in selection.channels[topic]
+            for name in array_names(channel.metadata, "probabilities")
+        ]
+        for topic in selection.topics_of(message_types.LABEL, LABEL_FIELDS)
+    }
+    segments = frozenset(selection.topics_of(message_types.SEGMENT, FIELDS))
+    return LabelledLog(path, *selection.span, not selection.unfinished, segments, classes)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from mcap.records import Channel, Schema
 
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
@@ -82,6 +83,14 @@ class Selection:
                 verify_chunks(
                     file, file.chunks[(ends >= (self.start or 0)) & (starts < (self.end or _LAST))]
                 )
+
+    def topics_of(self, type_: str, fields: Collection[str]) -> list[str]:
+        """List the topics of a type, of which all channels have some fields."""
+        return [
+            topic
+            for topic, channels in self.channels.items()
+            if all(is_compatible(*channel, type_, fields) for channel in channels)
+        ]
 
     def only(self, topics: Collection[str]) -> "Selection":
         """Leave out all other topics."""

@@ -16,7 +16,7 @@ from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, 
 from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.labellings import Side, Sources
+    from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
     from hearthlog.analyzer.review.queue.review_list import ReviewSpan
 
 _SHOWN, _QUEUED = 10, 60
@@ -50,14 +50,14 @@ def diff(
 
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
-    from hearthlog.analyzer.logs.labellings import find_sources
+    from hearthlog.analyzer.logs.labellings import find_labellings
     from hearthlog.schemas.messages.topics import labelling_topic
 
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
     _check_list(output)
     limits = parse_span(start, end)
-    sources = find_sources(log)
+    sources = find_labellings(log)
     name = sources.microphone(microphone)
     chosen = [sources.find(name, labelling) for labelling in (a, b) if labelling is not None]
     if len(set(chosen)) < len(chosen):
@@ -85,7 +85,7 @@ class _Result(NamedTuple):
     print_tables: Callable[[], None]
 
 
-def _difference(microphone: str, sides: "list[Side]", shown: int) -> _Result:
+def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
     from hearthlog.analyzer.evaluation.difference import compare_sides
     from hearthlog.analyzer.review.queue.review_list import disagreements
 
@@ -97,9 +97,9 @@ def _difference(microphone: str, sides: "list[Side]", shown: int) -> _Result:
 
 
 def _queue(
-    sources: "Sources",
+    sources: "Labellings",
     microphone: str,
-    sides: "list[Side]",
+    sides: "list[NamedLabelling]",
     limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:

@@ -78,10 +78,10 @@ def evaluate_log(
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
     from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
-    from hearthlog.analyzer.logs.labelling import read_labelled
+    from hearthlog.analyzer.logs.labelling import read_labelling
 
     _check_plot(plot)
-    labelled = read_labelled(log, topic)
+    labelled = read_labelling(log, topic)
     true = read_reference(reference, log, labelled.microphone)
     result = compare(true, labelled.labelling, labelled.classes)
     _save_plot(plot, f"{labelled.topic} of {log} against {reference}", result.scores)

@@ -201,7 +201,7 @@ def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[ReviewItem], Marking]":
     """Find what is to be gone through, and what is corrected."""
-    from hearthlog.analyzer.logs.labellings import find_sources
+    from hearthlog.analyzer.logs.labellings import find_labellings
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import queue_items
     from hearthlog.analyzer.review.timeline.model import no_spans
@@ -210,7 +210,7 @@ def _work(
     segments = {one.name: one.spans for one in timeline.microphones[microphone].labellings}
     labelling, items = choice.labels, []
     if choice.queue is not None or labelling != LIVE:
-        sources = find_sources(*logs)
+        sources = find_labellings(*logs)
         labelling = sources.find(microphone, choice.labels)
         if choice.queue is not None:
             items = queue_items(

@@ -8,7 +8,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY
 from hearthlog.analyzer.evaluation.event_scores import events_of
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Side, Sources
+from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Labellings, NamedLabelling
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,
     judgeable_spans,
@@ -67,11 +67,11 @@ class ReviewQueue:
 
 
 def make_queue(  # noqa: PLR0913
-    sources: Sources,
+    sources: Labellings,
     microphone: str,
-    side: Side,
+    side: NamedLabelling,
     *,
-    other: Side | None,
+    other: NamedLabelling | None,
     marks: Labelling | None,
     count: int,
     ranking: str | None = None,
@@ -81,11 +81,11 @@ def make_queue(  # noqa: PLR0913
 
     Parameters
     ----------
-    sources : Sources
+    sources : Labellings
     microphone : str
-    side : Side
+    side : NamedLabelling
         The labelling to be reviewed.
-    other : Side or None
+    other : NamedLabelling or None
         Another one, to see where they disagree; another name for a class is no disagreement.
     marks : Labelling or None
         What was reviewed already: it is left out.
@@ -150,7 +150,7 @@ def _scores(parts: Float64, ranking: str | None) -> Float64:
 
 def _add_frames(
     doubt: ModelUncertainty,
-    sources: Sources,
+    sources: Labellings,
     topic: str,
     windows: JudgeableSpans,
     progress: Progress,

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.labellings import Sources
+from hearthlog.analyzer.logs.labellings import Labellings
 from hearthlog.analyzer.review.queue.ranking import RANKINGS, make_queue
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan, queued, read_list
 from hearthlog.analyzer.review.session.session import ReviewItem
@@ -14,7 +14,7 @@ Limits = tuple[int | None, int | None]
 
 
 def queue_items(
-    wanted: str, sources: Sources, labelled: tuple[str, str], limits: Limits, count: int
+    wanted: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int
 ) -> list[ReviewItem]:
     """Choose spans of a labelling that are to be reviewed.
 
@@ -22,7 +22,7 @@ def queue_items(
     ----------
     wanted : str
         One of `analyzer.diff.queue.RANKINGS`, or the name of a list that `hearthlog diff` made.
-    sources : Sources
+    sources : Labellings
     labelled : (str, str)
         The microphone, and the labelling: `live`, or `relabel/` and a model.
     limits : (int or None, int or None)
