@@ -26,7 +26,7 @@ from hearthlog.analyzer.relabel.layer import topics_of as layer_topics
 from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
 from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.report.html import paragraph
-from hearthlog.analyzer.report.read_home import read_heard
+from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
 from hearthlog.schemas.logs.log_stream import TopicBatch
@@ -39,8 +39,8 @@ UTC = ZoneInfo("UTC")
 
 
 def look(root, day=DAY, zone=UTC, labelling="live"):
-    heard = read_heard(find_home_logs([root]), labelling, 0, day_span(day, zone))
-    return day_of(whole_home(heard), day, zone)
+    data = read_home(find_home_logs([root]), labelling, 0, day_span(day, zone))
+    return day_of(whole_home(data), day, zone)
 
 
 def page_of(root, tmp_path, first=DAY, days=1) -> str:
@@ -116,8 +116,8 @@ def test_names_that_a_report_puts_together_are_as_right_as_the_worst_of_them(tmp
     precisions = {"shout": 0.9, "yell": 0.4, "music": 0.8, "yelling": 0.7}
     monkeypatch.setattr(homelife, "PRECISIONS", precisions)
     write_day(tmp_path, DAY, [(at("10:00"), 60, "shout", 0.6)], hours=[10])
-    heard = read_heard(find_home_logs([tmp_path]), "live", 0, day_span(DAY, UTC))
-    assert heard.precisions == {"yelling": 0.4, "music": 0.8}
+    data = read_home(find_home_logs([tmp_path]), "live", 0, day_span(DAY, UTC))
+    assert data.precisions == {"yelling": 0.4, "music": 0.8}
 
 
 def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
@@ -390,8 +390,8 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
 
 def test_a_class_is_only_compared_on_days_on_which_it_would_have_been_heard(flat, flat_page):
     shelf = find_home_logs([flat])
-    heard = read_heard(shelf, "live", 0, day_span(DAY, UTC))
-    day = day_of(whole_home(heard), DAY, UTC)
+    data = read_home(shelf, "live", 0, day_span(DAY, UTC))
+    day = day_of(whole_home(data), DAY, UTC)
     assert day.comparable("coughing")
     assert not day.comparable("shower"), "the bathroom was heard for 14 hours"
     assert "water taps less often" not in text_of(flat_page)
@@ -414,8 +414,8 @@ def test_a_week_has_its_seven_days_and_their_total(flat, tmp_path):
     assert "Week 9, 23 February 2026 to 1 March 2026" in text
     assert page.count('<th scope="row">Wed 25 Feb</th>') == 5
     assert page.count('<tr class="sum">') == 5
-    heard = read_heard(find_home_logs([flat]), "live", 0, day_span(DAY, UTC))
-    home = whole_home(heard)
+    data = read_home(find_home_logs([flat]), "live", 0, day_span(DAY, UTC))
+    home = whole_home(data)
     days = [day_of(home, DAY - timedelta(days=n), UTC) for n in range(7)]
     total = sum((day.count("shower") for day in days), Count())
     row = re.search(r'<tr class="sum"><th scope="row">All days</th>(.*?)</tr>', page)[1]

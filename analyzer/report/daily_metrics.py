@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from hearthlog.analyzer.logs.spans import (
     one,
     without,
 )
-from hearthlog.analyzer.report.read_home import Heard, Segments
+from hearthlog.analyzer.report.read_home import HomeData
+from hearthlog.analyzer.report.segments import Segments
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
@@ -71,7 +73,7 @@ class Home:
     Attributes
     ----------
     classes : list of str
-    heard : Spans
+    coverage : Spans
         When at least one of them heard.
     listened : dict of str to Spans
         By class: when at least one of them heard whose model knows it.
@@ -85,7 +87,7 @@ class Home:
     """
 
     classes: list[str]
-    heard: Spans
+    coverage: Spans
     listened: dict[str, Spans]
     sound: Spans
     spans: dict[str, Spans]
@@ -95,7 +97,7 @@ class Home:
         """Leave what was heard in a span of time."""
         return Home(
             self.classes,
-            cut(self.heard, start, end),
+            cut(self.coverage, start, end),
             {name: cut(spans, start, end) for name, spans in self.listened.items()},
             cut(self.sound, start, end),
             {name: cut(spans, start, end) for name, spans in self.spans.items()},
@@ -103,21 +105,21 @@ class Home:
         )
 
 
-def whole_home(heard: Heard) -> Home:
+def whole_home(data: HomeData) -> Home:
     """Put together what the microphones heard."""
-    parts = list(heard.segments.values())
+    parts = list(data.segments.values())
     starts, ends, labels, chances = (
         np.concatenate([getattr(part, name) for part in parts]) for name in Segments._fields
     )
     everything = joined(starts, ends)
     loud = labels != SILENCE
     sound = joined(starts[loud], ends[loud])
-    classes = list(dict.fromkeys(name for known in heard.known.values() for name in known))
+    classes = list(dict.fromkeys(chain.from_iterable(data.classes.values())))
     listened, spans, events = {}, {}, {}
     for name in classes:
         own = labels == name
         knowing = [
-            part.spans for source, part in heard.segments.items() if name in heard.known[source]
+            part.spans for source, part in data.segments.items() if name in data.classes[source]
         ]
         begun, ended = (np.concatenate(edges) for edges in zip(*knowing, strict=True))
         listened[name] = joined(begun, ended)
@@ -149,7 +151,7 @@ class Day:
     zone : tzinfo
     span, night : Spans
         One span each, in nanoseconds of UTC.
-    heard : Spans
+    coverage : Spans
         What of the day was heard.
     """
 
@@ -158,17 +160,17 @@ class Day:
     zone: tzinfo
     span: Spans
     night: Spans
-    heard: Spans
+    coverage: Spans
 
     @property
     def share(self) -> float:
         """How much of the day was heard, 0 to 1."""
-        return self.heard.length / self.span.length
+        return self.coverage.length / self.span.length
 
     @property
     def night_hours(self) -> float:
         """How much of the night was heard."""
-        return common(self.home.heard, self.night).length / HOUR
+        return common(self.home.coverage, self.night).length / HOUR
 
     def comparable(self, name: str = "") -> bool:
         """Tell whether most of the day and of its night was heard; of all classes by default."""
@@ -239,7 +241,7 @@ class Day:
     def longest_quiet(self) -> Spans:
         """The longest span without sound in waking hours; none if nothing was heard then."""
         waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
-        quiet = without(common(self.home.heard, waking), self.home.sound)
+        quiet = without(common(self.home.coverage, waking), self.home.sound)
         if not len(quiet.starts):
             return NONE
         longest = int((quiet.ends - quiet.starts).argmax())
@@ -248,7 +250,7 @@ class Day:
     @property
     def quiet(self) -> Minutes | None:
         """How long that was."""
-        return _minutes(self.longest_quiet) if self.heard.length else None
+        return _minutes(self.longest_quiet) if self.coverage.length else None
 
     @property
     def active(self) -> Int64:
@@ -279,7 +281,7 @@ def day_of(home: Home, day: date, zone: tzinfo) -> Day:
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
     span = one(start, end)
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
-    return Day(day, near, zone, span, night, common(near.heard, span))
+    return Day(day, near, zone, span, night, common(near.coverage, span))
 
 
 def _of(home: Home, name: str) -> Events:

@@ -202,7 +202,7 @@ def _week(account: Account, figures: Sequence[Figure]) -> str:
     for day in account.days:
         share = _share(figures, day)
         heard = percent(share) if share else "not heard"
-        values = [figure.value(day) if day.heard.length else None for figure in figures]
+        values = [figure.value(day) if day.coverage.length else None for figure in figures]
         cells = [escape(_short(value)) for value in values]
         rows.append([escape(class_words.short_day(day.day)), heard, *cells])
     rows.append(["All days", "", *(escape(_total(account.days, figure)) for figure in figures)])
@@ -230,7 +230,7 @@ def _dense(text: str) -> str:
 
 
 def _total(days: Sequence[Day], figure: Figure) -> str:
-    values = [figure.value(day) for day in days if day.heard.length]
+    values = [figure.value(day) for day in days if day.coverage.length]
     return _short(_sum([v for v in values if v is not None])) if figure.sums else ""
 
 
@@ -244,7 +244,7 @@ def _sum(values: Sequence[Value]) -> Count | Minutes | None:
 
 def _interrai(account: Account) -> Iterator[str]:
     """Tell what sound can say to an assessment."""
-    days = [day for day in (*account.before, *account.days) if day.heard.length]
+    days = [day for day in (*account.before, *account.days) if day.coverage.length]
     over = "this week" if len(account.days) > 1 else f"{interrai.DAYS} days, up to this one"
     heard = "" if len(account.days) > 1 else f" ({len(days)} of them heard)"
     yield heading("For the interRAI Home Care assessment")

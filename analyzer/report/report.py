@@ -14,7 +14,7 @@ from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
 from hearthlog.analyzer.report.page import day_page, week_page
-from hearthlog.analyzer.report.read_home import Heard, read_heard
+from hearthlog.analyzer.report.read_home import HomeData, read_home
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError
@@ -80,8 +80,8 @@ def make_report(
     close = day_span(days[0], zone)[0], day_span(days[-1], zone)[1]
     earlier = [first - timedelta(days=number) for number in range(DAYS, 0, -1)]
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
-    heard = read_heard(shelf, labelling, since, close, progress)
-    account = _account(heard, days, earlier, zone, labelling)
+    data = read_home(shelf, labelling, since, close, progress)
+    account = _account(data, days, earlier, zone, labelling)
     with new_file(page) as html, new_file(picture) as png:
         if count == 1:
             save_day(png, account.days[0], account.earlier)
@@ -90,37 +90,37 @@ def make_report(
             save_week(png, account.days)
             text = week_page(account, png.read_bytes())
         html.write_text(text, "utf-8")
-    return Made(page, picture, heard.losses)
+    return Made(page, picture, data.losses)
 
 
 def _account(
-    heard: Heard, days: Sequence[date], earlier: Sequence[date], zone: tzinfo, labelling: str
+    data: HomeData, days: Sequence[date], earlier: Sequence[date], zone: tzinfo, labelling: str
 ) -> Account:
-    home = whole_home(heard)
+    home = whole_home(data)
     past = {day: day_of(home, day, zone) for day in earlier}
     shown = [day_of(home, day, zone) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
     return Account(
-        nodes=heard.nodes,
-        microphones=sorted({microphone for _, microphone in heard.segments}),
+        nodes=data.nodes,
+        microphones=sorted({microphone for _, microphone in data.segments}),
         labelling=labelling,
         zone=zone,
         days=shown,
         before=[past[day] for day in earlier[-(ASSESSED - 1) :]],
         earlier=[day for day in past.values() if any(map(day.comparable, home.classes))],
-        unheard=_unheard(heard, *span),
-        gaps=_within(heard.gaps, span),
-        troubles=_within(heard.troubles, span),
-        precisions=heard.precisions,
-        unread=len(heard.losses),
+        unheard=_unheard(data, *span),
+        gaps=_within(data.gaps, span),
+        troubles=_within(data.troubles, span),
+        precisions=data.precisions,
+        unread=len(data.losses),
     )
 
 
-def _unheard(heard: Heard, start: int, end: int) -> dict[str, float]:
+def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
     """Measure for how many hours each microphone heard nothing."""
     whole = end - start
     found: dict[str, float] = {}
-    for (_, microphone), segments in heard.segments.items():
+    for (_, microphone), segments in data.segments.items():
         own = common(segments.spans, one(start, end)).length
         found[microphone] = max(found.get(microphone, 0.0), (whole - own) / HOUR)
     return found

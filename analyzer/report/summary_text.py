@@ -27,7 +27,7 @@ _MINUTE = HOUR // 60
 
 def gist_of_day(account: Account, day: Day) -> Iterator[str]:
     """Say in a few lines what matters."""
-    heard = Minutes(day.heard.length / _MINUTE).text
+    heard = Minutes(day.coverage.length / _MINUTE).text
     yield f"Heard: {heard} of the day ({percent(day.share)}). {_loudest(day)}"
     yield _changes(account, day)
     if day.night_hours:
@@ -38,8 +38,8 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
 
 def gist_of_week(account: Account) -> Iterator[str]:
     """Say in a few lines what matters."""
-    heard = [day for day in account.days if day.heard.length]
-    share = sum(day.heard.length for day in heard) / sum(day.span.length for day in account.days)
+    heard = [day for day in account.days if day.coverage.length]
+    share = sum(day.coverage.length for day in heard) / sum(day.span.length for day in account.days)
     yield f"Heard: {len(heard)} of {len(account.days)} days, {percent(share)} of the time."
     if not account.comparable:
         yield account.too_few
@@ -57,7 +57,7 @@ def gist_of_week(account: Account) -> Iterator[str]:
 def not_heard(account: Account) -> Iterator[str]:
     """State how much was not heard, and why; the first line says how much in all."""
     length = sum(day.span.length for day in account.days)
-    missing = length - sum(day.heard.length for day in account.days)
+    missing = length - sum(day.coverage.length for day in account.days)
     if missing >= _MINUTE:
         text = Minutes(missing / _MINUTE).text
         yield f"Not heard: {text} ({percent(missing / length)}). The report knows nothing of it."
@@ -167,7 +167,7 @@ def _unexplained(account: Account) -> int:
     starts = np.array([gap.start for gap in account.gaps], np.int64)
     ends = np.array([gap.end for gap in account.gaps], np.int64)
     said = joined(starts, ends)
-    missing = (without(without(day.span, day.heard), said) for day in account.days)
+    missing = (without(without(day.span, day.coverage), said) for day in account.days)
     return sum(spans.length for spans in missing)
 
 

@@ -102,7 +102,7 @@ def _hours(axes: Any, day: Day, earlier: Sequence[Day]) -> None:
         if known is not None:
             axes.plot((place, place + 0.84), (known.median, known.median), color="black", lw=1.6)
             axes.plot((place, place + 0.84), (known.median, known.median), color="white", lw=0.5)
-    _unheard(axes, day, day.heard, (0, 75))
+    _unheard(axes, day, day.coverage, (0, 75))
     axes.set_ylim(0, 75)
     axes.set_yticks((0, 30, 60))
     label = "minutes with sound\nin each hour"
