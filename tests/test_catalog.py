@@ -29,7 +29,7 @@ from hearthlog.analyzer.logs.catalog import (
     write_catalog,
 )
 from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed
-from hearthlog.analyzer.logs.catalog.fleet import heard, homes
+from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import Microphone, Settings
@@ -527,7 +527,7 @@ def test_the_homes_of_a_folder_are_summed_up(fleet):
     )
     assert anna.start == min(row.start for row in logs if row.start is not None)
     assert anna.end == max(row.end for row in logs if row.end is not None)
-    relabel = [one for one in heard(catalog) if one.kind == RELABEL]
+    relabel = [one for one in label_amounts(catalog) if one.kind == RELABEL]
     assert [(one.home, one.model, one.label, one.minutes, one.segments) for one in relabel] == [
         ("north/anna", "better.1", "speech", 0.5, 2),
         ("north/anna", "better.1", "music", 0.1, 1),

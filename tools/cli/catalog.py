@@ -15,7 +15,7 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog import Catalog
-    from hearthlog.analyzer.logs.catalog.fleet import Heard, Home
+    from hearthlog.analyzer.logs.catalog.fleet import Home, LabelAmount
 
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
@@ -40,7 +40,7 @@ def catalog(
     is unfinished or damaged.
     """
     from hearthlog.analyzer.logs.catalog import DAMAGED, UNFINISHED
-    from hearthlog.analyzer.logs.catalog.fleet import heard, homes
+    from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 
     if folder.is_file():
         wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
@@ -55,11 +55,11 @@ def catalog(
             "unfinished": unfinished,
             "damaged": {row.path: row.error for row in damaged},
             "homes": [_home(home) for home in homes(files)],
-            "labels": [asdict(label) for label in heard(files)],
+            "labels": [asdict(label) for label in label_amounts(files)],
         }
         print(json.dumps(result, indent=2))
     else:
-        _print(homes(files), heard(files), unfinished)
+        _print(homes(files), label_amounts(files), unfinished)
     if damaged or unfinished:
         raise typer.Exit(3)
 
@@ -89,7 +89,9 @@ def _home(home: "Home") -> dict[str, object]:
     return asdict(home) | times | {"hours": home.hours}
 
 
-def _print(homes: Sequence["Home"], labels: Sequence["Heard"], unfinished: Sequence[str]) -> None:
+def _print(
+    homes: Sequence["Home"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
+) -> None:
     print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
     if len(homes) > _HOMES_SHOWN:
         print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
@@ -119,7 +121,7 @@ def _home_row(name: str, homes: Sequence["Home"]) -> Sequence[str]:
     ]
 
 
-def _label_rows(labels: Sequence["Heard"]) -> Iterator[Sequence[str]]:
+def _label_rows(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
     """Add up the labels of all homes, those of one kind and model together."""
     sums: dict[tuple[str, str, str], tuple[float, int]] = {}
     for one in labels:

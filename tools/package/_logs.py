@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import Sources, find_sources
+from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
 from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
@@ -246,8 +246,8 @@ class Logs:
         return sorted((mark for log in logs for mark in read_marks(log)), key=lambda m: m.start)
 
     @cached_property
-    def _sources(self) -> Sources:
-        return find_sources(self.path)
+    def _sources(self) -> Labellings:
+        return find_labellings(self.path)
 
     def _only(self, topic: str) -> Selection:
         if topic not in self._selection.channels:

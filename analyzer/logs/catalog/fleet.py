@@ -52,8 +52,8 @@ class Home:
 
 
 @dataclass(frozen=True)
-class Heard:
-    """How long a label was heard in one home.
+class LabelAmount:
+    """How much of a label there is in one home.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ def homes(catalog: Catalog) -> list[Home]:
     return [Home(**row) for row in _grouped(counted, ["home"], functions)]
 
 
-def heard(catalog: Catalog) -> list[Heard]:
+def label_amounts(catalog: Catalog) -> list[LabelAmount]:
     """Sum up the labels of each home, the live ones, those of relabellings and of reviews."""
     table = catalog.table
     lists = table["labels"].combine_chunks()
@@ -104,8 +104,8 @@ def heard(catalog: Catalog) -> list[Heard]:
     for name in _LABELLING:
         labels = labels.append_column(name, table[name].take(pc.list_parent_indices(lists)))
     values = [("minutes", "sum"), ("segments", "sum")]
-    found = [Heard(**row) for row in _grouped(labels, [*_LABELLING, "label"], values)]
-    return sorted(found, key=lambda one: (one.home, one.kind, one.model or "", -one.minutes))
+    amounts = [LabelAmount(**row) for row in _grouped(labels, [*_LABELLING, "label"], values)]
+    return sorted(amounts, key=lambda one: (one.home, one.kind, one.model or "", -one.minutes))
 
 
 def _grouped(
