@@ -25,9 +25,8 @@ from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
-from hearthlog.analyzer.review.timeline.clock import clock
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans, time_shares
-from hearthlog.analyzer.review.timeline.lanes import changes
+from hearthlog.analyzer.review.timeline.lanes import changes, clock
 from hearthlog.analyzer.review.timeline.model import (
     GridSeries,
     LabelledSpans,

@@ -27,17 +27,7 @@ _QUIETEST = 1e-10  # of a mean square: -100 dB
 
 
 class FeatureRows(NamedTuple):
-    """Features of successive frames.
-
-    Attributes
-    ----------
-    microphone : str
-    names : tuple of str
-        Of the columns.
-    times : np.ndarray [shape=(n,)], int64
-        Starts of the frames, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float32
-    """
+    """Features of n frames, shape (n, k), by name; times are their starts, in ns of UTC."""
 
     microphone: str
     names: tuple[str, ...]
@@ -46,19 +36,7 @@ class FeatureRows(NamedTuple):
 
 
 class LabelRows(NamedTuple):
-    """Probabilities and novelty of successive frames.
-
-    Attributes
-    ----------
-    microphone, labelling : str
-    names : tuple of str
-        Of the classes, which are the columns.
-    times : np.ndarray [shape=(n,)], int64
-        Starts of the frames, in nanoseconds of UTC.
-    probabilities : np.ndarray [shape=(n, k)], float32
-    novelty : np.ndarray [shape=(n,)], float32
-        NaN where the model has none.
-    """
+    """Probabilities of classes in frames, shape (n, k), and novelty, NaN where there is none."""
 
     microphone: str
     labelling: str
@@ -84,19 +62,10 @@ class GapRows(NamedTuple):
 
 
 class StatusRows(NamedTuple):
-    """Diagnostics.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    microphones : np.ndarray [shape=(n,)] of str
-        What each message names as its frame; see `is_microphone`.
-    statuses : np.ndarray [shape=(n,)] of sequence of dict
-    """
+    """Diagnostics: of each message the time, the frame that it names, and its statuses."""
 
     times: Int64
-    microphones: NDArray[np.object_]
+    microphones: NDArray[np.object_]  # if `is_microphone`
     statuses: NDArray[np.object_]
 
 
@@ -104,7 +73,7 @@ Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StatusRows | LogLines
 
 
 def read_rows(path: Path, columns: Columns) -> Rows | None:
-    """Take the fields out of messages of one topic.
+    """Take the fields out of messages of one topic; None if a timeline does not show the topic.
 
     Parameters
     ----------
@@ -112,11 +81,6 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
         The log, for errors.
     columns : Columns
         At least one message, with the `FIELDS` of its type.
-
-    Returns
-    -------
-    Rows or None
-        None if a timeline has no place for the topic.
 
     Raises
     ------

@@ -2,23 +2,23 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta, tzinfo
 from typing import NamedTuple
 
 import numpy as np
 
 from hearthlog.analyzer.colours import GAP, Colour, colour
-from hearthlog.analyzer.logs.local_time import home_zone
-from hearthlog.analyzer.review.timeline.clock import clock
+from hearthlog.analyzer.logs.local_time import home_zone, local_time
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.analyzer.review.timeline.model import (
     LabelledSpans,
-    LabellingTimeline,
     MicrophoneTimeline,
     Timeline,
 )
 from hearthlog.analyzer.review.timeline.overview import disagreements, overview
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages.topics import LIVE, REVIEW
+from hearthlog.schemas.times import NANOSECONDS
 
 _HOURS: tuple[Colour, Colour] = ((52, 60, 70), (32, 38, 46))
 _DIFFERENT: Colour = (222, 165, 32)
@@ -30,25 +30,18 @@ _TROUBLES: dict[str, Colour] = {
 }
 TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnostic status less one
 NOT_HEARD = "not heard"
+_HOUR = 3600
+_TICKS = (60, 300, 900, _HOUR, 3 * _HOUR, 6 * _HOUR, 24 * _HOUR)  # seconds
+_MOST_TICKS = 30
 
 
 @dataclass(frozen=True)
 class LaneKind:
-    """How lanes of one kind look.
+    """How lanes of one kind look: those of a microphone are shown by place, then by name."""
 
-    Attributes
-    ----------
-    place : int
-        0 to 9; the lanes of a microphone are shown by place, then by name.
-    colours : callable
-        Gives states their colours.
-    states : sequence of str
-        Those that a watch announces to the viewer before they occur.
-    """
-
-    place: int
-    colours: Callable[[Iterable[str]], dict[str, Colour]]
-    states: Sequence[str] = ()
+    place: int  # 0 to 9
+    colours: Callable[[Iterable[str]], dict[str, Colour]]  # of states
+    states: Sequence[str] = ()  # that a watch announces to the viewer before they occur
 
 
 def _class_colours(states: Iterable[str]) -> dict[str, Colour]:
@@ -73,38 +66,20 @@ TROUBLE = LaneKind(9, _trouble_colours, TROUBLES)
 
 
 class Changes(NamedTuple):
-    """When a lane changes, and to what; None is nothing.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, ascending.
-    states : list of (str or None)
-    """
+    """When a lane changes, ascending in ns of UTC, and to which states; None is nothing."""
 
     times: Int64
     states: list[str | None]
 
 
 class Lane(NamedTuple):
-    """A lane, or what is new in it.
-
-    Attributes
-    ----------
-    kind : LaneKind
-    microphone : str
-        Empty for the clock.
-    name : str
-    changes : Changes
-    states : sequence of str
-        Those that may follow, beside those of the changes.
-    """
+    """A lane, or what is new in it."""
 
     kind: LaneKind
-    microphone: str
+    microphone: str  # empty for the clock
     name: str
     changes: Changes
-    states: Sequence[str] = ()
+    states: Sequence[str] = ()  # that may follow, beside those of the changes
 
     @property
     def colours(self) -> dict[str, Colour]:
@@ -124,14 +99,7 @@ def changes(spans: LabelledSpans) -> Changes:
 
 
 def timeline_lanes(timeline: Timeline, *, detail: bool) -> Iterator[Lane]:
-    """Make the lanes of a timeline, the clock first.
-
-    Parameters
-    ----------
-    timeline : Timeline
-    detail : bool
-        Whether they show every segment, where there are any, or an `overview`.
-    """
+    """Make the lanes of a timeline, in `detail` (every segment) or as an `overview`."""
     grid = timeline.grid
     hours = clock(grid, home_zone(timeline.zone))
     yield Lane(CLOCK, "", timeline.zone, changes(hours))
@@ -152,7 +120,8 @@ def _microphone_lanes(
     unmarked = Changes(np.array([grid.start]), [None])
     yield Lane(MARKS, name, REVIEW, changes(marks[0].spans) if marks else unmarked, classes)
     for other in labellings[1:]:
-        spans = disagreements(*(_spans(one, grid, detail=detail) for one in (labellings[0], other)))
+        both = (labellings[0], other)
+        spans = disagreements(*(one.spans if detail else overview(one, grid) for one in both))
         yield Lane(DIFFERENCE, name, f"differs {other.name}", changes(spans))
     if len(microphone.gaps):
         yield Lane(GAPS, name, NOT_HEARD, changes(microphone.gaps))
@@ -160,5 +129,35 @@ def _microphone_lanes(
         yield Lane(TROUBLE, name, "trouble", changes(microphone.troubles))
 
 
-def _spans(labelling: LabellingTimeline, grid: Grid, *, detail: bool) -> LabelledSpans:
-    return labelling.spans if detail else overview(labelling, grid)
+def clock(grid: Grid, zone: tzinfo) -> LabelledSpans:
+    """Divide a span of time into blocks whose text is the local time at which they begin.
+
+    They have the shortest length that gives about thirty of them or fewer.
+    """
+    seconds = (grid.end - grid.start) / NANOSECONDS
+    tick = next((tick for tick in _TICKS if seconds / tick <= _MOST_TICKS), _TICKS[-1])
+    starts = np.unique(list(_ticks(grid, tick, zone)))  # also where clocks are changed
+    ends = np.append(starts[1:], grid.end)
+    texts = [_clock_text(int(start), tick, zone) for start in starts]
+    return LabelledSpans(starts, ends, np.array(texts, object))
+
+
+def _ticks(grid: Grid, tick: int, zone: tzinfo) -> Iterator[int]:
+    """Yield the start, and each later time at which the local time is a multiple of a tick."""
+    yield grid.start
+    local = local_time(grid.start, zone)
+    midnight = local.replace(hour=0, minute=0, second=0, microsecond=0)
+    for number in range(1 << 16):
+        moment = (midnight + timedelta(seconds=tick * number)).timestamp()
+        time = int(moment) * NANOSECONDS
+        if time >= grid.end:
+            return
+        if time > grid.start:
+            yield time
+
+
+def _clock_text(time: int, tick: int, zone: tzinfo) -> str:
+    local = local_time(time, zone)
+    if tick >= _TICKS[-1]:
+        return f"{local:%a %d %b}"
+    return f"{local:%H:%M}"

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
-from hearthlog.analyzer.review.timeline.clock import clock
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
     FIELDS,
@@ -35,6 +34,7 @@ from hearthlog.analyzer.review.timeline.lanes import (
     Changes,
     Lane,
     changes,
+    clock,
 )
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.analyzer.review.timeline.plots import FEATURES, LEVEL, NOVELTY, SHARES, Plot

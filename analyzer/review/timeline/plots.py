@@ -19,42 +19,24 @@ _TINY = np.finfo(np.float64).tiny
 
 
 class Style(Enum):
-    """How values are drawn."""
+    """How values are drawn: shares of one in bands, 0 to 1 from dark to bright, or a line."""
 
-    BANDS = auto()  # shares of one, as bands one on the other
-    HEAT_MAP = auto()  # 0 (dark) to 1 (bright), a row a column of the values
+    BANDS = auto()
+    HEAT_MAP = auto()
     LINE = auto()
 
 
 @dataclass(frozen=True)
 class PlotKind:
-    """How plots of one kind look; they are shown in the order of `PLOTS`.
+    """How plots of one kind look; they are shown in the order of `PLOTS`."""
 
-    Attributes
-    ----------
-    name : str
-        Of the entity.
-    title : str
-        With `{first}`, `{last}` and `{end}` in the place of the names of the first and the last
-        column, and the number of the latter.
-    height : int
-        In relation to other views.
-    style : Style
-    colour : Colour
-        Of a line.
-    scale : tuple of float or None
-        Lowest and highest value that are shown; None fits the values.
-    live_scale : tuple of float or None
-        The same where values follow that nobody knows yet; by default `scale`.
-    """
-
-    name: str
-    title: str
-    height: int
+    name: str  # of the entity
+    title: str  # with {first} and {last} for names of columns, and {end} for the last number
+    height: int  # in relation to other views
     style: Style
-    colour: Colour = _BRIGHT
-    scale: tuple[float, float] | None = None
-    live_scale: tuple[float, float] | None = None
+    colour: Colour = _BRIGHT  # of a line
+    scale: tuple[float, float] | None = None  # None fits the values
+    live_scale: tuple[float, float] | None = None  # if another one, where values go on
 
 
 SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
@@ -69,28 +51,14 @@ PLOTS = (SHARES, LEVEL, NOVELTY, FEATURES)
 
 
 class Plot(NamedTuple):
-    """A plot, or what is new in it.
-
-    Attributes
-    ----------
-    kind : PlotKind
-    microphone : str
-    labelling : str
-        Empty where the plot is of none.
-    names : tuple of str
-        Of the columns.
-    times : np.ndarray [shape=(n,)], int64
-        Middles of the spans that values are means of, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float64
-        NaN where nothing was heard.
-    """
+    """A plot, or what is new in it: means over spans of time, NaN where nothing was recorded."""
 
     kind: PlotKind
     microphone: str
-    labelling: str
-    names: tuple[str, ...]
-    times: Int64
-    values: Float64
+    labelling: str  # empty if it is of none
+    names: tuple[str, ...]  # of k columns
+    times: Int64  # middles of the spans, shape (n,), in ns of UTC
+    values: Float64  # shape (n, k)
 
 
 def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
