@@ -16,7 +16,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
-from hearthlog.analyzer.logs.summary import GapSummary, Health, summarise
+from hearthlog.analyzer.logs.health import Status
+from hearthlog.analyzer.logs.summarise import summarise
+from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Microphone, Settings
@@ -313,7 +315,7 @@ def test_health_is_the_worst_that_was_said_and_of_that_the_last(tmp_path):
             array = message(message_types.DIAGNOSTICS, header=header(START, "mic"), status=statuses)
             writer.write(DIAGNOSTICS, START + i, encode(array))
         paths.append(writer.finish())
-    worst = Health(2, START + 2, "b", "lost again")
+    worst = Status("b", START + 2, 2, "lost again")
     assert summarise(paths).health == summarise(paths[::-1]).health == worst
 
 

@@ -1,9 +1,13 @@
-"""What was not well: gaps, and what diagnostics say."""
+"""What was not well, from gaps and diagnostics."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages.topics import LIVE, parse_topic
+
+_LONGEST = 200  # characters
 
 
 class Trouble(NamedTuple):
@@ -15,17 +19,11 @@ class Trouble(NamedTuple):
     end: int
 
 
-def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
-    """Go through messages of gaps."""
-    starts, lasting = columns["header.stamp"], columns["duration"]
-    rows = zip(starts.tolist(), lasting.tolist(), columns["reason"].tolist(), strict=True)
-    for start, nanoseconds, reason in rows:
-        if nanoseconds > 0:
-            yield Trouble(f"{node}/{columns.topic}", reason, start, start + nanoseconds)
-
-
 class Status(NamedTuple):
-    """What a part of the box said of itself; level 0 is well."""
+    """What a part of the box said of itself, at a log time (ns of UTC).
+
+    `level` is that of `diagnostic_msgs/DiagnosticStatus`: 0 is well, higher is worse.
+    """
 
     name: str
     time: int
@@ -33,26 +31,67 @@ class Status(NamedTuple):
     message: str
 
 
+class MicrophoneState(NamedTuple):
+    """How a microphone was at a time (ns of UTC): the worst level, and all that was not well."""
+
+    microphone: str
+    time: int
+    level: int
+    text: str
+
+
+def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
+    """Yield the gaps of messages, but those of no length."""
+    starts, durations = columns["header.stamp"], columns["duration"]
+    rows = zip(starts.tolist(), durations.tolist(), columns["reason"].tolist(), strict=True)
+    for start, nanoseconds, reason in rows:
+        if nanoseconds > 0:
+            yield Trouble(f"{node}/{columns.topic}", reason, start, start + nanoseconds)
+
+
 def statuses_of(columns: Columns) -> Iterator[Status]:
-    """Go through diagnostic messages."""
+    """Yield each status of diagnostic messages."""
     for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:
             yield Status(status["name"], time, int(status["level"]), status["message"])
 
 
-def troubles_of(said: list[Status], end: int) -> Iterator[Trouble]:
-    """Yield what was not well: from when it was said to when something else was."""
-    ordered = sorted(said)
-    latest = {status.name: status.time for status in ordered}
-    last: dict[str, Trouble] = {}
-    for status in ordered:
-        before = last.pop(status.name, None)
-        if before is not None and status.level and before.text == status.message:
-            last[status.name] = before
-            continue
-        if before is not None:
-            yield before._replace(end=status.time)
-        if status.level:
-            last[status.name] = Trouble(status.name, status.message, status.time, status.time)
-    for name, trouble in last.items():
-        yield trouble._replace(end=min(latest[name], end))
+def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
+    """Yield the state of a microphone for each diagnostic message that is about one."""
+    times, names = columns["header.stamp"].tolist(), columns["header.frame_id"].tolist()
+    for time, name, statuses in zip(times, names, columns["status"], strict=True):
+        topic = parse_topic(f"/{name}/info")
+        if topic is not None and topic.labelling == LIVE:
+            level = max((status["level"] for status in statuses), default=0)
+            bad = [status["message"] for status in statuses if status["level"]]
+            yield MicrophoneState(name, time, level, "; ".join(bad)[:_LONGEST])
+
+
+def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
+    """Yield what was not well: from when it was said to when something else was, or nothing was."""
+    for name, same in groupby(sorted(statuses), lambda status: status.name):
+        own = list(same)
+        texts = [(status.time, status.message if status.level else None) for status in own]
+        for start, stop, text in lasting(texts, min(own[-1].time, end)):
+            yield Trouble(name, text, start, stop)
+
+
+def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple[int, int, str]]:
+    """Let each text last until the next one that differs, the last one until `end`.
+
+    Parameters
+    ----------
+    texts : sequence of (int, str or None)
+        When something was said, in the order of time; None is nothing.
+    end : int
+
+    Yields
+    ------
+    start, end : int
+    text : str
+    """
+    changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]
+    ends = [*(time for time, _ in changes[1:]), end]
+    for (start, text), stop in zip(changes, ends, strict=False):
+        if text is not None:
+            yield start, stop, text

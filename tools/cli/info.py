@@ -30,7 +30,7 @@ def info(
     """
     if catalog:
         wrong_use("say `hearthlog catalog FOLDER`")
-    from hearthlog.analyzer.logs.summary import summarise
+    from hearthlog.analyzer.logs.summarise import summarise
     from hearthlog.schemas.logs.files import find_logs
     from hearthlog.tools.cli.progress import track
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.health import MicrophoneState, lasting
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
@@ -15,9 +16,8 @@ from hearthlog.analyzer.review.timeline.decode import (
     LabelRows,
     Rows,
     SegmentRows,
-    StatusRows,
+    StateRows,
     decibel,
-    is_microphone,
 )
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.model import (
@@ -33,8 +33,6 @@ from hearthlog.analyzer.review.timeline.model import (
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE, REVIEW
-
-_MOST_TROUBLE = 200  # characters
 
 
 @dataclass
@@ -72,7 +70,7 @@ class _Microphone:
     novelty: dict[str, GridMeans] = field(default_factory=dict)
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
     gaps: list[LabelledSpans] = field(default_factory=list)
-    troubles: list[tuple[int, str]] = field(default_factory=list)
+    states: list[MicrophoneState] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
 
@@ -108,8 +106,9 @@ class Collector:
         match rows:
             case LogLines():
                 self._lines.append(rows)
-            case StatusRows():
-                self._add_statuses(rows)
+            case StateRows():
+                for state in rows.states:
+                    self._microphone(state.microphone).states.append(state)
             case FeatureRows():
                 self._add_features(rows)
             case LabelRows():
@@ -181,14 +180,6 @@ class Collector:
             novelty = microphone.novelty.setdefault(name, GridMeans(self._grid, 1))
             novelty.add(rows.times[finite], rows.novelty[finite, np.newaxis])
 
-    def _add_statuses(self, rows: StatusRows) -> None:
-        columns = rows.times.tolist(), rows.microphones.tolist(), rows.statuses
-        for time, name, statuses in zip(*columns, strict=True):
-            messages = [status["message"] for status in statuses if status["level"]]
-            if is_microphone(name):
-                text = "; ".join(messages)[:_MOST_TROUBLE]
-                self._microphone(name).troubles.append((time, text))
-
     def _timeline(self, name: str, rows: _Microphone) -> MicrophoneTimeline:
         features = rows.features.series()
         level = None
@@ -201,7 +192,7 @@ class Collector:
             level=level,
             level_frames=rows.level_frames,
             gaps=self._join(rows.gaps),
-            troubles=_lasting(rows.troubles, self._grid.end),
+            troubles=_trouble_spans(rows.states, self._grid.end),
             clips=_join_clips(rows.clips),
         )
 
@@ -247,15 +238,10 @@ def _runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
         yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
 
 
-def _lasting(troubles: Sequence[tuple[int, str]], end: int) -> LabelledSpans:
-    """Let each trouble last until the next message with another text; an empty one ends it."""
-    changes = [
-        (stamp, text)
-        for (stamp, text), (_, before) in zip(troubles, [(0, ""), *troubles], strict=False)
-        if text != before
-    ]
-    stops = [*(stamp for stamp, _ in changes[1:]), end]
-    spans = [(a, b, text) for (a, text), b in zip(changes, stops, strict=False) if text and a < b]
+def _trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans:
+    """Let a trouble last until the next message says that it is over, or that it is another."""
+    changes = [(state.time, state.text or None) for state in states]
+    spans = [span for span in lasting(changes, end) if span[0] < span[1]]
     if not spans:
         return no_spans()
     starts, ends, texts = zip(*spans, strict=True)

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import checked_array_names
+from hearthlog.analyzer.logs.health import MicrophoneState, microphone_states
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.logs.columns import Columns
@@ -61,15 +61,13 @@ class GapRows(NamedTuple):
     spans: LabelledSpans
 
 
-class StatusRows(NamedTuple):
-    """Diagnostics: of each message the time, the frame that it names, and its statuses."""
+class StateRows(NamedTuple):
+    """How microphones were, by the diagnostics."""
 
-    times: Int64
-    microphones: NDArray[np.object_]  # if `is_microphone`
-    statuses: NDArray[np.object_]
+    states: list[MicrophoneState]
 
 
-Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StatusRows | LogLines
+Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StateRows | LogLines
 
 
 def read_rows(path: Path, columns: Columns) -> Rows | None:
@@ -90,8 +88,7 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
     if columns.type == message_types.LOG:
         return LogLines(columns["stamp"], columns["level"], columns["msg"])
     if columns.type == message_types.DIAGNOSTICS:
-        fields = (columns[name] for name in FIELDS[message_types.DIAGNOSTICS])
-        return StatusRows(*fields)
+        return StateRows(list(microphone_states(columns)))
     topic = shown_topic(columns.topic)
     return topic and _microphone_rows(path, columns, topic)
 
@@ -118,12 +115,6 @@ def shown_topic(name: str) -> TopicName | None:
     if topic is None or topic.kind not in _KINDS or topic.labelling == REVIEW:
         return None
     return topic
-
-
-def is_microphone(name: str) -> bool:
-    """Tell whether a text can be the name of a microphone."""
-    topic = parse_topic(f"/{name}/gap")
-    return topic is not None and topic.microphone == name
 
 
 def decibel(energy: Any) -> Any:

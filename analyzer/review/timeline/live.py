@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.health import MicrophoneState
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.logs.typed_columns import decode_types
 from hearthlog.analyzer.review.timeline.decode import (
@@ -18,9 +19,8 @@ from hearthlog.analyzer.review.timeline.decode import (
     LabelRows,
     Rows,
     SegmentRows,
-    StatusRows,
+    StateRows,
     decibel,
-    is_microphone,
     read_rows,
 )
 from hearthlog.analyzer.review.timeline.grid import Grid
@@ -121,8 +121,8 @@ class LiveTimeline:
         match rows:
             case LogLines():
                 yield rows
-            case StatusRows():
-                yield from _statuses(rows)
+            case StateRows():
+                yield from _states(rows)
             case FeatureRows():
                 yield from self._clock(rows.times)
                 yield from self._features(rows)
@@ -236,13 +236,12 @@ def _gaps(rows: GapRows) -> Lane:
     return Lane(GAPS, rows.microphone, NOT_HEARD, changes(spans))
 
 
-def _statuses(rows: StatusRows) -> Iterator[Lane]:
-    for name in np.unique(rows.microphones.astype(str)).tolist():
-        if not is_microphone(name):
-            continue
-        own = rows.microphones == name
-        levels = [
-            max((status["level"] for status in each), default=0) for each in rows.statuses[own]
-        ]
-        states = [TROUBLES[min(level, len(TROUBLES)) - 1] if level else None for level in levels]
-        yield Lane(TROUBLE, name, "trouble", Changes(rows.times[own], states))
+def _states(rows: StateRows) -> Iterator[Lane]:
+    by_microphone: dict[str, list[MicrophoneState]] = {}
+    for state in rows.states:
+        by_microphone.setdefault(state.microphone, []).append(state)
+    for name, states in sorted(by_microphone.items()):
+        times = np.array([state.time for state in states])
+        levels = (min(state.level, len(TROUBLES)) for state in states)
+        texts = [TROUBLES[level - 1] if level else None for level in levels]
+        yield Lane(TROUBLE, name, "trouble", Changes(times, texts))
