@@ -1,4 +1,4 @@
-"""When a sample was taken: a line through the times at which the sound card says it was."""
+"""From the index of a sample to its time: a line through the times that the sound card reports."""
 
 from collections import deque
 
@@ -8,16 +8,16 @@ from hearthlog.schemas.arrays import Float64
 
 _WINDOW_SECONDS = 2.0
 _WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
-_PRIOR_PPM = 50.0  # what a sound card's crystal is off by, before it has been measured
-_PRIOR_NOISE = 100e-6  # seconds: what the least late observation of a window is still late by
+_PRIOR_PPM = 50.0  # expected error of a sound card's crystal, before it has been measured
+_PRIOR_NOISE = 100e-6  # seconds: expected lateness of the earliest observation of a window
 
 
 class SampleClock:
-    """Maps the index of a sample to the time of its taking.
+    """Maps the index of a sample to the time at which it was taken.
 
-    Observations are late, never early: by the time that the sound card and the scheduler took.
-    So each window of two seconds counts by its earliest one, and a line is fitted through these.
-    The time it gives is steered towards each new line, never moved: time does not jump.
+    Observations are late, never early, by the delays of the sound card and the scheduler. So each
+    window of two seconds counts by its earliest observation, and a line is fitted through these.
+    The time is steered towards each new line, never set to it: time does not jump.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class SampleClock:
 
     @property
     def started(self) -> bool:
-        """Whether there is a time to give."""
+        """Whether there has been an observation."""
         return self._origin is not None
 
     @property
@@ -49,7 +49,7 @@ class SampleClock:
         return -self._fitted_slope * 1e6
 
     def observe(self, index: int, time: float) -> None:
-        """Note that sample `index` was taken no later than `time` (seconds, monotonic)."""
+        """Add an observation: a sample was taken no later than a time (s, CLOCK_MONOTONIC)."""
         nominal = index / self._rate
         if self._origin is None:
             self._origin = time - nominal
@@ -62,7 +62,7 @@ class SampleClock:
             self._earliest, self._earliest_steered = (nominal, late), steered
 
     def time(self, index: Float64 | float) -> Float64:
-        """Return the time of samples on the clock of the observations, in seconds."""
+        """Return the times of samples on the clock of the observations, in seconds."""
         assert self._origin is not None
         nominal = np.asarray(index) / self._rate
         return self._origin + nominal + self._late + self._slope * (nominal - self._anchor)

@@ -1,4 +1,4 @@
-"""What the recorder was asked to do: command line, then environment, then file, then defaults."""
+"""Configuration of the recorder: command line, then environment, then file, then defaults."""
 
 import os
 from pathlib import Path
@@ -35,8 +35,8 @@ def _checked(check: Any) -> AfterValidator:
     return AfterValidator(validate)
 
 
-class Microphone(BaseModel):
-    """One microphone, or the audio files that stand in for it."""
+class MicrophoneSettings(BaseModel):
+    """One microphone, or the audio files that replace it."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -83,7 +83,9 @@ class Settings(BaseSettings):
     clip_minutes_a_day: int = Field(default=30, ge=1, le=1500)
     clip_retention_days: int = Field(default=30, ge=1, le=3650)
     clip_min_free_space: int = Field(default=500, ge=0)  # MB: with less, only the log goes on
-    microphone: list[Microphone] = Field(default=[Microphone()], min_length=1, max_length=1)
+    microphone: list[MicrophoneSettings] = Field(
+        default=[MicrophoneSettings()], min_length=1, max_length=1
+    )
 
     @classmethod
     def settings_customise_sources(
@@ -111,9 +113,9 @@ def load_settings(
     file : Path or None
         The TOML file.
     command_line : dict
-        What was given there, by field name.
+        Values given there, by field name.
     microphone : dict
-        What was given there of the microphone.
+        Values given there for the microphone, by field name.
 
     Raises
     ------
@@ -124,7 +126,7 @@ def load_settings(
     try:
         settings = Settings(file=content, **command_line)  # type: ignore[call-arg]
         merged = settings.microphone[0].model_dump() | microphone
-        return settings.model_copy(update={"microphone": [Microphone(**merged)]})
+        return settings.model_copy(update={"microphone": [MicrophoneSettings(**merged)]})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

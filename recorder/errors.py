@@ -4,8 +4,8 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 class SourceError(HearthlogError):
-    """An audio file or a microphone cannot be heard."""
+    """An audio file cannot be read, or a microphone cannot be opened."""
 
 
 class ConfigurationError(HearthlogError):
-    """What the recorder was asked to do makes no sense."""
+    """The configuration is unknown, wrong or contradicts itself."""

@@ -1,9 +1,13 @@
-"""What a source of sound hands on: frames, gaps between them, and what it has to report."""
+"""What a source of sound hands on: frames, gaps between them, and the state of the source."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from threading import Event as Flag
+from typing import NamedTuple, Protocol
 
 from hearthlog.schemas.arrays import Float32, Int64
+
+OK, WARNING, ERROR = 0, 1, 2  # levels of diagnostic_msgs
 
 
 @dataclass(frozen=True)
@@ -15,6 +19,7 @@ class Frames:
     first : int
         Number of the first frame.
     samples : np.ndarray [shape=(n, 800)], float32
+        Samples in full scale, -1 to 1.
     stamps : np.ndarray [shape=(n,)], int64
         Time of each frame's first sample in nanoseconds of UTC.
     """
@@ -26,7 +31,15 @@ class Frames:
 
 @dataclass(frozen=True)
 class Gap:
-    """Audio that was not heard, between two times in nanoseconds of UTC, and why."""
+    """Audio that was not recorded.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    reason : str
+    frames_lost : int
+    """
 
     start: int
     end: int
@@ -35,8 +48,19 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Health:
-    """State of a source: level as in `diagnostic_msgs` (0 ok, 1 warning, 2 error)."""
+class SourceHealth:
+    """State of a source of sound.
+
+    Attributes
+    ----------
+    stamp : int
+        In nanoseconds of UTC.
+    level : int
+        `OK`, `WARNING` or `ERROR`.
+    summary : str
+    values : mapping of str to str
+        Details by name.
+    """
 
     stamp: int
     level: int
@@ -44,4 +68,40 @@ class Health:
     values: Mapping[str, str] = field(default_factory=dict)
 
 
-Event = Frames | Gap | Health
+Event = Frames | Gap | SourceHealth
+
+
+class SoundSource(Protocol):
+    """Where sound comes from.
+
+    Attributes
+    ----------
+    device : str
+        Its name.
+    """
+
+    device: str
+
+    def events(self, stop: Flag) -> Iterator[Event]:
+        """Yield what the source gives, until it ends or `stop` is set."""
+
+
+def event_time(event: Event) -> int:
+    """Return the last time that an event speaks of, in nanoseconds of UTC."""
+    if isinstance(event, Frames):
+        return int(event.stamps[-1])
+    return event.end if isinstance(event, Gap) else event.stamp
+
+
+class Notice(NamedTuple):
+    """A sentence about the recorder for its log.
+
+    Attributes
+    ----------
+    level : int
+        `OK`, `WARNING` or `ERROR`.
+    text : str
+    """
+
+    level: int
+    text: str

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hearthlog.recorder.pipeline import Record, opening
+from hearthlog.recorder.pipeline import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import active_path, log_path
 from hearthlog.schemas.logs.writer import Attachment, LogWriter
@@ -16,9 +16,9 @@ from hearthlog.schemas.messages.message_types import header
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
 
-# What may lie between a sound and its being written: a block of frames, and the capture's delay.
+# The longest time from a sound to its writing: a block of frames, and the delay of the capture.
 _DELAY_SECONDS = 0.9
-_FILES = 256  # that are remembered: of a second each, more than what clips are held back
+_FILES = 256  # to remember: even with one a second, longer than clips are held back
 _NEVER = (1 << 63) - 1
 
 
@@ -28,8 +28,15 @@ class LogDescription:
 
     Attributes
     ----------
+    root : Path
+        Folder of the logs.
+    node : str
+    topics : sequence of Topic
     infos : sequence of messages
         The `AudioStreamInfo` of each microphone, without its stamp.
+    metadata : mapping of str to str
+        The `hearthlog` record.
+    attachments : sequence of Attachment
     """
 
     root: Path
@@ -41,7 +48,7 @@ class LogDescription:
 
 
 class RollingLog:
-    """Writes records into hourly files.
+    """Writes messages into one file after another.
 
     Parameters
     ----------
@@ -52,6 +59,11 @@ class RollingLog:
         A killed process loses at most this much sound.
     sync_seconds : float
         A power cut loses at most this much sound.
+
+    Attributes
+    ----------
+    finished : list of Path
+        Files that are complete.
     """
 
     def __init__(
@@ -67,13 +79,13 @@ class RollingLog:
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
         self._sync_seconds = sync_seconds - _DELAY_SECONDS
         self._writer: LogWriter | None = None
-        self._last = self._until = 0  # no time lies between: the first record opens a file
+        self._last = self._until = 0  # no time lies between: the first message opens a file
         self._flush_at: int | None = None
         self._synced = time.monotonic()
         self._begun: deque[tuple[int, Path]] = deque(maxlen=_FILES)
 
-    def write(self, records: Sequence[Record]) -> None:
-        """Append records, in the order of their log times.
+    def write(self, messages: Sequence[EncodedMessage]) -> None:
+        """Append messages, in the order of their log times.
 
         Where time runs backwards, because the clock was set, another file begins.
 
@@ -83,17 +95,17 @@ class RollingLog:
             If the disk refuses; what was written stays, for the next start to complete.
         """
         with self._keeping_what_was_written():
-            for record in records:
-                if not self._last <= record.log_time < self._until:
-                    self._roll(record.log_time)
-                self._append(record)
+            for message in messages:
+                if not self._last <= message.log_time < self._until:
+                    self._roll(message.log_time)
+                self._append(message)
             if self._flush_at is not None and self._last >= self._flush_at:
                 self.flush()
             if time.monotonic() - self._synced >= self._sync_seconds:
                 self.sync()
 
     def flush(self) -> None:
-        """Hand what was written to the operating system."""
+        """Hand what was written over to the operating system."""
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
             self._flush_at = None
@@ -105,8 +117,8 @@ class RollingLog:
             self._writer.sync()
         self._synced = time.monotonic()
 
-    def finish(self, records: Sequence[Record] = ()) -> None:
-        """Append the last records to the file that is open, and complete it.
+    def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
+        """Append the last messages to the open file, and complete it.
 
         Raises
         ------
@@ -115,19 +127,28 @@ class RollingLog:
         """
         with self._keeping_what_was_written():
             if self._writer is not None:
-                for record in records:
-                    self._append(record)
+                for message in messages:
+                    self._append(message)
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether there is a name left for a file that begins at a time: one a second."""
+        """Tell whether a file may begin at a time: names are one a second."""
         path = log_path(self._description.root, self._description.node, stamp)
         return not (path.exists() or active_path(path).exists())
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
-        """Return which of the last files has a time that was written, and the end of that file.
+        """Find the file that contains a time; the later one where the clock was set back.
 
-        Where the clock was set back and files speak of the same time, it is the later one.
+        Parameters
+        ----------
+        stamp : int
+            A time that was written, in nanoseconds of UTC.
+
+        Returns
+        -------
+        path : Path
+        end : int
+            When the next file begins, in nanoseconds of UTC.
         """
         until = _NEVER
         for start, path in reversed(self._begun):
@@ -136,9 +157,22 @@ class RollingLog:
             until = start
         return self._begun[0][1], until
 
-    def begin_anew(self, description: LogDescription, records: Sequence[Record]) -> None:
-        """Complete the file as `finish` does; the next record begins one of other content."""
-        self.finish(records)
+    def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
+        """Complete the open file, and let the next message begin one of another description.
+
+        Parameters
+        ----------
+        description : LogDescription
+            Of the files to come.
+        messages : sequence of EncodedMessage
+            The last ones of the open file.
+
+        Raises
+        ------
+        LogError
+            As `finish` does.
+        """
+        self.finish(messages)
         self._description = description
         self._until = 0
 
@@ -161,24 +195,26 @@ class RollingLog:
             self.finished.append(self._writer.finish())
             self._writer = None
 
-    def _append(self, record: Record) -> None:
+    def _append(self, message: EncodedMessage) -> None:
         assert self._writer is not None
-        self._writer.write(record.topic, record.log_time, record.data)
-        self._last = record.log_time
+        self._writer.write(message.topic, message.log_time, message.data)
+        self._last = message.log_time
         if self._flush_at is None:
-            self._flush_at = record.log_time + self._flush_nanoseconds
+            self._flush_at = message.log_time + self._flush_nanoseconds
 
     def _roll(self, stamp: int) -> None:
         self._finish_file()
-        about = self._description
-        path = log_path(about.root, about.node, stamp)
-        self._writer = LogWriter(path, about.topics, about.metadata, about.attachments, stamp)
+        description = self._description
+        path = log_path(description.root, description.node, stamp)
+        self._writer = LogWriter(
+            path, description.topics, description.metadata, description.attachments, stamp
+        )
         self._begun.append((stamp, path))
         self._last = stamp
         self._until = (stamp // self._file_nanoseconds + 1) * self._file_nanoseconds
-        for info in about.infos:
+        for info in description.infos:
             info.header = header(stamp, info.header.frame_id)
-            for record in opening(info):
-                self._append(record)
+            for message in opening_messages(info):
+                self._append(message)
         self._writer.flush()  # the file now says what it is, whatever happens next
         self._flush_at = None

@@ -1,4 +1,4 @@
-"""The file of the model that speaks, watched: what takes its place is loaded and checked aside."""
+"""The model file in use, watched: a file that replaces it is loaded and checked in a thread."""
 
 import sys
 from collections.abc import Iterator
@@ -19,87 +19,87 @@ _Identity = tuple[int, int, int, int] | None
 
 
 class Loaded(NamedTuple):
-    """A model that was checked, ready to speak."""
+    """A model that was checked, with its classifier."""
 
     model: Model
     classifier: Classifier
 
 
 class ModelWatch:
-    """Looks every second, in a thread of its own, whether a model's file is another one.
+    """Checks every second, in a thread of its own, whether a model's file was replaced.
 
     Parameters
     ----------
     path : Path
         A model file, or a symbolic link to one.
-    asked : SimpleQueue
-        What is put into it makes the watch look at once, and say again what it has refused. Unlike
-        an event it can be put to from a signal handler at any moment.
+    requests : SimpleQueue
+        An item makes the watch check at once, and report again what it has refused. Unlike an
+        event, a queue can be used from a signal handler at any moment.
 
     Attributes
     ----------
     first : Loaded
-        The model that is there at the start.
+        The model at the start.
     ready : Loaded or None
-        The last one that has taken its place; to be set to None by who uses it.
+        The last model that replaced it; to be set to None by who uses it.
 
     Raises
     ------
     ModelError
-        If the model that is there at the start cannot be used.
+        If the model at the start cannot be used.
     """
 
-    def __init__(self, path: Path, asked: SimpleQueue[None]) -> None:
+    def __init__(self, path: Path, requests: SimpleQueue[None]) -> None:
         self._path = path
-        self._asked = asked
+        self._requests = requests
         self._seen = _identity(path)  # before it is loaded: a later file is another one
         self.first = _load(path)
         self.ready: Loaded | None = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
-        self._found: SimpleQueue[Loaded | str] = SimpleQueue()
+        self._results: SimpleQueue[Loaded | str] = SimpleQueue()
         self._closed = Flag()
         self._thread = Thread(target=self._watch, name="model watch", daemon=True)
         self._thread.start()
 
     def refusals(self) -> Iterator[str]:
-        """Take what was found since the last time: say what was refused, and set `ready`."""
+        """Yield why models were refused since the last call, and set `ready`."""
         with suppress(Empty):
             while True:
-                found = self._found.get_nowait()
-                if isinstance(found, str):
-                    yield found
+                result = self._results.get_nowait()
+                if isinstance(result, str):
+                    yield result
                 else:
-                    self.ready = found
+                    self.ready = result
 
     def close(self) -> None:
         """End the thread."""
         self._closed.set()
-        self._asked.put(None)
+        self._requests.put(None)
         self._thread.join()
 
     def _watch(self) -> None:
         while not self._closed.is_set():
-            asked = self._wait()
+            requested = self._wait()
             now = _identity(self._path)
-            if (now != self._seen or asked) and not self._closed.is_set():
+            if (now != self._seen or requested) and not self._closed.is_set():
                 self._seen = now
                 self._look()
 
     def _wait(self) -> bool:
-        """Wait for the next look; return whether somebody has asked for it."""
+        """Wait for the next check; return whether it was requested."""
         try:
-            self._asked.get(timeout=_LOOK_SECONDS)
+            self._requests.get(timeout=_LOOK_SECONDS)
         except Empty:
             return False
-        while not self._asked.empty():
-            self._asked.get_nowait()
+        while not self._requests.empty():
+            self._requests.get_nowait()
         return True
 
     def _look(self) -> None:
         try:
             loaded = _load(self._path)
-        except Exception as error:  # noqa: BLE001  whatever is wrong with a file: the sound goes on
+        except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
             if _identity(self._path) == self._seen:  # else it is still being written
                 self._refuse(str(error) or repr(error))
             return
@@ -111,11 +111,11 @@ class ModelWatch:
         if (model.name, model.sha256) != (self._last.name, self._last.sha256):
             self._last = model
             _warn_if_simulated(model)
-            self._found.put(loaded)
+            self._results.put(loaded)
 
     def _refuse(self, reason: str) -> None:
         text = f"model {self._path.stem} refused: {reason}; going on with {self._last.name}"
-        self._found.put(text)
+        self._results.put(text)
         _say(text)
 
 
@@ -139,9 +139,9 @@ def _load(path: Path) -> Loaded:
 
 
 def _identity(path: Path) -> _Identity:
-    """Return what changes when another file takes a name; None if there is none."""
+    """Return what differs between two files of one name; None if there is no file."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
+    return status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size

@@ -1,7 +1,7 @@
 """Frames in, encoded messages out: features, statistics, labels and segments. No I/O."""
 
 from collections.abc import Mapping
-from operator import itemgetter
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,10 +9,11 @@ import numpy as np
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.labels.segments import Segment, Segmenter
+from hearthlog.models.labels.label_messages import label_columns, segment_columns
+from hearthlog.models.labels.labeller import FrameLabels, Labeller
+from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
-from hearthlog.recorder.clips.clip_choice import Labelled
-from hearthlog.recorder.events import Event, Frames, Gap, Health
+from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.statistics import RollingStatistics
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
@@ -27,15 +28,18 @@ from hearthlog.schemas.messages.message_types import (
 )
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
 
-_ROW_TYPES = {
-    "features": message_types.FEATURES,
-    "statistics": message_types.STATISTICS,
-    "label": message_types.LABEL,
-}
 
+class EncodedMessage(NamedTuple):
+    """One message on its way into the log.
 
-class Record(NamedTuple):
-    """One encoded message on its way into the log."""
+    Attributes
+    ----------
+    log_time : int
+        In nanoseconds of UTC.
+    topic : str
+    data : bytes
+        The message in CDR.
+    """
 
     log_time: int
     topic: str
@@ -59,12 +63,12 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
     )
 
 
-def opening(info: Any) -> list[Record]:
-    """Return what every file begins with: its `AudioStreamInfo`, and the same in words."""
+def opening_messages(info: Any) -> list[EncodedMessage]:
+    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words."""
     stamp = nanoseconds(info.header.stamp)
     return [
-        Record(stamp, topic(info.header.frame_id, "info"), encode(info)),
-        Record(stamp, ROSOUT, rosout.of_info(info)),
+        EncodedMessage(stamp, topic(info.header.frame_id, "info"), encode(info)),
+        EncodedMessage(stamp, ROSOUT, rosout.info_line(info)),
     ]
 
 
@@ -78,7 +82,7 @@ class Pipeline:
     features : FeatureSet
         What is computed from each frame.
     classifier : Classifier or None
-        Of this feature set. Without one there are no labels.
+        For this feature set. Without one there are no labels.
     statistics_every : int
         Frames from one statistics message to the next.
 
@@ -86,10 +90,10 @@ class Pipeline:
     ----------
     microphone : str
     feature_set : FeatureSet
-    settled : bool
-        Whether sound before the first frame would have left no trace in the segments to come.
-    labelled : Labelled or None
-        What was said of the last frames that were pushed last; None where they had no label.
+    segments_converged : bool
+        Whether sound before the first frame would leave no trace in the segments to come.
+    last_labels : FrameLabels or None
+        Labels of the frames that were pushed last; None if they have none.
     """
 
     def __init__(
@@ -101,29 +105,29 @@ class Pipeline:
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
-        self.settled = False
-        self.labelled: Labelled | None = None
-        self._use(classifier)
+        self.segments_converged = False
+        self.last_labels: FrameLabels | None = None
+        self._labeller = None if classifier is None else Labeller(classifier)
         self._statistics_every = statistics_every
         self._features = features.extractor()
         self._statistics = RollingStatistics(features.window_frames)
         self._end = 0
-        self._level = 0
+        self._level = OK
 
     @property
     def classes(self) -> tuple[str, ...] | None:
-        """What the model that speaks tells apart."""
-        return None if self._classifier is None else self._classifier.classes
+        """The classes of the model in use; None without one."""
+        return None if self._labeller is None else self._labeller.classes
 
-    def push(self, event: Event) -> list[Record]:
-        """Turn what a source handed on into messages, in the order of their log times."""
+    def push(self, event: Event) -> list[EncodedMessage]:
+        """Turn an event of a source into messages, in the order of their log times."""
         if isinstance(event, Frames):
             return self.push_features(self._features(event.samples), event.first, event.stamps)
         if isinstance(event, Gap):
             return self._push_gap(event)
         return self._push_health(event)
 
-    def push_features(self, features: Float32, first: int, stamps: Int64) -> list[Record]:
+    def push_features(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
         """Turn the features of successive frames into messages.
 
         Parameters
@@ -133,74 +137,78 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of EncodedMessage
+            In the order of their log times.
         """
-        self.labelled = None
         mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))
-        shown = np.flatnonzero(frames % self._statistics_every == 0)
-        records = [
-            *self._rows("features", frames, stamps, {"values": features}),
-            *self._rows(
-                "statistics", frames[shown], stamps[shown], {"mean": mean[shown], "std": std[shown]}
-            ),
+        logged = np.flatnonzero(frames % self._statistics_every == 0)
+        statistics = {"mean": mean[logged], "std": std[logged]}
+        messages = [
+            *self._feature_messages("features", frames, stamps, {"values": features}),
+            *self._feature_messages("statistics", frames[logged], stamps[logged], statistics),
+            *self._label(features, first, stamps),
         ]
-        if self._inputs is not None:
-            inputs = self._inputs(features)  # at the last frames: labels are of a whole window
-            heard = slice(len(frames) - len(inputs), None)
-            records += self._labels(inputs, frames[heard], stamps[heard])
-        records.sort(key=itemgetter(0))
+        messages.sort(key=attrgetter("log_time"))
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
-        return records
+        return messages
 
-    def finish(self) -> list[Record]:
-        """Close what is open at the end of the sound."""
+    def finish(self) -> list[EncodedMessage]:
+        """Close the open segment at the end of the sound."""
         return self._close(self._end)
 
     def change_model(
         self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
-    ) -> tuple[list[Record], list[Record]]:
-        """Let another model speak from a frame on; features and statistics go on.
-
-        It must be for the same feature set.
+    ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
+        """Use another model from a frame on; features and statistics go on.
 
         Parameters
         ----------
         model : Model or None
+            For the same feature set.
         classifier : Classifier or None
             Of that model.
         frame, stamp : int
-            Number and time of the frame that follows.
+            Number of the next frame, and its start in nanoseconds of UTC.
 
         Returns
         -------
-        closing, opening : list of Record
-            What ends the log of the last model, and what begins that of this one.
+        closing : list of EncodedMessage
+            Last messages of the log of the model before.
+        opening : list of EncodedMessage
+            First messages of the log of this model.
         """
         closing = self._close(stamp)
-        self._use(classifier)
-        if self._inputs is not None and self._statistics.recent is not None:
-            self._inputs(self._statistics.recent)
+        self._labeller = None if classifier is None else Labeller(classifier)
+        if self._labeller is not None and self._statistics.recent is not None:
+            self._labeller.fill_window(self._statistics.recent)
         who = "no model" if model is None else f"model {model.name} ({model.sha256[:12]})"
-        return closing, self.report("model", stamp, 0, f"{who} from frame {frame} on")
+        notice = Notice(OK, f"{who} from frame {frame} on")
+        return closing, self.report("model", stamp, notice)
 
-    def report(self, what: str, stamp: int, level: int, text: str) -> list[Record]:
-        """Say something about the model or the clips; the level is one of `diagnostic_msgs`."""
+    def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
+        """Turn a notice into messages.
+
+        Parameters
+        ----------
+        subject : str
+            What it is about: "model" or "clips".
+        stamp : int
+            In nanoseconds of UTC.
+        notice : Notice
+        """
+        name = f"hearthlog: {self.microphone} {subject}"
         return [
-            self._diagnostics(stamp, level, f"hearthlog: {self.microphone} {what}", text, {}),
-            Record(stamp, ROSOUT, rosout.of_report(self.microphone, stamp, level, text)),
+            self._diagnostics(stamp, notice.level, name, notice.text, {}),
+            EncodedMessage(stamp, ROSOUT, rosout.notice_line(self.microphone, stamp, notice)),
         ]
 
-    def _use(self, classifier: Classifier | None) -> None:
-        self._classifier = classifier
-        self._inputs = None if classifier is None else classifier.inputs.stream()
-        self._segmenter = None if classifier is None else _segmenter(classifier)
-
-    def _push_gap(self, gap: Gap) -> list[Record]:
+    def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         self._features.restart()
         self._statistics.restart()
-        if self._inputs is not None:
-            self._inputs.restart()
-        closed = self._close(self._end)
         data = encode(
             message(
                 message_types.GAP,
@@ -211,83 +219,84 @@ class Pipeline:
             )
         )
         return [
-            *closed,
-            Record(gap.end, topic(self.microphone, "gap"), data),
-            Record(gap.end, ROSOUT, rosout.of_gap(self.microphone, gap)),
+            *self._close(self._end),
+            EncodedMessage(gap.end, topic(self.microphone, "gap"), data),
+            EncodedMessage(gap.end, ROSOUT, rosout.gap_line(self.microphone, gap)),
         ]
 
-    def _labels(self, inputs: Float32, frames: Int64, stamps: Int64) -> list[Record]:
-        classifier, segmenter = self._classifier, self._segmenter
-        if classifier is None or segmenter is None or not len(inputs):
+    def _label(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
+        self.last_labels = None
+        if self._labeller is None:
             return []
-        probabilities, novelty = classifier.classify(inputs)
-        self.labelled = Labelled(classifier.classes, probabilities, novelty)
-        best = probabilities.argmax(axis=1)
-        confidence = probabilities[np.arange(len(best)), best]
-        closed = segmenter.push(probabilities, stamps)
-        self.settled |= segmenter.settled
-        columns = {
-            "label": [classifier.classes[i] for i in best],
-            "confidence": confidence,
-            "novelty": novelty,
-            "probabilities": probabilities,
-        }
-        return self._segment_records(closed) + self._rows("label", frames, stamps, columns)
+        labels, segments = self._labeller.push(features, first, stamps)
+        if not len(labels.frames):
+            return []
+        self.last_labels = labels
+        self.segments_converged |= self._labeller.segmenter.segments_converged
+        columns = label_columns(labels, self.microphone)
+        return [
+            *self._segment_messages(segments),
+            *self._messages("label", message_types.LABEL, labels.stamps, columns),
+        ]
 
-    def _rows(
-        self, kind: str, frames: Int64, stamps: Int64, columns: Mapping[str, Column]
-    ) -> list[Record]:
-        common: dict[str, Column] = {
+    def _close(self, end: int) -> list[EncodedMessage]:
+        """End the segments at `end`; the next frame begins anew."""
+        if self._labeller is None:
+            return []
+        segments = self._labeller.close(end)
+        self.segments_converged |= bool(segments)
+        return self._segment_messages(segments)
+
+    def _feature_messages(
+        self, kind: str, frames: Int64, stamps: Int64, arrays: Mapping[str, Float32]
+    ) -> list[EncodedMessage]:
+        columns: dict[str, Column] = {
             "header.stamp": stamps,
             "header.frame_id": self.microphone,
             "frame": frames,
+            **arrays,
         }
+        typename = message_types.FEATURES if kind == "features" else message_types.STATISTICS
+        return self._messages(kind, typename, stamps, columns)
+
+    def _messages(
+        self, kind: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
+    ) -> list[EncodedMessage]:
         name = topic(self.microphone, kind)
-        rows = encode_rows(_ROW_TYPES[kind], common | dict(columns), len(frames))
-        return [Record(time, name, row) for time, row in zip(stamps.tolist(), rows, strict=True)]
-
-    def _close(self, end: int) -> list[Record]:
-        """End the segments at `end`; what comes next begins anew."""
-        if self._segmenter is None:
-            return []
-        closed = self._segmenter.close(end)
-        self.settled |= bool(closed)
-        return self._segment_records(closed)
-
-    def _segment_records(self, segments: list[Segment]) -> list[Record]:
-        return [record for segment in segments for record in self._of_segment(segment)]
-
-    def _of_segment(self, segment: Segment) -> list[Record]:
-        assert self._classifier is not None
-        label = self._classifier.classes[segment.label]
-        data = encode(
-            message(
-                message_types.SEGMENT,
-                header=header(segment.start, self.microphone),
-                duration=duration_message(segment.end - segment.start),
-                label=label,
-                confidence=segment.confidence,
-            )
-        )
+        rows = encode_rows(typename, columns, len(log_times))
         return [
-            Record(segment.known, topic(self.microphone, "segment"), data),
-            Record(segment.known, ROSOUT, rosout.of_segment(self.microphone, segment, label)),
+            EncodedMessage(time, name, row)
+            for time, row in zip(log_times.tolist(), rows, strict=True)
         ]
 
-    def _push_health(self, health: Health) -> list[Record]:
+    def _segment_messages(self, segments: list[Segment]) -> list[EncodedMessage]:
+        if self._labeller is None or not segments:
+            return []
+        classes = self._labeller.classes
+        times = np.array([segment.decided_at for segment in segments])
+        columns = segment_columns(segments, classes, self.microphone)
+        messages = []
+        for encoded, segment in zip(
+            self._messages("segment", message_types.SEGMENT, times, columns), segments, strict=True
+        ):
+            line = rosout.segment_line(self.microphone, segment, classes[segment.label])
+            messages += [encoded, EncodedMessage(segment.decided_at, ROSOUT, line)]
+        return messages
+
+    def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         name = f"hearthlog: {self.microphone}"
-        records = [
+        messages = [
             self._diagnostics(health.stamp, health.level, name, health.summary, health.values)
         ]
         if health.level != self._level:
             self._level = health.level
-            line = rosout.of_health(self.microphone, health)
-            records.append(Record(health.stamp, ROSOUT, line))
-        return records
+            line = rosout.health_line(self.microphone, health)
+            messages.append(EncodedMessage(health.stamp, ROSOUT, line))
+        return messages
 
     def _diagnostics(
         self, stamp: int, level: int, name: str, text: str, values: Mapping[str, str]
-    ) -> Record:
+    ) -> EncodedMessage:
         status = message(
             "diagnostic_msgs/msg/DiagnosticStatus",
             level=level,
@@ -304,8 +313,4 @@ class Pipeline:
                 message_types.DIAGNOSTICS, header=header(stamp, self.microphone), status=[status]
             )
         )
-        return Record(stamp, DIAGNOSTICS, data)
-
-
-def _segmenter(classifier: Classifier) -> Segmenter:
-    return Segmenter(classifier.smoothing, classifier.transitions, FRAME_SECONDS)
+        return EncodedMessage(stamp, DIAGNOSTICS, data)

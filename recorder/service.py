@@ -1,26 +1,26 @@
-"""The recorder: a source of sound, the pipeline, and the log it ends in."""
+"""The recorder: a source of sound, the pipeline, and the log that it writes."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
-from typing import Any, Protocol
+from typing import Any
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile.card import model_attachments
-from hearthlog.recorder.clips.clip_recorder import ClipKeeper, time_of
-from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.clips.clip_recorder import ClipRecorder
+from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.events import Event, Frames, Gap
+from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.model_watch import ModelWatch
-from hearthlog.recorder.pipeline import Pipeline, Record, stream_info
+from hearthlog.recorder.pipeline import EncodedMessage, Pipeline, stream_info
 from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.microphone import MicrophoneSource
@@ -30,20 +30,19 @@ from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.messages.topics import topics_of
 
 
-class Source(Protocol):
-    """Where sound comes from."""
-
-    device: str
-
-    def events(self, stop: Flag) -> Iterator[Event]:
-        """Hand on what is heard until it ends or `stop` is set."""
-
-
 @dataclass
-class Recording:
-    """What was recorded: finished logs, and the gaps in them.
+class RecordingSummary:
+    """What was recorded.
 
-    `recovered` are the logs of an earlier recorder that were completed first.
+    Attributes
+    ----------
+    logs : list of Path
+        Finished logs.
+    recovered : sequence of Recovered
+        Logs of an earlier recorder that were completed first.
+    frames_lost, gaps : int
+    models_refused : int
+        Model files that could not be used.
     """
 
     logs: list[Path]
@@ -55,28 +54,28 @@ class Recording:
 
 def record_files(
     settings: Settings,
-    microphone: Microphone,
+    microphone: MicrophoneSettings,
     source: FileSource,
     stop: Flag,
-    asked: SimpleQueue[None] | None = None,
-) -> Recording:
-    """Record audio files as if a microphone had heard them.
+    reload_requests: SimpleQueue[None] | None = None,
+) -> RecordingSummary:
+    """Record audio files as if a microphone had captured them.
 
     Parameters
     ----------
     settings : Settings
-    microphone : Microphone
+    microphone : MicrophoneSettings
         The one that they stand in for.
     source : FileSource
     stop : threading.Event
         Once set, the log is completed.
-    asked : SimpleQueue or None
-        What is put into it makes the recorder look at once whether the model's file is another.
+    reload_requests : SimpleQueue or None
+        An item makes the recorder check at once whether the model's file has been replaced.
 
     Raises
     ------
     SourceError
-        If one of them turns out to be damaged.
+        If one of the files turns out to be damaged.
     ModelError
         If the model cannot be used.
     ConfigurationError
@@ -86,39 +85,42 @@ def record_files(
         If the log cannot be written; what was written stays, for the next start to complete.
     """
     recovered = recover_active(settings.output, settings.node)
-    recording = record(settings, microphone, source, stop, asked)
-    recording.recovered = recovered
-    return recording
+    summary = record(settings, microphone, source, stop, reload_requests)
+    summary.recovered = recovered
+    return summary
 
 
 def record_microphone(
-    settings: Settings, microphone: Microphone, stop: Flag, asked: SimpleQueue[None] | None = None
-) -> Recording:
+    settings: Settings,
+    microphone: MicrophoneSettings,
+    stop: Flag,
+    reload_requests: SimpleQueue[None] | None = None,
+) -> RecordingSummary:
     """Record a microphone until `stop` is set, whatever happens to it.
 
-    Parameters are those of `record_files`.
+    The parameters are those of `record_files`.
 
     Raises
     ------
     SourceError
-        If it cannot be heard at the start.
+        If it gives no sound at the start.
     ModelError, ConfigurationError, LogError
         As `record_files`.
     """
     source = MicrophoneSource(microphone.device)
-    with closing(source):  # it hears, and its pipe holds, while older logs are completed
+    with closing(source):  # it captures, and its pipe holds, while older logs are completed
         recovered = recover_active(settings.output, settings.node)
         end = max((log.end for log in recovered), default=0)
-        heard = _AfterKill(source, end) if end else source
-        recording = record(settings, microphone, heard, stop, asked)
-    recording.recovered = recovered
-    return recording
+        resumed = _GapAfterRestart(source, end) if end else source
+        summary = record(settings, microphone, resumed, stop, reload_requests)
+    summary.recovered = recovered
+    return summary
 
 
-class _AfterKill:
-    """A source before whose first frame lies what was not heard since a recorder was killed."""
+class _GapAfterRestart:
+    """A source with a gap before its first frame: from the end of the last log on."""
 
-    def __init__(self, source: Source, end: int) -> None:
+    def __init__(self, source: SoundSource, end: int) -> None:
         self.device = source.device
         self._source = source
         self._end = end
@@ -135,82 +137,116 @@ class _AfterKill:
 
 def record(
     settings: Settings,
-    microphone: Microphone,
-    source: Source,
+    microphone: MicrophoneSettings,
+    source: SoundSource,
     stop: Flag,
-    asked: SimpleQueue[None] | None = None,
-) -> Recording:
-    """Record a source until it ends or `stop` is set; raises as `record_files`."""
+    reload_requests: SimpleQueue[None] | None = None,
+) -> RecordingSummary:
+    """Record a source until it ends or `stop` is set.
+
+    The parameters and the errors are those of `record_files`.
+    """
     with ExitStack() as stack:
         watch = None
         if settings.model is not None:
-            watch = stack.enter_context(closing(ModelWatch(settings.model, asked or SimpleQueue())))
+            watch = ModelWatch(settings.model, reload_requests or SimpleQueue())
+            stack.enter_context(closing(watch))
+        recording = Recording(settings, microphone.name, source.device, watch)
+        try:
+            for event in source.events(stop):
+                recording.add(event)
+        finally:
+            recording.finish()
+    return recording.summary
+
+
+class Recording:
+    """Everything that one source ends in: its log, and clips beside it.
+
+    Parameters
+    ----------
+    settings : Settings
+    microphone : str
+        Its name.
+    device : str
+        Name of the source.
+    watch : ModelWatch or None
+        Gives the models, one after the other; None for no labels.
+
+    Attributes
+    ----------
+    summary : RecordingSummary
+    """
+
+    def __init__(
+        self, settings: Settings, microphone: str, device: str, watch: ModelWatch | None
+    ) -> None:
+        self._settings = settings
+        self._device = device
+        self._watch = watch
         model, classifier = (None, None) if watch is None else watch.first
-        features = _features(settings, classifier)
-        pipeline = Pipeline(microphone.name, features, classifier, settings.statistics_every)
-
-        def describe(model: Model | None) -> LogDescription:
-            info = stream_info(microphone.name, source.device, features, model)
-            return describe_log(settings, info, features, model)
-
-        log = RollingLog(
-            describe(model),
+        features = _configured_features(settings, classifier)
+        self._pipeline = Pipeline(microphone, features, classifier, settings.statistics_every)
+        self._log = RollingLog(
+            self._describe(model),
             settings.max_bag_duration,
             settings.flush_seconds,
             settings.sync_seconds,
         )
-        clips = ClipKeeper(settings, pipeline, log.file_at)
-        recording = Recording(log.finished)
-        now = 0
-        try:
-            for event in source.events(stop):
-                if isinstance(event, Gap):
-                    recording.gaps += 1
-                    recording.frames_lost += event.frames_lost
-                if isinstance(event, Frames) and watch is not None:
-                    recording.models_refused += _attend(watch, event, pipeline, log, describe)
-                said = clips.before(event)
-                log.write(pipeline.push(event))
-                said += clips.after(event, pipeline.labelled)
-                now = time_of(event)
-                log.write(_reports(pipeline, now, said))
-        finally:
-            said = clips.finish()
-            log.finish([*pipeline.finish(), *_reports(pipeline, now, said)])
-    return recording
+        self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
+        self._now = 0  # time of the last event
+        self.summary = RecordingSummary(self._log.finished)
+
+    def add(self, event: Event) -> None:
+        """Record one event of the source."""
+        if isinstance(event, Gap):
+            self.summary.gaps += 1
+            self.summary.frames_lost += event.frames_lost
+        if isinstance(event, Frames) and self._watch is not None:
+            self._look_for_model(self._watch, event)
+        notices = self._clips.before(event)
+        self._log.write(self._pipeline.push(event))
+        notices += self._clips.after(event, self._pipeline.last_labels)
+        self._now = event_time(event)
+        self._log.write(self._clip_messages(notices))
+
+    def finish(self) -> None:
+        """Complete the log and its clips."""
+        notices = self._clips.finish()
+        self._log.finish([*self._pipeline.finish(), *self._clip_messages(notices)])
+
+    def _clip_messages(self, notices: Sequence[Notice]) -> list[EncodedMessage]:
+        return [
+            message
+            for notice in notices
+            for message in self._pipeline.report("clips", self._now, notice)
+        ]
+
+    def _look_for_model(self, watch: ModelWatch, frames: Frames) -> None:
+        """Report models that were refused, and let one that is ready label from these frames on.
+
+        Its labels begin a log of their own: the names of the classes belong to the channel, and
+        the model card to the file.
+        """
+        stamp = int(frames.stamps[0])
+        for text in watch.refusals():
+            self.summary.models_refused += 1
+            self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, text)))
+        if watch.ready is not None and self._log.may_begin(stamp):
+            model, classifier = watch.ready
+            watch.ready = None
+            closing, opening = self._pipeline.change_model(model, classifier, frames.first, stamp)
+            self._log.begin_anew(self._describe(model), closing)
+            self._log.write(opening)
+
+    def _describe(self, model: Model | None) -> LogDescription:
+        features = self._pipeline.feature_set
+        info = stream_info(self._pipeline.microphone, self._device, features, model)
+        return describe_log(self._settings, info, features, model)
 
 
-def _reports(pipeline: Pipeline, now: int, said: Sequence[tuple[int, str]]) -> list[Record]:
-    return [record for level, text in said for record in pipeline.report("clips", now, level, text)]
-
-
-def _attend(
-    watch: ModelWatch,
-    coming: Frames,
-    pipeline: Pipeline,
-    log: RollingLog,
-    describe: Callable[[Model | None], LogDescription],
-) -> int:
-    """Let a model that is ready speak from the coming frames on; return how many were refused.
-
-    Its labels begin a log of their own: the names behind the probabilities are of the channel, and
-    the card is of the file.
-    """
-    stamp = int(coming.stamps[0])
-    refused = list(watch.refusals())
-    for text in refused:
-        log.write(pipeline.report("model", stamp, 1, text))
-    if watch.ready is not None and log.may_begin(stamp):
-        model, classifier = watch.ready
-        watch.ready = None
-        last, first = pipeline.change_model(model, classifier, coming.first, stamp)
-        log.begin_anew(describe(model), last)
-        log.write(first)
-    return len(refused)
-
-
-def _features(settings: Settings, classifier: Classifier | None) -> FeatureSet:
-    """Return the feature set to compute: the one that is asked for, which must be the model's."""
+def _configured_features(settings: Settings, classifier: Classifier | None) -> FeatureSet:
+    """Return the configured feature set, which must be that of the model, if there is one."""
     if classifier is None:
         return feature_set(settings.feature_set or DEFAULT.name)
     name = classifier.feature_set.name
@@ -225,7 +261,17 @@ def _features(settings: Settings, classifier: Classifier | None) -> FeatureSet:
 def describe_log(
     settings: Settings, info: Any, features: FeatureSet, model: Model | None
 ) -> LogDescription:
-    """Say what every file of a recording says of itself; `info` is its `AudioStreamInfo`."""
+    """Return the description of the logs of a recording.
+
+    Parameters
+    ----------
+    settings : Settings
+    info : message
+        Their `AudioStreamInfo`.
+    features : FeatureSet
+    model : Model or None
+        That labels the sound.
+    """
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]

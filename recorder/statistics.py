@@ -11,7 +11,7 @@ _FRAMES_AT_ONCE = 256
 class RollingStatistics:
     """Statistics of one stream of frames over its last frames.
 
-    Every window is summed anew from its own frames: running sums would drift over months.
+    Every window is summed anew from its own frames, since running sums would drift over months.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class RollingStatistics:
 
     @property
     def recent(self) -> Float32 | None:
-        """The features of the last frames, of which one more makes a window; None after a gap."""
+        """The features of the last frames, one less than a window; None after a gap."""
         return self._recent
 
     def restart(self) -> None:
@@ -41,8 +41,8 @@ class RollingStatistics:
         Returns
         -------
         mean, std : np.ndarray [shape=(n, d)], float32
-            Over the last window, or over those heard since the start or the last restart if
-            they are fewer; the standard deviation divides by their number.
+            Over the last window, or over all frames since the start or the last restart where
+            these are fewer; the standard deviation divides by their number.
         """
         mean = np.empty_like(features)
         std = np.empty_like(features)
@@ -53,11 +53,11 @@ class RollingStatistics:
 
     def _compute(self, features: Float32, mean: Float32, std: Float32) -> None:
         recent = features[:0] if self._recent is None else self._recent
-        heard = np.concatenate([recent, features])
+        values = np.concatenate([recent, features])
         filling = min(max(self._window - 1 - len(recent), 0), len(features))
         for i in range(filling):
-            frames = [*heard[: len(recent) + i + 1, np.newaxis]]
+            frames = [*values[: len(recent) + i + 1, np.newaxis]]
             mean[i : i + 1], std[i : i + 1] = mean_and_std(frames)
         if filling < len(features):
-            mean[filling:], std[filling:] = mean_and_std(successive(heard, self._window))
-        self._recent = heard[max(len(heard) - self._window + 1, 0) :].copy()
+            mean[filling:], std[filling:] = mean_and_std(successive(values, self._window))
+        self._recent = values[max(len(values) - self._window + 1, 0) :].copy()

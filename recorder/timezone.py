@@ -19,7 +19,7 @@ def time_zone(name: str) -> tzinfo:
     Raises
     ------
     LogError
-        If this machine knows no such zone.
+        If this machine has no such zone.
     """
     if name == DEFAULT:
         return UTC  # known where there is no database, too
@@ -32,7 +32,7 @@ def time_zone(name: str) -> tzinfo:
 
 
 def check_time_zone(name: str) -> str:
-    """Return the name of a zone that there is."""
+    """Return the name of a zone if this machine knows it; raises as `time_zone`."""
     time_zone(name)
     return name
 

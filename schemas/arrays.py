@@ -8,6 +8,7 @@ Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Int16 = NDArray[np.int16]
 Int64 = NDArray[np.int64]
 
 

@@ -15,7 +15,7 @@ from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
 from hearthlog.analyzer.logs import typed_columns as known
-from hearthlog.analyzer.relabel.layer import digest
+from hearthlog.analyzer.relabel.layer import log_digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages import cdr_layout as layout
@@ -135,7 +135,7 @@ def _write(path: Path, target: Path) -> None:
             record.metadata["schema_version"] = str(NEXT)
             if "input_sha256" in record.metadata:
                 of = target.with_name(record.metadata["log"])
-                record.metadata["input_sha256"] = digest(of)
+                record.metadata["input_sha256"] = log_digest(of)
     log.write(target)
 
 

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from threading import Event as Flag
 
-from hearthlog.recorder.events import Event, Frames, Gap
-from hearthlog.recorder.service import Source
+from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
@@ -14,7 +13,7 @@ class LossySource:
 
     Parameters
     ----------
-    source : Source
+    source : SoundSource
     lost : dict of int to int
         Frames lost before a block, by the number of the block.
     at_end : callable
@@ -22,7 +21,7 @@ class LossySource:
     """
 
     def __init__(
-        self, source: Source, lost: dict[int, int], at_end: Callable[[], object] = lambda: None
+        self, source: SoundSource, lost: dict[int, int], at_end: Callable[[], object] = lambda: None
     ) -> None:
         self.device = source.device
         self._source = source

@@ -10,7 +10,7 @@ import soundfile
 from lossy import LossySource
 
 from hearthlog.analyzer.training.dataset import build_dataset
-from hearthlog.analyzer.training.manifest import Clip, read_manifest
+from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
@@ -126,7 +126,7 @@ def _record(folder: Path, model: Path, paths: list[Path], half: int) -> None:
     )
 
 
-def _write_piece(path: Path, clips: list[Clip]) -> Path:
+def _write_piece(path: Path, clips: list[LabelledClip]) -> Path:
     """Chain recordings, those last that the model has learnt from."""
     learnt = set(_spread(clips, _CLIPS))
     parts, left = [], _PIECE * SAMPLE_RATE
@@ -142,5 +142,5 @@ def _write_piece(path: Path, clips: list[Clip]) -> Path:
     return path
 
 
-def _spread(clips: list[Clip], count: int) -> list[Clip]:
+def _spread(clips: list[LabelledClip], count: int) -> list[LabelledClip]:
     return clips[:: max(len(clips) // count, 1)][:count]

@@ -32,7 +32,7 @@ from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed
 from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
@@ -206,7 +206,7 @@ def test_layers_have_rows_of_their_own_that_name_their_log(fleet):
 def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_path, capfd):
     log = find_logs(fleet / "north")[0]
     layer = relabelled(log, [(12, "speech"), (6, "music")])
-    hall = Settings(output=tmp_path, model=model_file, microphone=[Microphone(name="hall")])
+    hall = Settings(output=tmp_path, model=model_file, microphone=[MicrophoneSettings(name="hall")])
     (other,) = record(hall, hall.microphone[0], FileSource([day], START), Event()).logs
     merged = fleet / "merged.mcap"
     assert run(capfd, "merge", log, layer, other, "-o", merged).returncode == 0

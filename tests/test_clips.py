@@ -29,11 +29,12 @@ from hearthlog.analyzer.training.scenario import load_scenario
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
+from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, ClipFinder, Labelled, Sound
-from hearthlog.recorder.clips.clip_layer import ClipLog
-from hearthlog.recorder.clips.clip_retention import Retention
-from hearthlog.recorder.config import Microphone, Settings, load_settings
+from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, ClipFinder, KeptSound
+from hearthlog.recorder.clips.clip_layer import ClipWriter
+from hearthlog.recorder.clips.clip_retention import ClipRetention
+from hearthlog.recorder.config import MicrophoneSettings, Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.service import record, record_files
@@ -65,11 +66,16 @@ def push(finder, first, private, unlabelled=0, blocks=(7, 20, 1)):
         said = np.asarray(private, np.float32)[numbers[numbers >= unlabelled]]
         rest = 1 - said
         probabilities = np.stack([rest / 4, said, rest * 3 / 4], axis=1)
-        labelled = Labelled(CLASSES, probabilities, np.zeros(len(said), np.float32))
+        labelled = labels_of(probabilities, np.zeros(len(said), np.float32))
         frames = Frames(first + start, samples.astype(np.float32), stamps)
         kept += finder.push(frames, labelled if len(said) else None)
         start = int(numbers[-1]) + 1
     return numbers_of(kept)
+
+
+def labels_of(probabilities, novelty):
+    frames = np.arange(len(novelty))
+    return FrameLabels(CLASSES, frames, START + frames * FRAME_NANOSECONDS, probabilities, novelty)
 
 
 def numbers_of(sounds):
@@ -148,7 +154,7 @@ def kept_of(finder, probabilities, novelty):
     samples = np.repeat(np.arange(count)[:, np.newaxis] / 32768, FRAME_SAMPLES, axis=1)
     stamps = START + np.arange(count) * FRAME_NANOSECONDS
     frames = Frames(0, samples.astype(np.float32), stamps)
-    kept = finder.push(frames, Labelled(CLASSES, probabilities, novelty))
+    kept = finder.push(frames, labels_of(probabilities, novelty))
     return numbers_of([*kept, *finder.close()])
 
 
@@ -309,17 +315,17 @@ def test_layers_roll_with_their_logs(noise, tmp_path):
 def test_a_layer_is_complete_soon_after_its_log_though_no_sound_follows(tmp_path):
     names = [tmp_path / f"home_20260301T07000{second}Z.mcap" for second in (0, 5)]
     rolls = START + 5 * SECOND
-    log = ClipLog(
+    log = ClipWriter(
         asked(tmp_path, keep_audio="always"),
         "mic",
         lambda stamp: (names[0], rolls) if stamp < rolls else (names[1], rolls + DAY),
     )
-    log.write([Sound(START + np.arange(9) * FRAME_NANOSECONDS, np.zeros((9, 800), np.int16))])
+    log.write([KeptSound(START + np.arange(9) * FRAME_NANOSECONDS, np.zeros((9, 800), np.int16))])
     layer = audio_path(names[0])
     for after in (4, 6, 60):
-        log.attend(START + after * SECOND)
+        log.tick(START + after * SECOND)
         assert not layer.exists()  # sound of it may still be held back
-    log.attend(START + 67 * SECOND)
+    log.tick(START + 67 * SECOND)
     assert len(frames_of([layer])) == 9
 
 
@@ -428,11 +434,11 @@ def test_old_clips_are_deleted_and_nothing_else(old, noise, tmp_path, mode):
 
 def test_old_clips_are_looked_for_every_hour(old, tmp_path):
     layer, _ = old
-    retention = Retention(tmp_path / "logs", "home", 1)
-    assert retention.attend(START + DAY - 60 * SECOND) == []
-    assert retention.attend(START + DAY + 3000 * SECOND) == []
+    retention = ClipRetention(tmp_path / "logs", "home", 1)
+    assert retention.tick(START + DAY - 60 * SECOND) == []
+    assert retention.tick(START + DAY + 3000 * SECOND) == []
     assert layer.exists()
-    assert len(retention.attend(START + DAY + 3600 * SECOND)) == 1
+    assert len(retention.tick(START + DAY + 3600 * SECOND)) == 1
     assert not layer.exists()
 
 
@@ -440,7 +446,7 @@ def test_what_recovery_kept_of_damaged_clips_is_deleted_too(old, tmp_path):
     layer, _ = old
     damaged = layer.with_name(layer.name + ".damaged")
     layer.rename(damaged)
-    assert len(Retention(tmp_path / "logs", "home", 1).attend(START + 2 * DAY)) == 1
+    assert len(ClipRetention(tmp_path / "logs", "home", 1).tick(START + 2 * DAY)) == 1
     assert not damaged.exists()
 
 
@@ -453,7 +459,7 @@ def test_clips_that_cannot_be_deleted_are_said_and_the_others_go(old, tmp_path):
         for path in stuck:
             path.write_bytes(b"sound")
         subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
-        (deleted, failed) = Retention(tmp_path / "logs", "home", 1).attend(START + 9 * DAY)
+        (deleted, failed) = ClipRetention(tmp_path / "logs", "home", 1).tick(START + 9 * DAY)
         assert all(path.exists() for path in stuck)
     assert not layer.exists()
     assert deleted == (0, "clips of 1 logs deleted: they were 1 days old")
@@ -475,11 +481,11 @@ def test_where_space_runs_out_clips_stop_and_the_log_goes_on(noise, tmp_path):
 def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(tmp_path):
     rng = np.random.default_rng(0)
     stamps = START + np.arange(1200) * FRAME_NANOSECONDS
-    sound = Sound(stamps, rng.integers(-3000, 3000, (1200, FRAME_SAMPLES)).astype(np.int16))
+    sound = KeptSound(stamps, rng.integers(-3000, 3000, (1200, FRAME_SAMPLES)).astype(np.int16))
     with small_disk(tmp_path / "disk", "300k") as disk:
         full, good = disk / "home_20260301T070000Z.mcap", tmp_path / "home_20260301T070030Z.mcap"
         rolls = START + 30 * SECOND
-        log = ClipLog(
+        log = ClipWriter(
             asked(tmp_path, keep_audio="always"),
             "mic",
             lambda stamp: (full, rolls) if stamp < rolls else (good, rolls + DAY),
@@ -522,7 +528,7 @@ def test_a_killed_recorder_leaves_clips_that_the_next_one_completes(noise, tmp_p
     (active,) = logs.rglob("*.audio.mcap.active")
     heard, kept = len(read(_log(active), "features")), frames_of([active])
     assert heard - 20 - 19 <= len(kept)
-    record_files(asked(logs), Microphone(), FileSource([noise(3)], START + HOUR), Flag())
+    record_files(asked(logs), MicrophoneSettings(), FileSource([noise(3)], START + HOUR), Flag())
     assert not active.exists()
     whole = active.with_name(active.name.removesuffix(".active"))
     assert LogReader(whole).complete
@@ -540,7 +546,9 @@ def _leave(noise, folder, change):
     active = layer.with_name(layer.name + ".active")
     active.write_bytes(change(bytearray(layer.read_bytes())))
     layer.unlink()
-    result = record_files(asked(folder), Microphone(), FileSource([noise(3)], START + HOUR), Flag())
+    result = record_files(
+        asked(folder), MicrophoneSettings(), FileSource([noise(3)], START + HOUR), Flag()
+    )
     return layer, active, result.recovered
 
 
@@ -645,7 +653,7 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     about = asked(
         logs, folder / "champion.safetensors", keep_audio="always", max_bag_duration=86_400
     )
-    paths = record(about, about.microphone[0], source, Flag(), asked=question).logs
+    paths = record(about, about.microphone[0], source, Flag(), reload_requests=question).logs
     assert [audio_path(path).exists() for path in paths] == [True, False, True]
     assert source.unfinished == [1, 0, 1]
     assert said(paths[0]) == []

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hearthlog.recorder.clock import SampleClock
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.sources.framing import Block, Framer
+from hearthlog.recorder.sources.framing import Framer, SampleBlock
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 RATE = 16_000
@@ -60,7 +60,9 @@ def test_time_never_jumps_nor_runs_backwards(ppm, noise, seed):
 
 def block(index, taken_at, count=BLOCK, *, overflowed=False, position=None):
     samples = (np.arange(index, index + count) % 30_000).astype(np.int16)
-    return Block(index if position is None else position, samples, overflowed, taken_at, taken_at)
+    return SampleBlock(
+        index if position is None else position, samples, overflowed, taken_at, taken_at
+    )
 
 
 def framer():
@@ -119,7 +121,7 @@ def test_times_on_a_clock_nobody_knows_are_not_believed():
         arrival = float(true_time(index + BLOCK)) + rng.exponential(0.002)
         adc_time = 1.7e9 + number * 0.5 + rng.normal(0, 0.1)
         samples = np.ones(BLOCK, np.int16)
-        events += made.add(Block(index, samples, False, adc_time, arrival))
+        events += made.add(SampleBlock(index, samples, False, adc_time, arrival))
     assert all(isinstance(event, Frames) for event in events)
     stamps = np.concatenate([event.stamps for event in events])
     true = true_time(np.arange(len(stamps)) * FRAME_SAMPLES) * 1e9 + OFFSET

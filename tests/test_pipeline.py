@@ -7,7 +7,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder import rosout as lines
-from hearthlog.recorder.events import Frames, Gap, Health
+from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.pipeline import Pipeline, opening
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
@@ -43,13 +43,13 @@ def in_blocks(frames, size, model_file):
     pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     stamps = START + np.arange(len(frames) + LOST) * FRAME_NANOSECONDS
     middle = len(frames) // 2
-    records = pipeline.push(Health(START, 0, "listening"))
+    records = pipeline.push(SourceHealth(START, 0, "listening"))
     for half, late in ((range(middle), 0), (range(middle, len(frames)), LOST)):
         if late:
             start = int(stamps[middle])
-            records += pipeline.push(Health(start, 2, "the microphone went silent"))
+            records += pipeline.push(SourceHealth(start, 2, "the microphone went silent"))
             records += pipeline.push(Gap(start, start + late * FRAME_NANOSECONDS, "test", late))
-            records += pipeline.push(Health(start, 0, "listening"))
+            records += pipeline.push(SourceHealth(start, 0, "listening"))
         for first in half[::size]:
             last = min(first + size, half.stop)
             block = stamps[first + late : last + late]
@@ -92,7 +92,7 @@ def test_only_a_change_of_health_is_a_line():
     records = []
     for second, level in enumerate(levels):
         stamp = START + second * 10**9
-        records += pipeline.push(Health(stamp, level, f"state {level}"))
+        records += pipeline.push(SourceHealth(stamp, level, f"state {level}"))
     assert sum(record.topic == "/diagnostics" for record in records) == len(levels)
     found = [(time, line.level, line.msg) for time, line in said(records)]
     assert found == [

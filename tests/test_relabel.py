@@ -23,7 +23,7 @@ from stores import put
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.logs.layers import find_chains
-from hearthlog.analyzer.relabel.layer import digest, read_about
+from hearthlog.analyzer.relabel.layer import log_digest, read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -272,10 +272,10 @@ def test_a_layer_says_what_made_it(model, logs):
     relabelled(model, logs)
     log, behind = recorded_logs(logs)[:2]
     loaded = load_model(model)
-    about = read_about(relabel_path(log, loaded.name))
-    assert about.source.model_sha256 == loaded.sha256
-    assert about.source.input_sha256 == digest(log)
-    assert (about.source.before, about.source.behind) == ("", behind.stem)
+    about = read_layer_metadata(relabel_path(log, loaded.name))
+    assert about.inputs.model_sha256 == loaded.sha256
+    assert about.inputs.input_sha256 == log_digest(log)
+    assert (about.inputs.before, about.inputs.behind) == ("", behind.stem)
 
 
 def test_layers_are_sound(model, logs):

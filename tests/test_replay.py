@@ -21,7 +21,7 @@ from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
 
-from hearthlog.analyzer.replay.player import Wanted
+from hearthlog.analyzer.replay.player import ReplayOptions
 from hearthlog.analyzer.replay.replay import LogSet, find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
@@ -29,7 +29,7 @@ from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import Frames, Gap, Health
+from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -81,7 +81,7 @@ def replay(source, output=None, model=None, **wanted):
     loaded = None if model is None else load_model(model)
     kind = wanted.get("kind", "features")
     logs = LogSet(find_logs(source), kind)
-    return replay_logs(logs, Wanted(model=lambda _: loaded, output=output, **wanted), Flag())
+    return replay_logs(logs, ReplayOptions(model=lambda _: loaded, output=output, **wanted), Flag())
 
 
 def content(folder):
@@ -143,12 +143,12 @@ class Trouble:
         for number, samples in enumerate(self._frames):
             stamps = stamp + np.arange(400) * FRAME_NANOSECONDS
             yield Frames(first, samples, stamps)
-            yield Health(int(stamps[-1]), 0, "listening", {"device": self.device})
+            yield SourceHealth(int(stamps[-1]), 0, "listening", {"device": self.device})
             end = int(stamps[-1]) + FRAME_NANOSECONDS
             stamp, lost = (end - 9 * SECOND, 1) if number == 0 else (end + 30 * SECOND, 600)
             if number == 1:
-                yield Health(end + 3 * SECOND, 2, "the microphone went silent")
-                yield Health(end + 13 * SECOND, 2, "no such microphone")
+                yield SourceHealth(end + 3 * SECOND, 2, "the microphone went silent")
+                yield SourceHealth(end + 13 * SECOND, 2, "no such microphone")
             if number < 2:
                 yield Gap(end, stamp, "trouble", lost)
             first += 400 + lost
@@ -397,7 +397,7 @@ def test_a_loop_goes_on_until_it_is_stopped(folder, model_file):
             stop.set()
 
     loaded = load_model(model_file)
-    wanted = Wanted(model=lambda _: loaded, loop=True)
+    wanted = ReplayOptions(model=lambda _: loaded, loop=True)
     log = find_logs(folder)[0]
     result = replay_logs(LogSet([log], "features"), wanted, stop, progress)
     assert result.frames == 2 * len(read(log, "features"))

@@ -22,7 +22,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.relabel.layer import topics_of as layer_topics
+from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
 from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.report.html import paragraph

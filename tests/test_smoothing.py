@@ -11,7 +11,7 @@ from lossy import LossySource
 from rewriting import Log
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.analyzer.replay.player import Wanted
+from hearthlog.analyzer.replay.player import ReplayOptions
 from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.transitions import (
@@ -154,19 +154,19 @@ def test_what_is_smoothed_with_the_whole_sound_are_probabilities():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_once_settled_no_other_past_gives_other_states(seed):
+def test_once_converged_no_other_past_gives_other_states(seed):
     rng = np.random.default_rng(seed)
     probabilities, transitions = made_up(seed, 400), default_transitions(CLASSES)
-    blind = FixedLagSmoother(transitions, 1000)
-    blind.push(probabilities)
-    settled = blind.settled
-    assert settled is not None
-    states = blind.close()[settled - 1 :]
+    started_late = FixedLagSmoother(transitions, 1000)
+    started_late.push(probabilities)
+    converged = started_late.converged_after
+    assert converged is not None
+    states = started_late.close()[converged - 1 :]
     for _ in range(5):
         past = rng.dirichlet(np.full(5, 0.1), rng.integers(1, 50)).astype(np.float32)
         heard = np.concatenate([past, probabilities])
         whole = decided(FixedLagSmoother(transitions, 1000), heard, 100)
-        assert whole[len(past) + settled - 1 :].tolist() == states.tolist()
+        assert whole[len(past) + converged - 1 :].tolist() == states.tolist()
 
 
 def test_sounds_go_on_for_as_long_as_expected():
@@ -200,8 +200,8 @@ def test_a_single_cough_survives_and_a_flicker_does_not():
     _, cough, last = segments
     assert (cough.start, cough.end) == (stamps[100], stamps[120])
     assert cough.confidence == pytest.approx(0.7)
-    assert cough.known == stamps[120 + LAG]
-    assert (last.end, last.known) == (400 * FRAME_NANOSECONDS, 400 * FRAME_NANOSECONDS)
+    assert cough.decided_at == stamps[120 + LAG]
+    assert (last.end, last.decided_at) == (400 * FRAME_NANOSECONDS, 400 * FRAME_NANOSECONDS)
 
 
 def parts(lag, ready):
@@ -217,28 +217,28 @@ def parts(lag, ready):
             while not ready(part) and frame < 1200:
                 part.push(probabilities[frame : frame + 1], stamps[frame : frame + 1])
                 frame += 1
-            settled = part.settled
+            converged = part.segments_converged
             later = part.push(probabilities[frame:], stamps[frame:])
-            expected = [segment for segment in whole if segment.known >= stamps[frame]]
-            yield frame - begin, settled, later, expected
+            expected = [segment for segment in whole if segment.decided_at >= stamps[frame]]
+            yield frame - begin, converged, later, expected
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
-def test_once_states_are_sure_the_segments_that_begin_later_are_those_of_the_whole(lag):
+def test_once_states_have_converged_the_segments_that_begin_later_are_those_of_the_whole(lag):
     earlier = 0
-    for _, settled, later, expected in parts(lag, lambda part: part.sure):
-        earlier += not settled
+    for _, converged, later, expected in parts(lag, lambda part: part.states_converged):
+        earlier += not converged
         assert later[1:] == expected[1:]
     assert earlier > 10  # than the segments are
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.5, LAG_SECONDS])
-def test_segments_of_a_part_are_those_of_the_whole_once_settled(lag):
-    settled_after = []
-    for frames, _, later, expected in parts(lag, lambda part: part.settled):
-        settled_after.append(frames)
+def test_segments_of_a_part_are_those_of_the_whole_once_converged(lag):
+    converged_after = []
+    for frames, _, later, expected in parts(lag, lambda part: part.segments_converged):
+        converged_after.append(frames)
         assert later == expected
-    assert np.median(settled_after) < 400
+    assert np.median(converged_after) < 400
 
 
 @pytest.mark.parametrize(
@@ -317,7 +317,7 @@ def folder(tmp_path_factory, day, hmm_file):
 
 def replay(folder, output, model_file, **wanted):
     model = load_model(model_file)
-    wanted = Wanted(model=lambda _: model, output=output, **wanted)
+    wanted = ReplayOptions(model=lambda _: model, output=output, **wanted)
     return replay_logs(LogSet(find_logs(folder), "features"), wanted, Flag())
 
 

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.summarise import summarise
 from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
@@ -49,7 +49,10 @@ def logs(tmp_path_factory, model_file, day):
     """Three files of one recording with gaps."""
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(
-        output=folder, model=model_file, microphone=[Microphone(name="hall")], max_bag_duration=60
+        output=folder,
+        model=model_file,
+        microphone=[MicrophoneSettings(name="hall")],
+        max_bag_duration=60,
     )
     return record(
         settings, settings.microphone[0], LossySource(FileSource([day], START), LOST), Event()

@@ -25,10 +25,9 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.log import RollingLog
 from hearthlog.recorder.model_watch import ModelWatch
-from hearthlog.recorder.pipeline import Pipeline, stream_info
-from hearthlog.recorder.service import _attend, describe_log
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.service import Recording
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
@@ -249,27 +248,16 @@ def ready(watch):
 
 def record_and_promote(folder, logs, events):
     """Record events; before the second block of frames another model is ready."""
-    settings = Settings(output=logs)
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
-    pipeline = Pipeline("mic", DEFAULT, watch.first.classifier)
-
-    def describe(model):
-        info = stream_info("mic", "test", DEFAULT, model)
-        return describe_log(settings, info, DEFAULT, model)
-
-    log = RollingLog(describe(watch.first.model), 3600, 1.0, 5.0)
+    recording = Recording(Settings(output=logs), "mic", "test", watch)
+    recording.add(events[0])
     promote(folder, "two")
     ready(watch)
-    heard = False
-    for event in events:
-        if isinstance(event, Frames):
-            if heard:
-                _attend(watch, event, pipeline, log, describe)
-            heard = True
-        log.write(pipeline.push(event))
-    log.finish(pipeline.finish())
+    for event in events[1:]:
+        recording.add(event)
+    recording.finish()
     watch.close()
-    return log.finished
+    return recording.summary.logs
 
 
 def block(first, count):

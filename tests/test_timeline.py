@@ -38,7 +38,7 @@ from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeli
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.recorder.config import Microphone, Settings
+from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
@@ -257,7 +257,9 @@ def test_a_log_named_by_itself_comes_with_its_layers_and_no_others(folder):
 
 
 def test_a_log_without_a_model_shows_its_features(tmp_path, day):
-    logs = record(Settings(output=tmp_path), Microphone(), FileSource([day], START), Flag()).logs
+    logs = record(
+        Settings(output=tmp_path), MicrophoneSettings(), FileSource([day], START), Flag()
+    ).logs
     microphone = read_timeline(logs).microphones["mic"]
     assert microphone.labellings == []
     assert np.isfinite(microphone.level).all()

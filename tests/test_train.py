@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
-from hearthlog.analyzer.training.manifest import Clip, read_manifest
+from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
@@ -47,7 +47,7 @@ def write(folder, name, samples):
 
 def clip(folder, label, samples, group="g"):
     number = len(list(folder.iterdir()))
-    return Clip(write(folder, f"{number}.wav", samples), label, group, "", "")
+    return LabelledClip(write(folder, f"{number}.wav", samples), label, group, "", "")
 
 
 def dataset(*clips):
@@ -152,7 +152,7 @@ def test_a_class_nobody_recorded_is_named(tmp_path):
 def test_a_clip_that_is_no_audio_is_named(tmp_path):
     (tmp_path / "x.wav").write_text("no sound")
     with pytest.raises(SourceError, match=r"x\.wav"):
-        dataset(Clip(tmp_path / "x.wav", "speech", "g", "", ""))
+        dataset(LabelledClip(tmp_path / "x.wav", "speech", "g", "", ""))
 
 
 def test_folds_never_split_a_source_and_test_every_segment_once():

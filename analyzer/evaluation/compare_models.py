@@ -11,7 +11,7 @@ from hearthlog.analyzer.evaluation.evaluate_model import check_classes
 from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import (
-    Difference,
+    F1Difference,
     Scores,
     calibration_error,
     difference,
@@ -51,7 +51,7 @@ class Comparison:
     Attributes
     ----------
     a, b : Judged
-    difference : Difference
+    difference : F1Difference
         Macro F1 of b minus that of a.
     sources_left_out : int
         One of the models has learned from these.
@@ -63,7 +63,7 @@ class Comparison:
 
     a: Judged
     b: Judged
-    difference: Difference
+    difference: F1Difference
     sources_left_out: int
     held_out: bool
     skipped: Mapping[str, int]

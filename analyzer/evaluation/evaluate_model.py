@@ -8,7 +8,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
-from hearthlog.analyzer.training.manifest import Clip
+from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.models.classifiers.classifier import Classifier
@@ -51,14 +51,14 @@ class Evaluation:
 
 
 def evaluate_model(
-    model: Model, clips: Sequence[Clip], scenario: Scenario, progress: Progress
+    model: Model, clips: Sequence[LabelledClip], scenario: Scenario, progress: Progress
 ) -> Evaluation:
     """Run a model on clips, and compare what it says with their labels.
 
     Parameters
     ----------
     model : Model
-    clips : sequence of Clip
+    clips : sequence of LabelledClip
     scenario : Scenario
         With the classes of the model.
     progress : callable

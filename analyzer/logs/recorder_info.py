@@ -46,7 +46,7 @@ class Configuration(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Origin:
+class RecorderInfo:
     """What a log says of the recorder that wrote it.
 
     Attributes
@@ -80,7 +80,7 @@ class Origin:
     first_frame: tuple[int, int] | None
 
 
-def read_origin(path: Path, kind: str) -> Origin | None:
+def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
     """Read what a log says of its recorder.
 
     Parameters
@@ -91,7 +91,7 @@ def read_origin(path: Path, kind: str) -> Origin | None:
 
     Returns
     -------
-    Origin or None
+    RecorderInfo or None
         None if the log has no such topic, as layers have not.
 
     Raises
@@ -130,7 +130,7 @@ def read_origin(path: Path, kind: str) -> Origin | None:
         check_microphone_name(microphone)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
-    return Origin(
+    return RecorderInfo(
         path=path,
         complete=complete,
         node=node,
@@ -146,7 +146,7 @@ def read_origin(path: Path, kind: str) -> Origin | None:
     )
 
 
-def features_of(origin: Origin) -> FeatureSet:
+def features_of(origin: RecorderInfo) -> FeatureSet:
     """Return the feature set of a log, the default one where the log does not say which.
 
     Raises

@@ -21,9 +21,9 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.description import CLASS_NAME
-from hearthlog.recorder.config import Microphone, load_settings
-from hearthlog.recorder.events import Event, Frames
-from hearthlog.recorder.service import Source, record
+from hearthlog.recorder.config import MicrophoneSettings, load_settings
+from hearthlog.recorder.events import Event, Frames, SoundSource
+from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds
 from hearthlog.recorder.sources.microphone import MicrophoneSource
@@ -86,7 +86,7 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     length = audio_seconds(audio)
     if seconds is not None:
         length = min(length, seconds)
-    source: Source = FileSource([audio], _free_start(home, label, length))
+    source: SoundSource = FileSource([audio], _free_start(home, label, length))
     return _enrol(home, label, source, length, threading.Event())
 
 
@@ -157,7 +157,7 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
 class _First:
     """The first seconds of a source."""
 
-    def __init__(self, source: Source, seconds: float) -> None:
+    def __init__(self, source: SoundSource, seconds: float) -> None:
         self.device = source.device
         self._source = source
         self._left = round(seconds * NANOSECONDS / FRAME_NANOSECONDS)
@@ -175,10 +175,10 @@ class _First:
 
 
 def _enrol(
-    home: Path, label: str, source: Source, seconds: float, stop: threading.Event
+    home: Path, label: str, source: SoundSource, seconds: float, stop: threading.Event
 ) -> list[Enrolled]:
     """Record elsewhere, and take what came of it into the training set if it is good."""
-    microphone = Microphone()
+    microphone = MicrophoneSettings()
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
         asked = {
             "node": label,

@@ -1,7 +1,7 @@
 """The task of a worker: the labels and segments of one log."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -10,139 +10,163 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.recorder_info import Origin
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+from hearthlog.analyzer.relabel.jobs import Job
 from hearthlog.analyzer.relabel.layer import (
-    About,
-    Source,
+    LayerInputs,
+    LayerMetadata,
     delete_parts,
-    digest,
-    metadata_of,
+    layer_record,
+    layer_topics,
+    log_digest,
     part_path,
-    read_about,
-    topics_of,
+    read_layer_metadata,
 )
 from hearthlog.analyzer.relabel.reading import (
     UnreadableError,
-    heard,
-    is_followed,
-    origin_of,
-    recovered,
-    warmed_up,
+    goes_on_in,
+    read_sound,
+    recorder_info,
+    recover_copy,
+    warm_up,
 )
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
+from hearthlog.models.labels.label_messages import label_columns, segment_columns
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.storage.new_files import new_file, replaced_file
 
 
-class Job(NamedTuple):
-    """A log to label.
-
-    Attributes
-    ----------
-    log, layer : Path
-    before : tuple of Path
-        Logs before it, the last first.
-    behind : Path or None
-        The log behind it.
-    model : Path
-    model_sha256 : str
-    replaces : bool
-        Whether there is a layer that may be replaced.
-    carried : bool
-        Whether what is open when the log begins is known from the layer before.
-    """
-
-    log: Path
-    layer: Path
-    before: tuple[Path, ...]
-    behind: Path | None
-    model: Path
-    model_sha256: str
-    replaces: bool
-    carried: bool
-
-
-class Labelled(NamedTuple):
+class LabelledLog(NamedTuple):
     """A log that is labelled, its layer not yet complete.
 
     Attributes
     ----------
     part : Path
-        The beginning of the layer.
-    content : LogStreamWriter
+        The unfinished layer, with the labels.
+    writer : LogStreamWriter
         That has written it.
-    source : Source
+    inputs : LayerInputs
     microphone, node : str
     provenance : mapping of str to str
-        What the log says of what made it.
+        The `hearthlog` record of the log.
     segments : list of Segment
-    began : Run or None
-        What was open when the log began.
-    begins : bool
-        That is known from the layer before, and neither counted here nor in `began`.
-    ended : Run or None
-        What is open when the log ends, and goes on in the log behind.
+    open_at_start, open_at_end : Run or None
+        The segment that is open when the log begins, and when it ends.
+    lacks_start : bool
+        Whether a segment is open when the log begins whose earlier frames, counted in the layer
+        before, are still to be added; `open_at_start` is None until then.
     frames : int
-    lost : str
-        What of the log could not be read.
+        Number of labels.
+    loss : str
+        What could not be read of the log.
     """
 
     part: Path
-    content: LogStreamWriter
-    source: Source
+    writer: LogStreamWriter
+    inputs: LayerInputs
     microphone: str
     node: str
     provenance: Mapping[str, str]
     segments: list[Segment]
-    began: Run | None
-    begins: bool
-    ended: Run | None
+    open_at_start: Run | None
+    open_at_end: Run | None
+    lacks_start: bool
     frames: int
-    lost: str
+    loss: str
 
-    def joined(self, began: Run | None) -> "Labelled":
-        """Put what the layer before has counted before what began there."""
-        if not self.begins:
+    def with_start(self, open_at_start: Run | None) -> "LabelledLog":
+        """Add the open segment with which the layer before ends, where it is lacking."""
+        if not self.lacks_start:
             return self
-        segments, ended = list(self.segments), self.ended
+        segments, open_at_end = list(self.segments), self.open_at_end
         if segments:
-            segments[0] = segments[0]._replace(run=segments[0].run.behind(began))
-        elif ended is not None:
-            ended = ended.behind(began)
-        return self._replace(segments=segments, began=began, begins=False, ended=ended)
+            segments[0] = segments[0]._replace(run=segments[0].run.prepend(open_at_start))
+        elif open_at_end is not None:
+            open_at_end = open_at_end.prepend(open_at_start)
+        return self._replace(
+            segments=segments,
+            open_at_start=open_at_start,
+            open_at_end=open_at_end,
+            lacks_start=False,
+        )
 
 
-def label_log(job: Job) -> Labelled:
+def label_log(job: Job) -> LabelledLog:
     """Write the labels of a log, and find its segments.
 
-    What is whole in a damaged log is labelled.
+    The whole parts of a damaged log are labelled.
 
     Raises
     ------
     LogError
-        If the log has no features, or of another set than the model, or nothing of it is whole;
-        if the labels cannot be written.
+        If the log has no features, or those of another set than the model's; if nothing of it is
+        whole; if the labels cannot be written.
     ModelError
-        If the model is not the one that was asked for.
+        If the file of the model holds another model.
     """
     model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:
         try:
             return _label(job, job.log, model, classifier)
         except UnreadableError:
-            copy, lost = recovered(job.log, Path(folder))
+            copy, loss = recover_copy(job.log, Path(folder))
         try:
-            return _label(job, copy, model, classifier)._replace(lost=lost)
+            return _label(job, copy, model, classifier)._replace(loss=loss)
         except UnreadableError as error:
             raise LogError(str(error).replace(str(copy), str(job.log))) from error
+
+
+def complete_layer(job: Job, labelled: LabelledLog) -> None:
+    """Add the segments to the labels, and give the layer its name.
+
+    Parameters
+    ----------
+    job : Job
+    labelled : LabelledLog
+        With the start of its first segment.
+
+    Raises
+    ------
+    LogError
+        If the layer cannot be written, or there is another one that may not be replaced.
+    """
+    model, classifier = _loaded(job.model, job.model_sha256)
+    metadata = LayerMetadata(
+        labelled.inputs, labelled.open_at_start, labelled.open_at_end, labelled.loss
+    )
+    smoothing = model.description.smoothing
+    more = {
+        "feature_set": model.description.feature_set,
+        "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
+    }
+    _, topic = layer_topics(labelled.microphone, model.name, classifier.classes)
+    times: Int64 = np.array([segment.decided_at for segment in labelled.segments], np.int64)
+    columns = segment_columns(labelled.segments, classifier.classes, labelled.microphone)
+    put = replaced_file if job.replaces else new_file
+    try:
+        with put(job.layer) as temporary, temporary.open("xb") as out:
+            with labelled.part.open("rb") as stream:
+                shutil.copyfileobj(stream, out, 1 << 20)
+            writer = labelled.writer
+            writer.continue_on(out)
+            writer.write_columns([TopicBatch(topic.name, times, columns)])
+            record = layer_record(metadata, job.log.name, labelled.node, more)
+            writer.add_metadata(METADATA, record)
+            writer.finish(job.layer.name)
+    except LogError:
+        if read_layer_metadata(job.layer) != metadata:  # else another run was quicker
+            labelled.part.unlink(missing_ok=True)
+            raise
+    delete_parts(job.layer)
 
 
 @lru_cache(2)
@@ -153,115 +177,71 @@ def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
     return model, Classifier(model)
 
 
-def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Labelled:
-    """Label a log, or what was saved of it."""
-    origin = _origin(log, job.log, model)
-    stream = warmed_up(origin, job.before, classifier, states_only=job.carried)
-    began = stream.open
-    begins = job.carried and began is not None
-    if begins:
-        stream.forget()
-    topics = topics_of(origin.microphone, model.name, classifier.classes)
+def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> LabelledLog:
+    """Label a log, or the copy that was saved of it."""
+    info = _checked_info(log, job.log, model)
+    labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
+    open_at_start = labeller.open_run
+    lacks_start = job.continues_layer and open_at_start is not None
+    if lacks_start:
+        labeller.discard_open()
+        open_at_start = None
     part = part_path(job.layer)
+    writer, frames = _write_labels(part, job, info, model, labeller)
+    goes_on = None if job.next_log is None else goes_on_in(labeller, info, job.next_log)
+    if not goes_on:
+        labeller.close()
+    before = stem(job.earlier[0]) if job.earlier else ""
+    behind = "" if job.next_log is None or goes_on is None else stem(job.next_log)
+    return LabelledLog(
+        part=part,
+        writer=writer,
+        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),
+        microphone=info.microphone,
+        node=info.node,
+        provenance=info.metadata,
+        segments=labeller.segments,
+        open_at_start=open_at_start,
+        open_at_end=labeller.open_run,
+        lacks_start=lacks_start,
+        frames=frames,
+        loss="" if info.complete else "it is cut off",
+    )
+
+
+def _checked_info(path: Path, log: Path, model: Model) -> RecorderInfo:
+    """Read what a log says of its recorder, and compare the feature set with the model's."""
+    info = recorder_info(path)
+    if info is None or info.first_frame is None:
+        raise LogError(f"{log}: has no features; there is nothing to label")
+    if info.feature_set not in {"", model.description.feature_set}:
+        raise LogError(
+            f"{log}: has features of set {info.feature_set!r}; model {model.name} is for "
+            f"{model.description.feature_set}"
+        )
+    return info
+
+
+def _write_labels(
+    part: Path, job: Job, info: RecorderInfo, model: Model, labeller: StreamLabeller
+) -> tuple[LogStreamWriter, int]:
+    """Write the labels of a log to a new file; return also how many there are."""
+    topics = layer_topics(info.microphone, model.name, model.classes)
+    frames = 0
     try:
         with part.open("xb") as out:
-            content = LogStreamWriter(out, topics)
-            frames = 0
-            for event in heard(origin, 0):
-                labels = stream.push(event)
+            writer = LogStreamWriter(out, topics)
+            for event in read_sound(info, 0):
+                labels = labeller.push(event)
                 if labels is not None:
-                    content.write_columns([labels.rows(topics[0].name, origin.microphone)])
+                    columns = label_columns(labels, info.microphone)
+                    writer.write_columns([TopicBatch(topics[0].name, labels.stamps, columns)])
                     frames += len(labels.stamps)
-            content.flush()
+            writer.flush()
     except BaseException as error:
         with suppress(OSError):
             part.unlink()
         if isinstance(error, OSError):
             raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
         raise
-    followed = None if job.behind is None else is_followed(stream, origin, job.behind)
-    if not followed:
-        stream.close()
-    before = stem(job.before[0]) if job.before else ""
-    behind = "" if job.behind is None or followed is None else stem(job.behind)
-    return Labelled(
-        part=part,
-        content=content,
-        source=Source(model.name, model.sha256, digest(job.log), before, behind),
-        microphone=origin.microphone,
-        node=origin.node,
-        provenance=origin.metadata,
-        segments=stream.segments,
-        began=None if begins else began,
-        begins=begins,
-        ended=stream.open,
-        frames=frames,
-        lost="" if origin.complete else "it is cut off",
-    )
-
-
-def _origin(path: Path, log: Path, model: Model) -> Origin:
-    """Read what a log says of itself, and compare it with what the model is for."""
-    origin = origin_of(path)
-    if origin is None or origin.first_frame is None:
-        raise LogError(f"{log}: has no features; there is nothing to label")
-    if origin.feature_set not in {"", model.description.feature_set}:
-        raise LogError(
-            f"{log}: has features of set {origin.feature_set!r}; model {model.name} is for "
-            f"{model.description.feature_set}"
-        )
-    return origin
-
-
-def complete_layer(job: Job, labelled: Labelled) -> None:
-    """Put the segments behind the labels, and give the layer its name.
-
-    Parameters
-    ----------
-    job : Job
-    labelled : Labelled
-        With all that its segments have in the logs before.
-
-    Raises
-    ------
-    LogError
-        If it cannot be written, or there is another one that may not be replaced.
-    """
-    model, classifier = _loaded(job.model, job.model_sha256)
-    about = About(labelled.source, labelled.began, labelled.ended, labelled.lost)
-    smoothing = model.description.smoothing
-    more = {
-        "feature_set": model.description.feature_set,
-        "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
-    }
-    topics = topics_of(labelled.microphone, model.name, classifier.classes)
-    put = replaced_file if job.replaces else new_file
-    try:
-        with put(job.layer) as temporary, temporary.open("xb") as out:
-            with labelled.part.open("rb") as stream:
-                shutil.copyfileobj(stream, out, 1 << 20)
-            content = labelled.content
-            content.continue_on(out)
-            content.write_columns([_rows(topics[1].name, labelled, classifier.classes)])
-            content.add_metadata(METADATA, metadata_of(about, job.log.name, labelled.node, more))
-            content.finish(job.layer.name)
-    except LogError:
-        if read_about(job.layer) != about:  # or else another run was quicker
-            labelled.part.unlink(missing_ok=True)
-            raise
-    delete_parts(job.layer)
-
-
-def _rows(topic: str, labelled: Labelled, classes: Sequence[str]) -> TopicBatch:
-    """Make messages of segments."""
-    segments = labelled.segments
-    starts = np.array([segment.start for segment in segments], np.int64)
-    ends = np.array([segment.end for segment in segments], np.int64)
-    fields: dict[str, Column] = {
-        "header.stamp": starts,
-        "header.frame_id": labelled.microphone,
-        "duration": ends - starts,
-        "label": [classes[segment.label] for segment in segments],
-        "confidence": np.array([segment.confidence for segment in segments], np.float32),
-    }
-    return TopicBatch(topic, np.array([segment.known for segment in segments], np.int64), fields)
+    return writer, frames

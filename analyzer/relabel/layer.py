@@ -1,4 +1,4 @@
-"""The layer that a relabelling makes: its name, its topics, and what it says of itself."""
+"""The layer that a relabelling makes: its name, its topics and its `hearthlog` record."""
 
 import glob
 import hashlib
@@ -21,17 +21,18 @@ _TAIL = 1 << 16  # bytes
 _RUN = ("label", "start", "frames", "confidence")
 
 
-class Source(NamedTuple):
-    """What a layer is made from; equal sources give equal labels and segments.
+class LayerInputs(NamedTuple):
+    """What a layer is made from; equal inputs give equal labels and segments.
 
     Attributes
     ----------
     model, model_sha256 : str
+        Name of the model, and SHA-256 of its file.
     input_sha256 : str
-        As `digest` gives it.
+        `log_digest` of the log.
     before, behind : str
-        Stems of the logs beside it; empty where there is none, or where it could not be told yet
-        whether the sound goes on there.
+        Stems of the logs before and after it; empty where there is none, or where it was not
+        decided yet whether the sound goes on there.
     """
 
     model: str
@@ -41,25 +42,25 @@ class Source(NamedTuple):
     behind: str
 
 
-class About(NamedTuple):
-    """What a layer says of itself.
+class LayerMetadata(NamedTuple):
+    """What the `hearthlog` record of a layer says.
 
     Attributes
     ----------
-    source : Source
-    began, ended : Run or None
+    inputs : LayerInputs
+    open_at_start, open_at_end : Run or None
         The segment that was open when the log began, and when it ended.
-    lost : str
-        What of the log could not be read.
+    loss : str
+        What could not be read of the log.
     """
 
-    source: Source
-    began: Run | None
-    ended: Run | None
-    lost: str
+    inputs: LayerInputs
+    open_at_start: Run | None
+    open_at_end: Run | None
+    loss: str
 
 
-def topics_of(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
+def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
     """Return the topics of the labels and of the segments."""
     labelling = relabelling(model)
     label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
@@ -69,11 +70,11 @@ def topics_of(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topi
     )
 
 
-def digest(log: Path) -> str:
+def log_digest(log: Path) -> str:
     """Identify a log: the SHA-256 of its size and its last 64 KiB.
 
-    There its index is, or the end of it, and the checksum of the index: it takes no reading of a
-    whole log to see that it is still the same.
+    The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
+    recognised without reading all of it.
     """
     with LogFile(log, indexed=False) as file:
         size = file.size
@@ -81,21 +82,21 @@ def digest(log: Path) -> str:
     return hashlib.sha256(str(size).encode() + b"\0" + tail).hexdigest()
 
 
-def read_about(layer: Path) -> About | None:
+def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     """Read what a layer says of itself; None if there is no layer.
 
     Raises
     ------
     LogError
-        If it is damaged, or is none.
+        If it is damaged, or is not a layer of `relabel`.
     """
     if not layer.exists():
         return None
     try:
         with LogFile(layer) as file:
             record = {key: text for each in read_provenance(file) for key, text in each.items()}
-        return About(
-            Source(*(record[name] for name in Source._fields)),
+        return LayerMetadata(
+            LayerInputs(*(record[name] for name in LayerInputs._fields)),
             _read_run(record["began"]),
             _read_run(record["ended"]),
             record["lost"],
@@ -106,27 +107,39 @@ def read_about(layer: Path) -> About | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Name the beginning of a layer, which nothing takes for a log."""
+    """Return a new path for an unfinished layer, of a name that no log has."""
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 
 def delete_parts(layer: Path) -> None:
-    """Delete what this and other runs have begun of a layer, now that it is there."""
+    """Delete the unfinished files that this and other runs have left of a layer."""
     for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
         with suppress(OSError):
             part.unlink()
 
 
-def metadata_of(about: About, log: str, node: str, more: Mapping[str, str]) -> dict[str, str]:
-    """Make the `hearthlog` record of a layer."""
+def layer_record(
+    metadata: LayerMetadata, log: str, node: str, more: Mapping[str, str]
+) -> dict[str, str]:
+    """Make the `hearthlog` record of a layer.
+
+    Parameters
+    ----------
+    metadata : LayerMetadata
+    log : str
+        Name of the log's file.
+    node : str
+    more : mapping of str to str
+        Further entries.
+    """
     return provenance(
         node,
         log=log,
         **more,
-        **about.source._asdict(),
-        began=_run_text(about.began),
-        ended=_run_text(about.ended),
-        lost=about.lost,
+        **metadata.inputs._asdict(),
+        began=_run_text(metadata.open_at_start),
+        ended=_run_text(metadata.open_at_end),
+        lost=metadata.loss,
         made=_now(),
     )
 

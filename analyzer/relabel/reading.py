@@ -1,14 +1,14 @@
-"""What was heard in a log and before it, where it is whole."""
+"""The features of a log and of the logs before it, as far as these can be read."""
 
 import shutil
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hearthlog.analyzer.logs.recorder_info import Origin, read_origin
-from hearthlog.analyzer.relabel.stream import Stream
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_info
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.recorder.events import Gap
@@ -19,8 +19,8 @@ from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.times import NANOSECONDS
 
 _WARM_UP = 30 * NANOSECONDS
-_EVER = (1 << 63) - 1
-_LONGEST = 1000  # characters
+_NEVER = (1 << 63) - 1
+_LONGEST_LOSS_TEXT = 1000  # characters
 
 
 class UnreadableError(LogError):
@@ -39,7 +39,7 @@ class UnreadableError(LogError):
         return UnreadableError, (self.log, str(self))
 
 
-def origin_of(path: Path) -> Origin | None:
+def recorder_info(path: Path) -> RecorderInfo | None:
     """Read what a log says of its recorder; None if it has no features.
 
     Raises
@@ -48,13 +48,13 @@ def origin_of(path: Path) -> Origin | None:
         If it is damaged.
     """
     try:
-        return read_origin(path, "features")
+        return read_recorder_info(path, "features")
     except LogError as error:
         raise UnreadableError(path, error) from error
 
 
-def heard(origin: Origin, begin: int) -> Iterator[Features | Gap]:
-    """Read what was heard in a log from a time on, in nanoseconds of UTC.
+def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
+    """Read the features and gaps of a log from a time on, in nanoseconds of UTC.
 
     Raises
     ------
@@ -62,19 +62,25 @@ def heard(origin: Origin, begin: int) -> Iterator[Features | Gap]:
         If it is damaged.
     """
     try:
-        for piece in read_recorded(origin, begin, _EVER, heard_only=True):
-            yield from (event for event in piece.events if isinstance(event, Features | Gap))
+        for batch in read_recorded(info, start, _NEVER, sound_only=True):
+            yield from (event for event in batch.events if isinstance(event, Features | Gap))
     except LogError as error:
-        raise UnreadableError(origin.path, error) from error
+        raise UnreadableError(info.path, error) from error
 
 
-def recovered(log: Path, folder: Path) -> tuple[Path, str]:
-    """Save what is whole in a log to a folder; return also what is not.
+def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
+    """Save the whole parts of a damaged log to a folder.
+
+    Returns
+    -------
+    copy : Path
+    loss : str
+        What could not be saved.
 
     Raises
     ------
     LogError
-        If nothing is, or it cannot be copied.
+        If nothing can be saved.
     """
     source, copy = log, folder / log.name
     if not is_local(log):
@@ -85,92 +91,100 @@ def recovered(log: Path, folder: Path) -> tuple[Path, str]:
         recovery = recover_log(source, copy, log.name)
     except OSError as error:
         raise LogError(f"{log}: what is whole cannot be copied ({error.strerror})") from error
-    lost = [str(damage) for damage in recovery.damages if not damage.lossless]
-    return copy, "; ".join(lost)[:_LONGEST]
+    losses = [str(damage) for damage in recovery.damages if not damage.lossless]
+    return copy, "; ".join(losses)[:_LONGEST_LOSS_TEXT]
 
 
-def warmed_up(
-    origin: Origin, before: tuple[Path, ...], classifier: Classifier, *, states_only: bool
-) -> Stream:
-    """Run through what was heard before a log, as far back as it matters.
+def warm_up(
+    info: RecorderInfo, earlier: Sequence[Path], classifier: Classifier, *, states_only: bool
+) -> StreamLabeller:
+    """Label as much before a log as its first labels depend on.
 
     Parameters
     ----------
-    origin : Origin
+    info : RecorderInfo
         Of the log.
-    before : tuple of Path
+    earlier : sequence of Path
         Logs before it, the last first.
     classifier : Classifier
     states_only : bool
-        Whether it is enough that the states to come are sure; otherwise the segment that is open
-        is whole.
+        Whether it suffices that the states have converged; if not, the open segment is complete.
+
+    Returns
+    -------
+    StreamLabeller
+        Ready for the first frame of the log.
     """
-    first, back = origin.first_frame, _WARM_UP
-    while first is not None and before:
-        stream, whole = _past(before, origin, first[1] - back, classifier)
-        if not stream.is_followed_by(first):
+    first, seconds_back = info.first_frame, _WARM_UP
+    while first is not None and earlier:
+        labeller, from_start = _label_earlier(earlier, info, first[1] - seconds_back, classifier)
+        if not labeller.is_followed_by(first):
             break
-        if whole or (stream.sure and (states_only or stream.settled)):
-            return stream
-        back *= 4
-    return Stream(classifier)
+        converged = labeller.states_converged and (states_only or labeller.segments_converged)
+        if from_start or converged:
+            return labeller
+        seconds_back *= 4
+    return StreamLabeller(classifier)
 
 
-def _past(
-    logs: tuple[Path, ...], origin: Origin, begin: int, classifier: Classifier
-) -> tuple[Stream, bool]:
-    """Run through logs from a time on; tell also whether there is nothing before it."""
-    saved: dict[Path, Path | None] = {}  # what could be saved of logs that are damaged
+def _label_earlier(
+    logs: Sequence[Path], info: RecorderInfo, start: int, classifier: Classifier
+) -> tuple[StreamLabeller, bool]:
+    """Label earlier logs from a time on; tell also whether there is nothing before it."""
+    copies: dict[Path, Path | None] = {}  # what could be saved of damaged logs
     with TemporaryDirectory(prefix="hearthlog") as folder:
         while True:
             try:
-                return _run_through(logs, saved, origin, begin, classifier)
+                return _label_readable(logs, copies, info, start, classifier)
             except UnreadableError as error:
                 copy = None
-                if error.log not in saved.values():
+                if error.log not in copies.values():
                     with suppress(LogError):
-                        copy, _ = recovered(error.log, Path(folder))
-                saved[next(log for log in logs if log.name == error.log.name)] = copy
+                        copy, _ = recover_copy(error.log, Path(folder))
+                copies[next(log for log in logs if log.name == error.log.name)] = copy
 
 
-def _run_through(
-    logs: tuple[Path, ...],
-    saved: Mapping[Path, Path | None],
-    origin: Origin,
-    begin: int,
+def _label_readable(
+    logs: Sequence[Path],
+    copies: Mapping[Path, Path | None],
+    info: RecorderInfo,
+    start: int,
     classifier: Classifier,
-) -> tuple[Stream, bool]:
-    past: deque[Origin] = deque()
-    whole = True
+) -> tuple[StreamLabeller, bool]:
+    chosen: deque[RecorderInfo] = deque()
+    from_start = True
     for log in logs:
-        path = saved.get(log, log)
-        other = None if path is None else origin_of(path)
-        if other is None or other.first_frame is None or _who(other) != _who(origin):
+        path = copies.get(log, log)
+        other = None if path is None else recorder_info(path)
+        if other is None or other.first_frame is None or not _same_microphone(other, info):
             break
-        past.appendleft(other)
-        if other.first_frame[1] < begin:
-            whole = False
+        chosen.appendleft(other)
+        if other.first_frame[1] < start:
+            from_start = False
             break
-    stream = Stream(classifier)
-    for other in past:
-        for event in heard(other, begin):
-            stream.push(event)
-        stream.segments.clear()
-    return stream, whole
+    labeller = StreamLabeller(classifier)
+    for other in chosen:
+        for event in read_sound(other, start):
+            labeller.push(event)
+        labeller.segments.clear()
+    return labeller, from_start
 
 
-def is_followed(stream: Stream, origin: Origin, behind: Path) -> bool | None:
-    """Tell whether the sound of a log goes on in the log behind it; None if that is not known yet.
+def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
+    """Tell whether the sound of a log goes on in the next log.
 
-    It is not while the log behind is being written and has no frame.
+    Returns
+    -------
+    bool or None
+        None while that is not decided: the next log is being written and has no frame.
     """
     other = None
     with suppress(LogError):
-        other = read_origin(behind, "features")
+        other = read_recorder_info(next_log, "features")
     if other is None or other.first_frame is None:
-        return None if is_active(behind) else False
-    return _who(other) == _who(origin) and stream.is_followed_by(other.first_frame)
+        return None if is_active(next_log) else False
+    return _same_microphone(other, info) and labeller.is_followed_by(other.first_frame)
 
 
-def _who(origin: Origin) -> tuple[str, str]:
-    return origin.node, origin.microphone
+def _same_microphone(first: RecorderInfo, second: RecorderInfo) -> bool:
+    return (first.node, first.microphone) == (second.node, second.microphone)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.recorder.pipeline import Record
+from hearthlog.recorder.pipeline import EncodedMessage
 from hearthlog.schemas.arrays import Bytes, Int64
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -20,7 +20,7 @@ _Content = bytes | tuple[bytes, ...]  # of a message: all of it, or field by fie
 
 
 @dataclass
-class Comparison:
+class ReplayComparison:
     """Counts of what was recorded and of how much of it came out again.
 
     Attributes
@@ -46,7 +46,7 @@ class Comparison:
         return (self.labels, self.segments) == (self.identical_labels, self.identical_segments)
 
     def add_labels(
-        self, recorded: Sequence[RawMessages], replayed: Sequence[Record], end: int
+        self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
         """Count the labels of one span of time; those from `end` on were not replayed."""
         for without, same in _by_version(recorded).items():
@@ -60,7 +60,7 @@ class Comparison:
             self.same_labels += identical + _count_same(same, changed)
 
     def add_segments(
-        self, recorded: Sequence[RawMessages], replayed: Sequence[Record], end: int
+        self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
         """Count the segments of one span of time.
 
@@ -126,7 +126,7 @@ def _recorded(
 
 
 def _replayed(
-    records: Sequence[Record], typename: str, without: _Without | None
+    records: Sequence[EncodedMessage], typename: str, without: _Without | None
 ) -> Iterator[tuple[int, _Content]]:
     """Yield log times, and what messages say, as `_recorded` does with messages of a version."""
     times = (record.log_time for record in records)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from hearthlog.analyzer.logs.recorder_info import Origin
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
@@ -15,7 +15,7 @@ from hearthlog.schemas.messages.topics import topics_of
 
 
 def describe(
-    origin: Origin,
+    origin: RecorderInfo,
     features: FeatureSet,
     model: Model | None,
     output: Path,
@@ -25,7 +25,7 @@ def describe(
 
     Parameters
     ----------
-    origin : Origin
+    origin : RecorderInfo
         Of the old one.
     features : FeatureSet
     model : Model or None

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event as Flag
 
-from hearthlog.analyzer.logs.recorder_info import Origin, features_of
-from hearthlog.analyzer.replay.comparison import Comparison
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
+from hearthlog.analyzer.replay.comparison import ReplayComparison
 from hearthlog.analyzer.replay.description import describe
-from hearthlog.analyzer.replay.recorded import Features, Piece
+from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.recorder.events import Frames, Gap, Health
+from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.pipeline import Pipeline, Record
+from hearthlog.recorder.pipeline import EncodedMessage, Pipeline
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages.topics import topic
@@ -29,7 +29,7 @@ _LOST = "the log that was replayed does not have it"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ReplayOptions:
     """How logs are replayed.
 
     Attributes
@@ -51,7 +51,7 @@ class Wanted:
     """
 
     kind: str = "features"
-    model: Callable[[Origin], Model | None] = lambda _: None
+    model: Callable[[RecorderInfo], Model | None] = lambda _: None
     output: Path | None = None
     start_offset: float = 0.0
     duration: float | None = None
@@ -70,7 +70,7 @@ class Replay:
     logs : list of Path
         What was written.
     frames, labels, segments, gaps : int
-    compared : Comparison
+    compared : ReplayComparison
         With the recorded labels and segments.
     missing : list of int
         Times (nanoseconds of UTC) before which the logs lack sound that the recorder heard: the
@@ -87,7 +87,7 @@ class Replay:
     labels: int = 0
     segments: int = 0
     gaps: int = 0
-    compared: Comparison = field(default_factory=Comparison)
+    compared: ReplayComparison = field(default_factory=ReplayComparison)
     missing: list[int] = field(default_factory=list)
     unfinished: list[Path] = field(default_factory=list)
     interrupted: bool = False
@@ -103,7 +103,7 @@ class Player:
 
     Parameters
     ----------
-    wanted : Wanted
+    wanted : ReplayOptions
     start : int
         Log time before which nothing comes out.
     result : Replay
@@ -114,37 +114,37 @@ class Player:
 
     Attributes
     ----------
-    settled : bool
+    converged : bool
         What comes out from here on does not depend on how far before the first frame was.
-    blind : bool
+    missing_before : bool
         Frames that were heard before the first one are not there.
     """
 
     def __init__(
         self,
-        wanted: Wanted,
+        wanted: ReplayOptions,
         start: int,
         result: Replay,
         stop: Flag,
         progress: Callable[[int], None],
     ) -> None:
-        self.settled = self.blind = False
+        self.converged = self.missing_before = False
         self._wanted = wanted
         self._start = start
         self._result = result
         self._stop = stop
         self._progress = progress
         self._pace = _Pace(wanted.rate)
-        self._origin: Origin | None = None  # of the first log of this start of a recorder
+        self._origin: RecorderInfo | None = None  # of the first log of this start of a recorder
         self._opened: Path | None = None
         self._log: RollingLog | None = None
         self._next = 0  # number of the frame that follows
         self._after_gap = False  # any later one may follow
         self._arrived = False
         self._end: int | None = None  # of the last frame of this recorder
-        self._records: list[Record] = []  # to be compared
+        self._records: list[EncodedMessage] = []  # to be compared
 
-    def open(self, origin: Origin) -> None:
+    def open(self, origin: RecorderInfo) -> None:
         """Go on with another log; where it is of another start of a recorder, begin anew."""
         if origin.path == self._opened:
             return
@@ -155,24 +155,24 @@ class Player:
             self._close()
             self._begin(origin)
 
-    def push(self, event: Features | Frames | Gap | Health) -> bool:
+    def push(self, event: Features | Frames | Gap | SourceHealth) -> bool:
         """Replay an event; return whether to go on."""
         if isinstance(event, Features):
             self._follow(event)
         if isinstance(event, Features | Frames):
             return self._push_frames(event)
         if isinstance(event, Gap):
-            self.settled = self._after_gap = True
+            self.converged = self._after_gap = True
         self._emit(self._pipeline.push(event))
         return True
 
     def arrive(self) -> None:
         """Note that what was pushed so far only led to the start."""
-        if self.blind and not self.settled:
+        if self.missing_before and not self.converged:
             self._result.missing.append(self._start)
         self._arrived = True
 
-    def compare(self, piece: Piece) -> None:
+    def compare(self, piece: RecordedBatch) -> None:
         """Compare what came out since the last time with what was recorded."""
         if self._origin is None or not self._arrived:
             return
@@ -188,10 +188,10 @@ class Player:
         """Complete the log; if the sound was cut here, the last segment is not as recorded."""
         self._close()
         if not cut and self._wanted.kind == "features":
-            self.compare(Piece([], [], []))
+            self.compare(RecordedBatch([], [], []))
         self._result.compared.finish(cut=cut)
 
-    def _begin(self, origin: Origin) -> None:
+    def _begin(self, origin: RecorderInfo) -> None:
         model = self._wanted.model(origin)
         asked = origin.configuration
         classifier = None if model is None else Classifier(model)
@@ -205,7 +205,7 @@ class Player:
         self._origin = origin
         self._next, self._end, self._after_gap = 0, None, False
 
-    def _features(self, origin: Origin, classifier: Classifier | None) -> FeatureSet:
+    def _features(self, origin: RecorderInfo, classifier: Classifier | None) -> FeatureSet:
         """Return the feature set to go on with; clips can be given to any."""
         if self._wanted.kind != "features":
             return DEFAULT if classifier is None else classifier.feature_set
@@ -217,7 +217,7 @@ class Player:
             )
         return features
 
-    def _goes_on(self, origin: Origin) -> bool:
+    def _goes_on(self, origin: RecorderInfo) -> bool:
         """Tell whether a log is of the same start of a recorder, but of another model."""
         assert self._origin is not None
         if origin.first_frame is None or origin.model_sha256 == self._origin.model_sha256:
@@ -226,7 +226,7 @@ class Player:
         follows = first == self._next or (self._after_gap and first > self._next)
         return self._next > 0 and follows and _without_model(origin) == _without_model(self._origin)
 
-    def _change_model(self, origin: Origin) -> None:
+    def _change_model(self, origin: RecorderInfo) -> None:
         """Let the model speak that the recorder went on with, if it is another one here too."""
         self._origin = origin
         model = self._wanted.model(origin)
@@ -243,7 +243,7 @@ class Player:
         self._sha256 = sha256
         self._emit(opening)
 
-    def _describe(self, origin: Origin, model: Model | None) -> LogDescription:
+    def _describe(self, origin: RecorderInfo, model: Model | None) -> LogDescription:
         assert self._wanted.output is not None
         kind = "clips" if self._wanted.kind == "audio" else self._wanted.kind
         replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
@@ -260,10 +260,10 @@ class Player:
             self._close()
             self._begin(self._origin)
         if self._end is None:
-            self.settled |= event.first == 0
-            self.blind |= event.first > 0
+            self.converged |= event.first == 0
+            self.missing_before |= event.first > 0
         elif event.first > self._next:
-            self.settled = True
+            self.converged = True
             lost = event.first - self._next
             gap = Gap(self._end, int(event.stamps[0]), _LOST, lost)
             self._emit(self._pipeline.push(gap))
@@ -291,21 +291,21 @@ class Player:
             if end > self._start:
                 self._progress(end)
         if self._sha256 is None:
-            self.settled |= len(event.stamps) >= self._pipeline.feature_set.window_frames
+            self.converged |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
 
-    def _emit(self, records: list[Record]) -> None:
+    def _emit(self, records: list[EncodedMessage]) -> None:
         records = self._count(records)
         if self._log is not None and records:
             self._log.write(records)
 
-    def _count(self, records: list[Record]) -> list[Record]:
+    def _count(self, records: list[EncodedMessage]) -> list[EncodedMessage]:
         """Leave out what is from before the start, and count the rest."""
         microphone = self._pipeline.microphone
         label, segment, gap = (topic(microphone, kind) for kind in ("label", "segment", "gap"))
         counts = Counter(record.topic for record in records)
         if self._wanted.kind == "features":
-            self.settled |= self._pipeline.settled
+            self.converged |= self._pipeline.segments_converged
         if records and records[0].log_time < self._start:
             records = [record for record in records if record.log_time >= self._start]
             counts = Counter(record.topic for record in records)
@@ -347,14 +347,14 @@ class _Pace:
             pass
 
 
-def _is_new(origin: Origin, last: Origin, following: int) -> bool:
+def _is_new(origin: RecorderInfo, last: RecorderInfo, following: int) -> bool:
     """Tell whether a log is of another start of a recorder than the last one."""
     if origin.first_frame is not None and origin.first_frame[0] < following:
         return True
     return origin.metadata != last.metadata or origin.model_sha256 != last.model_sha256
 
 
-def _without_model(origin: Origin) -> dict[str, str]:
+def _without_model(origin: RecorderInfo) -> dict[str, str]:
     return {key: value for key, value in origin.metadata.items() if not key.startswith("model")}
 
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.recorder_info import Origin, features_of
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.recorder.events import Gap, Health
+from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -18,8 +18,8 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Fields
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, topic
 
-_HEARD = {"features": message_types.FEATURES, "gap": message_types.GAP}
-_TYPES = _HEARD | {"label": message_types.LABEL, "segment": message_types.SEGMENT}
+_SOUND_TYPES = {"features": message_types.FEATURES, "gap": message_types.GAP}
+_TYPES = _SOUND_TYPES | {"label": message_types.LABEL, "segment": message_types.SEGMENT}
 _FIELDS = {
     message_types.FEATURES: ("header.stamp", "frame", "values"),
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
@@ -31,7 +31,7 @@ _LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be 
 _LARGEST_FRAME = 1 << 62
 _PLACE_BITS = 40
 
-_Found = dict[str, list[RawMessages]]
+_RawByType = dict[str, list[RawMessages]]
 
 
 class Features(NamedTuple):
@@ -42,34 +42,34 @@ class Features(NamedTuple):
     stamps: Int64
 
 
-class Piece(NamedTuple):
+class RecordedBatch(NamedTuple):
     """A span of time of a log.
 
     Attributes
     ----------
-    events : list of Features, Gap or Health
+    events : list of Features, Gap or SourceHealth
         In the order in which they were written.
     labels, segments : list of RawMessages
         What the recorder made of them.
     """
 
-    events: list[Features | Gap | Health]
+    events: list[Features | Gap | SourceHealth]
     labels: list[RawMessages]
     segments: list[RawMessages]
 
 
 def read_recorded(
-    origin: Origin, start: int, end: int, *, heard_only: bool = False
-) -> Iterator[Piece]:
+    origin: RecorderInfo, start: int, end: int, *, sound_only: bool = False
+) -> Iterator[RecordedBatch]:
     """Read a log piece by piece.
 
     Parameters
     ----------
-    origin : Origin
+    origin : RecorderInfo
         Of the log.
     start, end : int
         Log times, in nanoseconds: from `start` on, before `end`.
-    heard_only : bool
+    sound_only : bool
         Read features and gaps and nothing else, and compare the checksums of what is read.
 
     Raises
@@ -79,12 +79,12 @@ def read_recorded(
         not installed.
     """
     width = features_of(origin).width
-    kinds = _HEARD if heard_only else _TYPES
+    kinds = _SOUND_TYPES if sound_only else _TYPES
     topics = {topic(origin.microphone, kind): type_ for kind, type_ in kinds.items()}
-    if not heard_only:
+    if not sound_only:
         topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
-    for batch in iterate_messages([origin.path], topics, start, end, check=heard_only):
-        found: _Found = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
+    for batch in iterate_messages([origin.path], topics, start, end, check=sound_only):
+        found: _RawByType = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
@@ -94,15 +94,15 @@ def read_recorded(
             events = _events(found, origin.microphone, width, buffers)
         except LogError as error:
             raise LogError(f"{origin.path}: {error}") from error
-        yield Piece(events, found[message_types.LABEL], found[message_types.SEGMENT])
+        yield RecordedBatch(events, found[message_types.LABEL], found[message_types.SEGMENT])
 
 
 def _events(
-    found: _Found, microphone: str, width: int, buffers: Sequence[int]
-) -> list[Features | Gap | Health]:
+    found: _RawByType, microphone: str, width: int, buffers: Sequence[int]
+) -> list[Features | Gap | SourceHealth]:
     """Put features, gaps and states into the order in which they were written."""
     heard = [_features(raw, width) for raw in found[message_types.FEATURES]]
-    others: list[Gap | Health | None] = [
+    others: list[Gap | SourceHealth | None] = [
         gap for raw in found[message_types.GAP] for gap in _gaps(raw)
     ]
     others += [
@@ -121,7 +121,7 @@ def _events(
         for path in (heard[0] if heard else ())
     }
     count = len(times) - len(others)
-    events: list[Features | Gap | Health] = []
+    events: list[Features | Gap | SourceHealth] = []
     begin = 0
     for position in [*np.flatnonzero(order >= count).tolist(), len(order)]:
         if position > begin:
@@ -162,7 +162,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
     return [Gap(*row) for row in zip(*(values.tolist() for values in lists), strict=True)]
 
 
-def _health(raw: RawMessages, microphone: str) -> list[Health | None]:
+def _health(raw: RawMessages, microphone: str) -> list[SourceHealth | None]:
     """Read the states of the source; None for messages about something else."""
     (columns,) = decode([raw], _FIELDS[message_types.DIAGNOSTICS])
     name = f"hearthlog: {microphone}"
@@ -172,9 +172,9 @@ def _health(raw: RawMessages, microphone: str) -> list[Health | None]:
     ]
 
 
-def _state(time: int, status: dict[str, Any]) -> Health:
+def _state(time: int, status: dict[str, Any]) -> SourceHealth:
     values = {pair["key"]: pair["value"] for pair in status["values"]}
-    return Health(time, status["level"], status["message"], values)
+    return SourceHealth(time, status["level"], status["message"], values)
 
 
 def _check_times(columns: Columns, times: Int64) -> None:

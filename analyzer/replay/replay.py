@@ -7,8 +7,8 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.analyzer.logs.clips import ClipFramer, read_clips
-from hearthlog.analyzer.logs.recorder_info import Origin, read_origin
-from hearthlog.analyzer.replay.player import Player, Replay, Wanted
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_info
+from hearthlog.analyzer.replay.player import Player, Replay, ReplayOptions
 from hearthlog.analyzer.replay.recorded import read_recorded
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
@@ -68,16 +68,16 @@ class LogSet:
         self.kind = kind
         self.first, self.last = spans[0][0], max(last for _, last, _ in spans)
         self._spans = spans
-        self._origins: dict[Path, Origin | None] = {}
+        self._origins: dict[Path, RecorderInfo | None] = {}
 
-    def span(self, wanted: Wanted) -> tuple[int, int]:
+    def span(self, wanted: ReplayOptions) -> tuple[int, int]:
         """Return the log times from which on, and before which, messages are wanted."""
         start = self.first + round(wanted.start_offset * NANOSECONDS)
         if wanted.duration is None:
             return start, _EVER
         return start, min(start + round(wanted.duration * NANOSECONDS), _EVER)
 
-    def chosen(self, wanted: Wanted) -> list[Origin]:
+    def chosen(self, wanted: ReplayOptions) -> list[RecorderInfo]:
         """Return the logs that are wanted, at least one; raises as `between`."""
         found = self.between(*self.span(wanted))
         if not found:
@@ -90,7 +90,7 @@ class LogSet:
         seconds = (self.last - self.first) / NANOSECONDS
         return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
 
-    def between(self, start: int, end: int) -> list[Origin]:
+    def between(self, start: int, end: int) -> list[RecorderInfo]:
         """Return the logs that have messages with start <= log time < end.
 
         Raises
@@ -102,7 +102,7 @@ class LogSet:
         for first, last, path in self._spans:
             if first < end and last >= start:
                 if path not in self._origins:
-                    self._origins[path] = read_origin(path, self.kind)
+                    self._origins[path] = read_recorder_info(path, self.kind)
                 if (origin := self._origins[path]) is not None:
                     found.append(origin)
         names = sorted({f"{origin.node}/{origin.microphone}" for origin in found})
@@ -111,7 +111,7 @@ class LogSet:
                 f"{found[0].path} and others are of several microphones ({', '.join(names)}); "
                 "replay the logs of one at a time"
             )
-        heard: dict[tuple[int, int], Origin] = {}
+        heard: dict[tuple[int, int], RecorderInfo] = {}
         for origin in found:
             if origin.first_frame is not None:
                 same = heard.setdefault(origin.first_frame, origin)
@@ -122,7 +122,7 @@ class LogSet:
 
 def replay(
     logs: LogSet,
-    wanted: Wanted,
+    wanted: ReplayOptions,
     stop: Flag,
     progress: Progress = ignore_progress,
 ) -> Replay:
@@ -135,7 +135,7 @@ def replay(
     ----------
     logs : LogSet
         For the kind of sound that is wanted.
-    wanted : Wanted
+    wanted : ReplayOptions
     stop : threading.Event
         Once set, the replay ends, and the new log is completed.
     progress : callable
@@ -191,7 +191,7 @@ def _rewound(logs: LogSet, start: int, new_player: Callable[[], Player]) -> Play
         player = new_player()
         begin = max(start - back, logs.first)
         _play_features(logs, player, begin, start)
-        if begin == logs.first or player.settled:
+        if begin == logs.first or player.converged:
             player.arrive()
             return player
         back *= 2
@@ -221,7 +221,7 @@ def _play_clips(logs: LogSet, player: Player, end: int) -> None:
             return
 
 
-def _clip_events(origins: Sequence[Origin]) -> Iterator[Frames | Gap]:
+def _clip_events(origins: Sequence[RecorderInfo]) -> Iterator[Frames | Gap]:
     framer = ClipFramer()
     for origin in origins:
         for start, rate, samples in read_clips(origin.path, topic(origin.microphone, "audio")):

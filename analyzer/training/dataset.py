@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.manifest import Clip
+from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.features.feature_set import FeatureSet
@@ -117,7 +117,7 @@ class Dataset:
 
 
 def build_dataset(
-    clips: Sequence[Clip],
+    clips: Sequence[LabelledClip],
     scenario: Scenario,
     progress: Progress,
     home: Iterable[Recording] = (),
@@ -127,7 +127,7 @@ def build_dataset(
 
     Parameters
     ----------
-    clips : sequence of Clip
+    clips : sequence of LabelledClip
     scenario : Scenario
     progress : callable
         Told the share of the clips that is done.
@@ -153,7 +153,7 @@ def build_dataset(
 
 
 def clip_recordings(
-    clips: Sequence[Clip],
+    clips: Sequence[LabelledClip],
     scenario: Scenario,
     progress: Progress,
     features: FeatureSet = DEFAULT,
@@ -225,7 +225,7 @@ def cut_recordings(
     )
 
 
-def clip_features(clip: Clip, features: FeatureSet) -> Float32:
+def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
     """Compute the features of a clip, shape (n, d).
 
     Raises

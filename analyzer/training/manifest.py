@@ -15,7 +15,7 @@ _SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
 
 
 @dataclass(frozen=True)
-class Clip:
+class LabelledClip:
     """One labelled recording.
 
     Attributes
@@ -36,7 +36,7 @@ class Clip:
     licence: str
 
 
-def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
+def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     """Read a manifest with the columns path, label, source_group and, optionally, source, licence.
 
     Parameters
@@ -62,7 +62,7 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
     missing = [name for name in REQUIRED if name not in column]
     if missing:
         raise DataError(f"{path}:{number}: no column {', '.join(missing)} in the first line")
-    clips: list[Clip] = []
+    clips: list[LabelledClip] = []
     seen: dict[Path, int] = {}
     for number, record in lines:
         where = f"{path}:{number}"
@@ -78,7 +78,7 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[Clip]:
 
 def _clip(
     where: str, folder: Path, column: dict[str, int], record: list[str], labels: Collection[str]
-) -> Clip:
+) -> LabelledClip:
     if len(record) <= max(column[name] for name in REQUIRED):
         raise DataError(f"{where}: has {len(record)} fields, the first line names {len(column)}")
     value = {
@@ -97,7 +97,9 @@ def _clip(
     audio = folder / value["path"]
     if not _is_file(audio):
         raise DataError(f"{where}: no such file: {value['path'][:256]!r}")
-    return Clip(audio, value["label"], value["source_group"], value["source"], value["licence"])
+    return LabelledClip(
+        audio, value["label"], value["source_group"], value["source"], value["licence"]
+    )
 
 
 def _is_file(path: Path) -> bool:

@@ -17,7 +17,7 @@ _INTERVAL = (2.5, 97.5)
 
 Interval = tuple[float, float]
 Counts = Int64
-Indices = NDArray[np.integer]
+Integers = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Bin:
 
 
 @dataclass(frozen=True)
-class Difference:
+class F1Difference:
     """Macro F1 of a second model minus that of a first, on the same segments.
 
     Attributes
@@ -105,9 +105,9 @@ class Difference:
 
 
 def score(
-    target: Indices,
-    predicted: Indices,
-    group: Indices,
+    target: Integers,
+    predicted: Integers,
+    group: Integers,
     classes: Sequence[str],
     weight: Counts | None = None,
 ) -> Scores:
@@ -116,7 +116,7 @@ def score(
     Parameters
     ----------
     target, predicted : np.ndarray [shape=(n,)]
-        Indices of classes.
+        Integers of classes.
     group : np.ndarray [shape=(n,)]
         Numbers of the sources, which are resampled as a whole for the intervals.
     classes : sequence of str
@@ -156,18 +156,18 @@ def score(
 
 
 def difference(
-    target: Indices,
+    target: Integers,
     probabilities_a: NDArray[np.floating],
     probabilities_b: NDArray[np.floating],
-    group: Indices,
+    group: Integers,
     classes: Sequence[str],
-) -> Difference:
+) -> F1Difference:
     """Compare two models on the same segments: macro F1 of b minus that of a.
 
     Parameters
     ----------
     target : np.ndarray [shape=(n,)]
-        Indices of classes.
+        Integers of classes.
     probabilities_a, probabilities_b : np.ndarray [shape=(n, C)]
     group : np.ndarray [shape=(n,)]
         Numbers of the sources.
@@ -189,10 +189,10 @@ def difference(
         ]
     )
     macro = [float(np.nanmean(_rates(c.sum(axis=0))[2])) for c in (first, second)]
-    return Difference(macro[1] - macro[0], _interval(resampled, first))
+    return F1Difference(macro[1] - macro[0], _interval(resampled, first))
 
 
-def calibration_error(probabilities: NDArray[np.floating], target: Indices) -> float:
+def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> float:
     """Compute the expected calibration error of the winning class, over 15 bins of equal width.
 
     Parameters
@@ -208,7 +208,7 @@ def calibration_error(probabilities: NDArray[np.floating], target: Indices) -> f
     return float(np.abs(np.bincount(place, right - confidence)).sum() / len(target))
 
 
-def reliability(probabilities: NDArray[np.floating], target: Indices) -> list[Bin]:
+def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[Bin]:
     """Compare how sure a model is with how often it is right; empty bins are left out.
 
     Parameters
@@ -227,7 +227,7 @@ def reliability(probabilities: NDArray[np.floating], target: Indices) -> list[Bi
 
 
 def _binned(
-    probabilities: NDArray[np.floating], target: Indices
+    probabilities: NDArray[np.floating], target: Integers
 ) -> tuple[NDArray[np.intp], Float64, Float64]:
     confidence = probabilities.max(axis=1).astype(np.float64)
     right = (probabilities.argmax(axis=1) == target).astype(np.float64)
@@ -235,9 +235,9 @@ def _binned(
 
 
 def _confusions(
-    target: Indices,
-    predicted: Indices,
-    group: Indices,
+    target: Integers,
+    predicted: Integers,
+    group: Integers,
     classes: int,
     weight: Counts | None = None,
 ) -> Float64:

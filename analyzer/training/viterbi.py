@@ -6,11 +6,11 @@ hmmlearn has no wheel for Python 3.14 yet; nothing but this module needs it.
 import numpy as np
 from hmmlearn.base import BaseHMM
 
-from hearthlog.models.labels.smoothing import States, log_likelihoods
+from hearthlog.models.labels.smoothing import Indices, log_likelihoods
 from hearthlog.schemas.arrays import Float32, Float64
 
 
-def viterbi(probabilities: Float32, transitions: Float64) -> States:
+def viterbi(probabilities: Float32, transitions: Float64) -> Indices:
     """Return the likeliest path through a sound, shape (n,).
 
     Parameters
@@ -19,7 +19,7 @@ def viterbi(probabilities: Float32, transitions: Float64) -> States:
         Of a classifier, frame by frame.
     transitions : np.ndarray [shape=(C, C)], float64
     """
-    path: States = _model(transitions).predict(log_likelihoods(probabilities))
+    path: Indices = _model(transitions).predict(log_likelihoods(probabilities))
     return path
 
 

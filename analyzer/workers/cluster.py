@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.extras import remedy
-from hearthlog.analyzer.workers.calls import pack_call, read_reply
+from hearthlog.analyzer.workers.pickled_calls import pack_call, read_reply
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -175,7 +175,7 @@ def _guard(ours: str) -> Callable[[bytes], tuple[str, bytes]]:
             has = f"hearthlog {theirs}" if theirs else "no hearthlog"
             worker = get_worker().address
             return f"the Dask worker at {worker} has {has}, this is {ours}: not used", b""
-        from hearthlog.analyzer.workers.calls import attempt  # noqa: PLC0415  not before it is known to be there
+        from hearthlog.analyzer.workers.pickled_calls import attempt  # noqa: PLC0415  not before it is known to be there
 
         return "", attempt(call)
 

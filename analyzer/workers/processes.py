@@ -14,11 +14,11 @@ from queue import SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
-from hearthlog.analyzer.workers.calls import attempt, pack_call, read_reply
+from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_reply
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogWarning
 
-LIVES = 3  # workers that a task may cost
+MAX_ATTEMPTS = 3  # workers that a task may cost
 _TIDY_SECONDS = 3.0  # to remove what is half-written
 _SERVE = module_command("hearthlog.analyzer.workers")
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -60,13 +60,15 @@ class Processes:
 
     def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
         call = pack_call(function, args)
-        for _ in range(LIVES):
+        for _ in range(MAX_ATTEMPTS):
             process = self._process()
             try:
                 return read_reply(process.ask(call))
             except _LostError:
                 self._drop(process)
-        raise WorkerError(f"the task lost its worker {LIVES} times: killed, or out of memory")
+        raise WorkerError(
+            f"the task lost its worker {MAX_ATTEMPTS} times: killed, or out of memory"
+        )
 
     def _process(self) -> "_Process":
         """Return the process of this thread; start one if there is none."""

@@ -54,13 +54,13 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
         with connected(scheduler) as client:
             yield Cluster(client, scheduler)
     elif count == 1:
-        yield _Here()
+        yield InlineWorkers()
     else:
         with closing(Processes(count)) as processes:
             yield processes
 
 
-class _Here:
+class InlineWorkers:
     """The process that asks."""
 
     parallel = 1

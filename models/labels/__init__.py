@@ -1,1 +1,1 @@
-"""From probabilities to labels: smoothing, segments."""
+"""From probabilities to labels: smoothing and segments."""

@@ -1,19 +1,16 @@
-"""Segments from the probabilities of classes: successive frames of one state, made one.
+"""Segments from the probabilities of classes: successive frames of one state, merged.
 
 The state of a frame is the likeliest class, which is the paper's first way (section 4), or that of
-the likeliest path through a hidden Markov model, which is known some frames later.
+the likeliest path through a hidden Markov model, which is decided some frames later.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.labels.smoothing import FixedLagSmoother
-from hearthlog.schemas.arrays import Float32, Float64, Int64
-
-States = NDArray[np.intp]
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 
 _UNITS = 1 << 30  # to 1: finer than what a float32 below 1 can tell
 
@@ -26,8 +23,9 @@ class Run(NamedTuple):
     label : int
         Index of the class.
     start : int
-        In nanoseconds of UTC.
+        Start of the first frame, in nanoseconds of UTC.
     frames : int
+        Number of frames.
     confidence : int
         Sum of the probabilities of the class, in units of 2**-30: whole numbers give the same sum
         in any order.
@@ -38,12 +36,12 @@ class Run(NamedTuple):
     frames: int
     confidence: int
 
-    def behind(self, before: "Run | None") -> "Run":
-        """Return this run with the frames before it, which had the same label."""
-        if before is None:
+    def prepend(self, earlier: "Run | None") -> "Run":
+        """Return this run with an earlier run of the same label, if any, joined to its start."""
+        if earlier is None:
             return self
-        frames, confidence = before.frames + self.frames, before.confidence + self.confidence
-        return before._replace(frames=frames, confidence=confidence)
+        frames, confidence = earlier.frames + self.frames, earlier.confidence + self.confidence
+        return earlier._replace(frames=frames, confidence=confidence)
 
 
 class Segment(NamedTuple):
@@ -53,19 +51,19 @@ class Segment(NamedTuple):
     ----------
     run : Run
     end : int
-        In nanoseconds of UTC.
-    known : int
-        Start of the frame with which it was known where the segment ends, in nanoseconds of UTC;
-        where the sound ends, its end.
+        End of the last frame, in nanoseconds of UTC.
+    decided_at : int
+        Start of the frame with which the end became certain, in nanoseconds of UTC; where the
+        sound ends, the end of the sound.
     """
 
     run: Run
     end: int
-    known: int
+    decided_at: int
 
     @property
     def start(self) -> int:
-        """In nanoseconds of UTC."""
+        """Start of the first frame, in nanoseconds of UTC."""
         return self.run.start
 
     @property
@@ -75,24 +73,24 @@ class Segment(NamedTuple):
 
     @property
     def confidence(self) -> float:
-        """Mean probability of its class."""
+        """Mean probability of the class, 0 to 1."""
         return self.run.confidence / self.run.frames / _UNITS
 
 
 class Segmenter:
-    """Divides one stream into segments, in the way that its model says.
+    """Divides one stream of frames into segments, as a model's smoothing says.
 
     Parameters
     ----------
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
-        Of the hidden Markov model; unused where segments are merged.
+        Transition probabilities of the hidden Markov model; unused where segments are merged.
     frame_seconds : float
 
     Attributes
     ----------
-    settled : bool
-        Whether sound before the first frame would have left no trace in the segments to come.
+    segments_converged : bool
+        Whether frames before the first one would leave no trace in the segments to come.
     """
 
     def __init__(self, smoothing: Smoothing, transitions: Float64, frame_seconds: float) -> None:
@@ -102,109 +100,112 @@ class Segmenter:
             self._lag = round(smoothing.lag_seconds / frame_seconds)
             self._smoother = FixedLagSmoother(transitions, self._lag)
         self._merger = SegmentMerger()
-        self._waiting: tuple[Float32, Int64] | None = None
-        self._count = 0  # of frames
-        self._settled_at: int | None = None  # the stamp from which on states are sure
-        self.settled = False
+        self._undecided: tuple[Float32, Int64] | None = None  # probabilities and stamps of frames
+        self._frames = 0  # number of frames so far
+        self._converged_at: int | None = None  # stamp from which on states have converged
+        self.segments_converged = False
 
     @property
-    def sure(self) -> bool:
-        """Whether sound before the first frame would leave no trace in the states to come."""
-        if self._waiting is None or self._settled_at is None:
+    def states_converged(self) -> bool:
+        """Whether frames before the first one would leave no trace in the states to come."""
+        if self._undecided is None or self._converged_at is None:
             return False
-        stamps = self._waiting[1]
-        return not len(stamps) or self._settled_at <= int(stamps[0])
+        stamps = self._undecided[1]
+        return not len(stamps) or self._converged_at <= int(stamps[0])
 
     @property
-    def open(self) -> Run | None:
-        """The frames behind the last segment, so far as their states are known."""
-        return self._merger.open
+    def open_run(self) -> Run | None:
+        """The frames after the last segment, as far as their states are decided."""
+        return self._merger.open_run
 
-    def forget(self) -> None:
-        """Count no frame of what is open: the next run begins with the states to come."""
-        if self._merger.open is not None:
-            self._merger.open = self._merger.open._replace(frames=0, confidence=0)
+    def discard_open(self) -> None:
+        """Set the counts of the open run to zero; its label and start stay."""
+        if self._merger.open_run is not None:
+            self._merger.open_run = self._merger.open_run._replace(frames=0, confidence=0)
 
     def push(self, probabilities: Float32, stamps: Int64) -> list[Segment]:
-        """Add successive frames and return the segments of which the end is now known.
+        """Add successive frames and return the segments whose end they decide.
 
         Parameters
         ----------
         probabilities : np.ndarray [shape=(n, C)], float32
         stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds.
+            Starts of the frames in nanoseconds of UTC.
         """
         states = self._states(probabilities)
-        self._settle(stamps)
-        if self._waiting is not None:
-            probabilities = np.concatenate([self._waiting[0], probabilities])
-            stamps = np.concatenate([self._waiting[1], stamps])
+        self._note_convergence(stamps)
+        if self._undecided is not None:
+            probabilities = np.concatenate([self._undecided[0], probabilities])
+            stamps = np.concatenate([self._undecided[1], stamps])
         count = len(states)
-        self._waiting = probabilities[count:], stamps[count:]
-        known = stamps[self._lag :]
-        closed = self._merger.push(states, _of(states, probabilities), stamps[:count], known)
-        sure = self._settled_at
-        self.settled |= sure is not None and any(segment.end > sure for segment in closed)
-        return closed
+        self._undecided = probabilities[count:], stamps[count:]
+        segments = self._merger.push(
+            states, _chosen(probabilities, states), stamps[:count], stamps[self._lag :]
+        )
+        converged_at = self._converged_at
+        self.segments_converged |= converged_at is not None and any(
+            segment.end > converged_at for segment in segments
+        )
+        return segments
 
     def close(self, end: int) -> list[Segment]:
-        """Return the segments that are left of a sound that ends at `end`, and begin anew."""
-        closed = []
-        if self._smoother is not None and self._waiting is not None:
-            probabilities, stamps = self._waiting
+        """Return the remaining segments of a sound that ends at `end`, and begin anew."""
+        segments = []
+        if self._smoother is not None and self._undecided is not None:
+            probabilities, stamps = self._undecided
             states = self._smoother.close()
-            known = np.full(len(states), end)
-            closed = self._merger.push(states, _of(states, probabilities), stamps, known)
-        self._waiting = self._settled_at = None
-        self._count = 0
-        closed += self._merger.close(end, end)
-        self.settled |= bool(closed)
-        return closed
+            decided_at = np.full(len(states), end)
+            segments = self._merger.push(states, _chosen(probabilities, states), stamps, decided_at)
+        self._undecided = self._converged_at = None
+        self._frames = 0
+        segments += self._merger.close(end, end)
+        self.segments_converged |= bool(segments)
+        return segments
 
-    def _states(self, probabilities: Float32) -> States:
+    def _states(self, probabilities: Float32) -> Indices:
         if self._smoother is None:
             return probabilities.argmax(axis=1)
         return self._smoother.push(probabilities)
 
-    def _settle(self, stamps: Int64) -> None:
-        frames = 1 if self._smoother is None else self._smoother.settled
-        if self._settled_at is None and frames is not None:
-            self._settled_at = int(stamps[frames - 1 - self._count])
-        self._count += len(stamps)
+    def _note_convergence(self, stamps: Int64) -> None:
+        frames = 1 if self._smoother is None else self._smoother.converged_after
+        if self._converged_at is None and frames is not None:
+            self._converged_at = int(stamps[frames - 1 - self._frames])
+        self._frames += len(stamps)
 
 
 class SegmentMerger:
-    """Merges the states of one stream.
+    """Merges successive equal states of one stream.
 
     Attributes
     ----------
-    open : Run or None
+    open_run : Run or None
         The run that has not ended.
     """
 
     def __init__(self) -> None:
-        self.open: Run | None = None
+        self.open_run: Run | None = None
 
     def push(
-        self, states: States, confidences: Float32, stamps: Int64, known: Int64
+        self, states: Indices, confidences: Float32, stamps: Int64, decided_at: Int64
     ) -> list[Segment]:
         """Add the states of successive frames and return the segments that they close.
 
         Parameters
         ----------
-        states : np.ndarray [shape=(n,)]
+        states : np.ndarray [shape=(n,)], intp
             Indices of classes.
-        confidences : np.ndarray [shape=(n,)]
-            Their probabilities.
+        confidences : np.ndarray [shape=(n,)], float32
+            Probabilities of these classes.
         stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds.
-        known : np.ndarray [shape=(n,)], int64
-            When their states were known.
+            Starts of the frames in nanoseconds of UTC.
+        decided_at : np.ndarray [shape=(n or more,)], int64
+            When each state was decided, in nanoseconds of UTC.
         """
-        closed: list[Segment] = []
+        segments: list[Segment] = []
         starts = np.flatnonzero(np.diff(states, prepend=-1))
         if not len(starts):
-            return closed
+            return segments
         units = np.rint(confidences.astype(np.float64) * _UNITS).astype(np.int64)
         columns = (
             states[starts],
@@ -213,22 +214,23 @@ class SegmentMerger:
             np.add.reduceat(units, starts),
         )
         rows = zip(*(column.tolist() for column in columns), strict=True)
-        for run, when in zip(map(Run._make, rows), known[starts].tolist(), strict=True):
-            last = self.open
+        for run, time in zip(map(Run._make, rows), decided_at[starts].tolist(), strict=True):
+            last = self.open_run
             if last is not None and last.label == run.label:
-                self.open = run.behind(last)
+                self.open_run = run.prepend(last)
             else:
-                closed += self.close(run.start, when)
-                self.open = run
-        return closed
+                segments += self.close(run.start, time)
+                self.open_run = run
+        return segments
 
-    def close(self, end: int, known: int) -> list[Segment]:
-        """End the open run, if there is one, at `end`, which is known at `known`."""
-        if self.open is None:
+    def close(self, end: int, decided_at: int) -> list[Segment]:
+        """End the open run, if there is one; both times are in nanoseconds of UTC."""
+        if self.open_run is None:
             return []
-        last, self.open = self.open, None
-        return [Segment(last, end, known)]
+        run, self.open_run = self.open_run, None
+        return [Segment(run, end, decided_at)]
 
 
-def _of(states: States, probabilities: Float32) -> NDArray[Any]:
+def _chosen(probabilities: Float32, states: Indices) -> Float32:
+    """Return the probability of each frame's state."""
     return probabilities[np.arange(len(states)), states]

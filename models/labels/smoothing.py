@@ -1,27 +1,31 @@
-"""Smoothing: the likeliest path through a hidden Markov model, some frames after the sound."""
+"""Smoothing: fixed-lag Viterbi decoding of the classifier's probabilities.
+
+The algorithm is that of Viterbi, "Error bounds for convolutional codes", 1967, with each state
+decided a fixed number of frames after its own.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Float32, Float64
 
-_FLOOR = 1e-6  # of a probability: no single frame forbids a class
-# Logarithms are rounded to multiples of this, so that their sums are exact. The path then does not
-# depend on when the scores are brought back to zero, nor on what is long past.
+_FLOOR = 1e-6  # least probability: no single frame forbids a class
+# Logarithms are rounded to multiples of this, so that their sums are exact. The path then depends
+# neither on when the scores are rescaled to zero, nor on frames long past.
 _STEP = 2.0**-30
 _FRAMES_AT_ONCE = 4096
 _LANE = 128  # frames
 _WARM_UP = 64  # frames; in real sound 99 of 100 beginnings are forgotten after 32
 
-States = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 
 def log_likelihoods(probabilities: Float32) -> Float64:
-    """Turn the probabilities of a classifier into what a hidden Markov model observes.
+    """Turn the probabilities of a classifier into the log-likelihoods of a hidden Markov model.
 
-    They are taken for likelihoods as they are: classes are trained with even weights, so their
-    prior is uniform. That successive windows overlap by 19 frames of 20, and say nearly the same,
-    would speak for a smaller weight, but any smaller one loses single coughs (docs/models.md).
+    Probabilities are used as likelihoods without change: classes are trained with even weights, so
+    their prior is uniform. Successive windows overlap by 19 frames of 20, which would justify a
+    smaller weight, but any smaller one loses single coughs (docs/models.md).
 
     Parameters
     ----------
@@ -36,24 +40,24 @@ def log_likelihoods(probabilities: Float32) -> Float64:
 
 
 class FixedLagSmoother:
-    """Decides the state of each frame once `lag_frames` more are known.
+    """Decides the state of each frame `lag_frames` frames later.
 
-    It is the state on the likeliest path up to the last of these: that of Viterbi over the whole
-    sound where later frames do not change it. The same frames give the same states in blocks of
-    any size.
+    It is the frame's state on the likeliest path up to that later frame, which is the state that
+    Viterbi gives over the whole sound unless still later frames change it. The same frames give
+    the same states in blocks of any size.
 
     Parameters
     ----------
     transitions : np.ndarray [shape=(C, C)], float64
-        Probability of each column's class in the frame after one of the row's class. Any class
-        may be the first.
+        Probability that a frame of the row's class is followed by one of the column's class. The
+        first frame may be of any class.
     lag_frames : int
 
     Attributes
     ----------
-    settled : int or None
-        After how many frames sound before the first one would have left no trace: the states from
-        the last of these on do not depend on it. None if that is later.
+    converged_after : int or None
+        Number of frames after which earlier sound would leave no trace: the states from the last
+        of these frames on do not depend on it. None if that is not reached yet.
     """
 
     def __init__(self, transitions: Float64, lag_frames: int) -> None:
@@ -62,7 +66,7 @@ class FixedLagSmoother:
         self._lag = lag_frames
         self._restart()
 
-    def push(self, probabilities: Float32) -> States:
+    def push(self, probabilities: Float32) -> Indices:
         """Add successive frames and return the states that they decide.
 
         Parameters
@@ -72,15 +76,15 @@ class FixedLagSmoother:
         Returns
         -------
         np.ndarray [shape=(m,)], intp
-            Of the frames that follow those decided before, up to `lag_frames` before the last.
+            States of the frames after those already decided, up to `lag_frames` before the last.
         """
         starts = range(0, len(probabilities), _FRAMES_AT_ONCE)
         blocks = (probabilities[start : start + _FRAMES_AT_ONCE] for start in starts)
         parts = [self._push(log_likelihoods(block)) for block in blocks]
         return np.concatenate([np.empty(0, np.intp), *parts])
 
-    def close(self) -> States:
-        """Return the states of the frames that are left, and begin anew."""
+    def close(self) -> Indices:
+        """Return the states of the remaining frames, and begin anew."""
         states = np.empty(len(self._back), np.intp)
         if len(states):
             states[-1] = self._score.argmax()
@@ -91,21 +95,21 @@ class FixedLagSmoother:
 
     def _restart(self) -> None:
         count = len(self._transitions)
-        self.settled: int | None = None
-        self._count = 0  # of frames
-        self._score = np.zeros(count)  # of the likeliest path to each state
-        self._back = np.empty((0, count), np.intp)  # of each frame that is not decided
-        # Scores if the sound had begun in each of the states: once they are the same but for a
-        # constant, any other beginning would have led to them too.
+        self.converged_after: int | None = None
+        self._count = 0  # number of frames so far
+        self._score = np.zeros(count)  # score of the likeliest path to each state
+        self._back = np.empty((0, count), np.intp)  # best predecessors, of undecided frames
+        # Scores had the sound begun in each of the states: once they differ by constants only, any
+        # other beginning would have led to the same path.
         self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
 
-    def _push(self, observed: Float64) -> States:
+    def _push(self, observed: Float64) -> Indices:
         count = len(observed)
         steps = observed if self._count else observed[1:]
         start = self._score if self._count else observed[0]
         self._count += count
-        if self.settled is None:
-            self._settle(steps)
+        if self.converged_after is None:
+            self._note_convergence(steps)
         scores = _forward_in_lanes(self._transitions, start, steps)
         back = np.zeros((count, len(start)), np.intp)
         reached = scores[:-1, :, np.newaxis] + self._transitions
@@ -114,7 +118,7 @@ class FixedLagSmoother:
         self._score = scores[-1] - scores[-1].max()
         return self._decide(back, best)
 
-    def _decide(self, back: States, best: States) -> States:
+    def _decide(self, back: Indices, best: Indices) -> Indices:
         """Trace back from the best state of each new frame to the frame `lag_frames` before it."""
         back = np.concatenate([self._back, back])
         decided = max(len(back) - self._lag, 0)
@@ -127,21 +131,21 @@ class FixedLagSmoother:
             states = back[frames - lag, states]
         return states
 
-    def _settle(self, steps: Float64) -> None:
+    def _note_convergence(self, steps: Float64) -> None:
         scores = _forward(self._transitions, self._scores_from, steps[..., np.newaxis])
         scores -= scores.max(axis=1, keepdims=True)
         self._scores_from = scores[-1]
         same = (scores == scores[..., :1]).all(axis=(1, 2))
         if same[-1]:
-            self.settled = self._count - int(same[::-1].argmin()) + 1
+            self.converged_after = self._count - int(same[::-1].argmin()) + 1
 
 
 def _forward_in_lanes(transitions: Float64, start: Float64, observed: Float64) -> Float64:
-    """Score as `_forward` does, but for constants that scores of one frame have in common.
+    """Score as `_forward` does, up to a constant per frame.
 
-    The frames are divided into lanes, scored side by side: each from some frames before it on,
-    as if nothing was known there. Where that led to what the lane before ends with, it is right,
-    for the sums are exact; elsewhere the lane is scored once more.
+    The frames are divided into lanes that are scored side by side, each with a warm-up of frames
+    before it and an uninformed start. Where the warm-up arrives at the scores with which the lane
+    before ends, the lane is right, since the sums are exact; elsewhere it is scored again.
     """
     count = len(observed) // _LANE - 1  # the first lane has no frames before it
     if count < 2:
@@ -171,13 +175,13 @@ def _forward(transitions: Float64, start: Float64, observed: Float64) -> Float64
     ----------
     transitions : np.ndarray [shape=(C, C)], float64
     start : np.ndarray [shape=(C,) or (C, k)], float64
-        Scores of the frame before, of k sounds.
+        Scores of the frame before, for k sounds.
     observed : np.ndarray [shape=(n, C), (n, C, 1) or (n, C, k)], float64
 
     Returns
     -------
     np.ndarray [shape=(n + 1, C) or (n + 1, C, k)], float64
-        The first is `start`.
+        The first row is `start`.
     """
     scores = np.empty((len(observed) + 1, *start.shape))
     scores[0] = start
@@ -185,10 +189,10 @@ def _forward(transitions: Float64, start: Float64, observed: Float64) -> Float64
     if start.ndim > 1:
         transitions = transitions[..., np.newaxis]
     steps = zip(scores[:-1, :, np.newaxis], scores[1:], observed, strict=True)
-    for before, after, seen in steps:
+    for before, after, likelihoods in steps:
         np.add(before, transitions, out=reached)
         np.maximum.reduce(reached, axis=0, out=after)
-        np.add(after, seen, out=after)
+        np.add(after, likelihoods, out=after)
     return scores
 
 

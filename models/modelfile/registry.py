@@ -24,7 +24,7 @@ _KEPT = 100  # earlier champions
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
+class ModelEntry:
     """One file of the folder.
 
     Attributes
@@ -47,7 +47,7 @@ class Entry:
     problem: str = ""
 
 
-def list_models(folder: Path) -> list[Entry]:
+def list_models(folder: Path) -> list[ModelEntry]:
     """Load every model of a folder, in the order of their names; aliases that lead nowhere too.
 
     Raises
@@ -169,14 +169,14 @@ def rollback(folder: Path) -> tuple[Model, str]:
         raise ModelError(f"{folder}: no champion before {before} can be used; promote a model")
 
 
-def _entry(folder: Path, name: str, aliases: tuple[str, ...]) -> Entry:
+def _entry(folder: Path, name: str, aliases: tuple[str, ...]) -> ModelEntry:
     path = _path(folder, name)
     try:
         model = load_model(path)
-        return Entry(name, aliases, path.stat().st_size, model)
+        return ModelEntry(name, aliases, path.stat().st_size, model)
     except (ModelError, OSError) as error:
         size = path.stat().st_size if path.is_file() else 0
-        return Entry(name, aliases, size, None, str(error))
+        return ModelEntry(name, aliases, size, None, str(error))
 
 
 def _path(folder: Path, name: str) -> Path:

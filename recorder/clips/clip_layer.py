@@ -1,4 +1,4 @@
-"""The layers of sound beside the logs: clips on the disk."""
+"""Clips on the disk: layers of sound beside the logs."""
 
 import json
 import shutil
@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, time, timedelta
 from pathlib import Path
 
-from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, Sound
+from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, KeptSound
 from hearthlog.recorder.clips.clip_retention import find_clips
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
@@ -30,18 +31,22 @@ _LONGEST_FILE = 86_400 * NANOSECONDS
 _LONGEST_HELD = 60 * NANOSECONDS  # a pre-roll, a second, a block of frames
 
 
-class ClipLog:
-    """Writes sound into layers, so long as the day's minutes and the disk allow.
+CLIPS_AGAIN = Notice(OK, "clips are kept again")
 
-    Whatever happens here, the logs go on: what went wrong is said, not raised.
+
+class ClipWriter:
+    """Writes sound into layers, as long as the day's minutes and the disk allow.
+
+    Whatever happens here, the logs go on: errors become notices and are not raised.
 
     Parameters
     ----------
     settings : Settings
     microphone : str
-        Whose sound it is.
+        Its name.
     file_at : callable
-        Gives the log that has a time, and when that ends, in nanoseconds of UTC.
+        Returns the log that contains a time, and the end of that log; times are in nanoseconds of
+        UTC.
     """
 
     def __init__(
@@ -53,33 +58,34 @@ class ClipLog:
         self._zone = time_zone(settings.timezone)
         self._log: Path | None = None
         self._writer: LogWriter | None = None
-        self._rolled: int | None = None  # when the log was seen to have ended
+        self._rolled: int | None = None  # when the next log had begun
         self._broken = ""  # why the layer of this log cannot be written
         self._stopped = ""
         self._day = range(0)
-        self._used = 0  # frames of the day
+        self._used = 0  # frames kept of the day
 
-    def write(self, sounds: Sequence[Sound]) -> list[tuple[int, str]]:
-        """Append sound to the layers of its logs.
-
-        Returns
-        -------
-        list of (int, str)
-            What is to be said, with its level of `diagnostic_msgs`.
-        """
-        said = []
+    def write(self, sounds: Sequence[KeptSound]) -> list[Notice]:
+        """Append sound to the layers of its logs."""
+        notices = []
         for sound in sounds:
             first = 0
             while first < len(sound.stamps):
                 log, until = self._file_at(int(sound.stamps[first]))
-                here = int(sound.stamps.searchsorted(until))
-                last = min(max(here, first + 1), first + _MESSAGE_FRAMES)
-                said += self._write(log, Sound(sound.stamps[first:last], sound.samples[first:last]))
+                split = int(sound.stamps.searchsorted(until))
+                last = min(max(split, first + 1), first + _MESSAGE_FRAMES)
+                part = KeptSound(sound.stamps[first:last], sound.samples[first:last])
+                notices += self._write(log, part)
                 first = last
-        return said
+        return notices
 
-    def attend(self, now: int) -> list[tuple[int, str]]:
-        """Complete the layer of a log that has ended, once no sound of it is held back."""
+    def tick(self, now: int) -> list[Notice]:
+        """Complete the layer of a log that has ended, once no sound of it is held back.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
         if self._writer is None or self._file_at(now)[0] == self._log:
             self._rolled = None
         elif self._rolled is None:
@@ -88,7 +94,7 @@ class ClipLog:
             return self.finish()
         return []
 
-    def finish(self) -> list[tuple[int, str]]:
+    def finish(self) -> list[Notice]:
         """Complete the layer that is open."""
         writer, self._writer = self._writer, None
         if writer is None:
@@ -97,28 +103,28 @@ class ClipLog:
             writer.finish()
         except OSError as error:
             writer.abandon()
-            return self._say(f"their layer cannot be completed ({error.strerror or error})")
+            return self._report(f"their layer cannot be completed ({error.strerror or error})")
         return []
 
-    def _write(self, log: Path, sound: Sound) -> list[tuple[int, str]]:
-        said = []
+    def _write(self, log: Path, sound: KeptSound) -> list[Notice]:
+        notices = []
         if log != self._log:
-            said = self.finish()
+            notices = self.finish()
             self._log, self._broken = log, ""
         reason = self._broken or self._full(int(sound.stamps[0]), len(sound.stamps))
         if not reason:
             reason = self._broken = self._append(log, sound)
-        return [*said, *self._say(reason)]
+        return [*notices, *self._report(reason)]
 
-    def _say(self, reason: str) -> list[tuple[int, str]]:
-        """Say why no sound is kept, if that is new."""
+    def _report(self, reason: str) -> list[Notice]:
+        """Report why no sound is kept (or that it is), if that is new."""
         if reason == self._stopped:
             return []
         self._stopped = reason
-        return [(1, f"no clips: {reason}") if reason else (0, "clips are kept again")]
+        return [Notice(WARNING, f"no clips: {reason}") if reason else CLIPS_AGAIN]
 
-    def _append(self, log: Path, sound: Sound) -> str:
-        """Write one message; return why that failed."""
+    def _append(self, log: Path, sound: KeptSound) -> str:
+        """Write one message; return why that failed, or an empty text."""
         start = int(sound.stamps[0])
         data = encode(
             message(
@@ -153,12 +159,12 @@ class ClipLog:
         )
 
     def _full(self, stamp: int, frames: int) -> str:
-        """Tell why so many frames may not be written now."""
+        """Return why so many frames may not be written now, or an empty text."""
         if stamp not in self._day:
             self._begin_day(stamp)
         minutes = self._settings.clip_minutes_a_day
         if self._used + frames > minutes * _MINUTE_FRAMES:
-            self._used = minutes * _MINUTE_FRAMES  # nor is what is shorter, then
+            self._used = minutes * _MINUTE_FRAMES  # so that no shorter sound is written either
             return f"{minutes} minutes of this day are kept already"
         least = self._settings.clip_min_free_space
         try:
@@ -168,7 +174,7 @@ class ClipLog:
         return f"less than {least} MB are free on the disk" if free < least * _MEGABYTE else ""
 
     def _begin_day(self, stamp: int) -> None:
-        """Count what is kept already of the day of the home that has a time."""
+        """Count the frames that are kept already of the home's day that contains a time."""
         day = datetime.fromtimestamp(stamp // NANOSECONDS, self._zone).date()
         begin, end = (
             int(datetime.combine(day + timedelta(days), time(), self._zone).timestamp())
@@ -185,11 +191,11 @@ class ClipLog:
 
 
 def _frames_in(layer: Path, start: int, end: int) -> int:
-    """Count the frames of a layer between two times; one that cannot be read counts nothing."""
+    """Count the frames of a layer between two times; none if it cannot be read."""
     try:
         with LogFile(layer) as file:
             chunks = file.chunks
     except LogError:
         return 0
-    some = (chunks["start"] >= start) & (chunks["start"] < end)
-    return int(chunks["size"][some].sum()) // _FRAME_BYTES
+    inside = (chunks["start"] >= start) & (chunks["start"] < end)
+    return int(chunks["size"][inside].sum()) // _FRAME_BYTES

@@ -1,23 +1,22 @@
-"""Keeping clips: what may be kept of the sound, into layers beside the log, and not for ever."""
+"""Recording clips: sound that may be kept, in layers beside the log, for a limited time."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hearthlog.recorder.clips.clip_choice import ClipFinder, Labelled
-from hearthlog.recorder.clips.clip_layer import ClipLog
-from hearthlog.recorder.clips.clip_retention import Retention
+from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.recorder.clips.clip_choice import ClipFinder
+from hearthlog.recorder.clips.clip_layer import CLIPS_AGAIN, ClipWriter
+from hearthlog.recorder.clips.clip_retention import ClipRetention
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.events import Event, Frames, Gap
+from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, event_time
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 
 
-class ClipKeeper:
-    """Keeps the clips of one recording, if it was asked to, and deletes old ones in any case.
-
-    What its methods return is to be said, with its level of `diagnostic_msgs`.
+class ClipRecorder:
+    """Keeps the clips of one recording, if that is configured, and always deletes old ones.
 
     Parameters
     ----------
@@ -25,7 +24,8 @@ class ClipKeeper:
     pipeline : Pipeline
         Of the microphone whose sound it is.
     file_at : callable
-        Gives the log that has a time, and when that ends, in nanoseconds of UTC.
+        Returns the log that contains a time, and the end of that log; times are in nanoseconds of
+        UTC.
 
     Raises
     ------
@@ -41,73 +41,76 @@ class ClipKeeper:
     ) -> None:
         self._keep = settings.keep_audio
         self._never = settings.never_keep
-        self._retention = Retention(settings.output, settings.node, settings.clip_retention_days)
+        self._retention = ClipRetention(
+            settings.output, settings.node, settings.clip_retention_days
+        )
         frames = round(settings.clip_pre_roll_seconds * NANOSECONDS / FRAME_NANOSECONDS)
         self._finder = ClipFinder(
             self._keep, self._never, frames, pipeline.feature_set.window_frames
         )
-        self._log = ClipLog(settings, pipeline.microphone, file_at)
+        self._writer = ClipWriter(settings, pipeline.microphone, file_at)
         self._classes: Sequence[str] | None = pipeline.classes
-        self._reason = self._refusal()
-        if self._reason:
-            raise ConfigurationError(self._reason)
+        self._refused = self._refusal()  # why no sound may be kept, or empty
+        if self._refused:
+            raise ConfigurationError(self._refused)
 
-    def before(self, event: Event) -> list[tuple[int, str]]:
-        """Attend to what will come into the log now: a gap ends the sound before it."""
-        if isinstance(event, Gap) and not self._reason:
-            return self._log.write(self._finder.close())
+    def before(self, event: Event) -> list[Notice]:
+        """Prepare for an event that is about to be logged: a gap ends the sound before it."""
+        if isinstance(event, Gap) and not self._refused:
+            return self._writer.write(self._finder.close())
         return []
 
-    def after(self, event: Event, labelled: Labelled | None) -> list[tuple[int, str]]:
-        """Attend to what is in the log now, and to how its last frames were labelled."""
-        now = time_of(event)
-        said = self._retention.attend(now)
+    def after(self, event: Event, labels: FrameLabels | None) -> list[Notice]:
+        """Keep the sound of an event that was logged.
+
+        Parameters
+        ----------
+        event : Event
+        labels : FrameLabels or None
+            Of its last frames, if they are labelled.
+        """
+        now = event_time(event)
+        notices = self._retention.tick(now)
         if self._keep == "off":
-            return said
-        said += self._log.attend(now)
+            return notices
+        notices += self._writer.tick(now)
         if isinstance(event, Frames):
-            if labelled is not None and labelled.classes != self._classes:
-                said += self._change_classes(labelled.classes)
-            if not self._reason:
-                said += self._log.write(self._finder.push(event, labelled))
-        return said
+            if labels is not None and labels.classes != self._classes:
+                notices += self._change_classes(labels.classes)
+            if not self._refused:
+                notices += self._writer.write(self._finder.push(event, labels))
+        return notices
 
-    def _change_classes(self, classes: Sequence[str]) -> list[tuple[int, str]]:
-        """Go on with the labels of another model, unless it does not know what is never kept."""
-        before, self._classes = self._reason, classes
-        self._reason = self._refusal()
-        if self._reason == before:
+    def finish(self) -> list[Notice]:
+        """Write the remaining sound, and complete the layer."""
+        notices = [] if self._refused else self._writer.write(self._finder.close())
+        return [*notices, *self._writer.finish()]
+
+    def _change_classes(self, classes: Sequence[str]) -> list[Notice]:
+        """Go on with another model, unless it cannot tell what is never kept."""
+        before, self._classes = self._refused, classes
+        self._refused = self._refusal()
+        if self._refused == before:
             return []
-        if not self._reason:
-            return [(0, "clips are kept again")]
-        return [*self._log.write(self._finder.close()), (1, f"no clips: {self._reason}")]
-
-    def finish(self) -> list[tuple[int, str]]:
-        """Keep what is left to be kept, and complete the layer."""
-        said = [] if self._reason else self._log.write(self._finder.close())
-        return [*said, *self._log.finish()]
+        if not self._refused:
+            return [CLIPS_AGAIN]
+        notices = self._writer.write(self._finder.close())
+        return [*notices, Notice(WARNING, f"no clips: {self._refused}")]
 
     def _refusal(self) -> str:
-        """Tell why no sound may be kept."""
+        """Return why no sound may be kept, or an empty text."""
         if self._keep == "off":
             return ""
-        asked = f'keep_audio = "{self._keep}" needs a model'
-        known = self._classes or ()
-        unknown = [name for name in self._never if name not in known]
-        if unknown:
-            names = ", ".join(repr(name) for name in unknown)
-            what = f"this one tells apart {', '.join(known)}" if known else "there is none"
+        problem = f'keep_audio = "{self._keep}" needs a model'
+        classes = self._classes or ()
+        missing = [name for name in self._never if name not in classes]
+        if missing:
+            names = ", ".join(repr(name) for name in missing)
+            what = f"this one tells apart {', '.join(classes)}" if classes else "there is none"
             return (
-                f"{asked} that knows {names}, which is never kept ({what}); take one that does, "
+                f"{problem} that knows {names}, which is never kept ({what}); take one that does, "
                 "or set never_keep = [] to keep that too"
             )
-        if not known and self._keep != "always":
-            return f"{asked}, which says what to keep; give one, or keep it always"
+        if not classes and self._keep != "always":
+            return f"{problem}, which says what to keep; give one, or keep it always"
         return ""
-
-
-def time_of(event: Event) -> int:
-    """Return the time of the last that an event tells of, in nanoseconds of UTC."""
-    if isinstance(event, Frames):
-        return int(event.stamps[-1])
-    return event.end if isinstance(event, Gap) else event.stamp

@@ -1,4 +1,4 @@
-"""Forgetting sound: clips are deleted when they are old enough. Nothing else ever is."""
+"""Retention of clips: they are deleted once they are old enough. Nothing else ever is."""
 
 import os
 import re
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.schemas.logs.files import AUDIO_SUFFIX
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -14,17 +15,17 @@ _EVERY = 3600 * NANOSECONDS
 _TIME = "%Y%m%dT%H%M%SZ"
 
 
-class Retention:
-    """Deletes the clips of a recorder once an hour, by the time of what it hears.
+class ClipRetention:
+    """Deletes the old clips of a recorder once an hour, by the time of the sound.
 
     Parameters
     ----------
     root : Path
         Folder of logs; links in it are not followed.
     node : str
-        Of whose clips.
+        Node whose clips they are.
     days : int
-        How long they are kept at most: a layer goes when its log began so long ago.
+        Age at which a layer is deleted, counted from the start of its log.
     """
 
     def __init__(self, root: Path, node: str, days: int) -> None:
@@ -33,13 +34,13 @@ class Retention:
         self._kept = days * _DAY
         self._last: int | None = None
 
-    def attend(self, now: int) -> list[tuple[int, str]]:
-        """Delete what is old now (nanoseconds of UTC), unless an hour has not passed since.
+    def tick(self, now: int) -> list[Notice]:
+        """Delete what is old, unless that was done less than an hour ago.
 
-        Returns
-        -------
-        list of (int, str)
-            What is to be said, with its level of `diagnostic_msgs`.
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
         """
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
@@ -52,15 +53,17 @@ class Retention:
                 deleted += 1
             except OSError as error:
                 failures.append(error)
-        said = []
+        notices = []
         if deleted:
             days = self._kept // _DAY
-            said.append((0, f"clips of {deleted} logs deleted: they were {days} days old"))
+            text = f"clips of {deleted} logs deleted: they were {days} days old"
+            notices.append(Notice(OK, text))
         if failures:
             more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
             first = f"{failures[0].filename}: {failures[0].strerror}"
-            said.append((1, f"clips cannot be looked through or deleted: {first}{more}"))
-        return said
+            text = f"clips cannot be looked through or deleted: {first}{more}"
+            notices.append(Notice(WARNING, text))
+        return notices
 
     def _old(self, limit: int, failures: list[OSError]) -> Iterator[Path]:
         for layer, start in find_clips(self._root, self._node, failures):
@@ -69,14 +72,20 @@ class Retention:
 
 
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
-    """Find the layers of sound of a node, whole or damaged, and when their logs began.
+    """Find the layers of sound of a node, whole or damaged.
 
     Parameters
     ----------
     root : Path
     node : str
     failures : list of OSError
-        Is added to, where a folder cannot be read.
+        Errors of folders that cannot be read are appended.
+
+    Yields
+    ------
+    path : Path
+    start : int
+        When its log began, in nanoseconds of UTC.
     """
     name = re.compile(rf"{re.escape(node)}_(\d{{8}}T\d{{6}}Z){re.escape(AUDIO_SUFFIX)}(\.damaged)?")
     for folder, folders, files in os.walk(root, onerror=failures.append):
@@ -89,6 +98,6 @@ def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple
 def _start(text: str) -> int | None:
     try:
         moment = datetime.strptime(text, _TIME).replace(tzinfo=UTC)
-    except ValueError:  # digits, but no time
+    except ValueError:  # digits, but not a time
         return None
     return int(moment.timestamp()) * NANOSECONDS

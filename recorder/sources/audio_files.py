@@ -1,4 +1,4 @@
-"""Audio files in the place of a microphone."""
+"""Audio files in place of a microphone."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -8,7 +8,7 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import Event, Frames, Health
+from hearthlog.recorder.events import OK, Event, Frames, SourceHealth
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
@@ -22,7 +22,7 @@ _HEALTH_FRAMES = 200  # every 10 s
 class FileSource:
     """Several audio files in a row, as one stream of frames.
 
-    What is left at the very end and fills no frame is not heard.
+    The last samples are dropped where they do not fill a frame.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ class FileSource:
     start : int
         Time of the first sample in nanoseconds of UTC.
     realtime : bool
-        Hand on each frame only when its time has come since the first one.
+        Yield each frame only once as much time has passed since the first one.
     progress : callable
-        Told the share of the sound that was handed on.
+        Told the share of the sound that was read.
 
     Raises
     ------
     SourceError
-        If one of the files is missing, or is no audio.
+        If one of the files is missing, or is not audio.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class FileSource:
         self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Hand on the frames until the files end or `stop` is set.
+        """Yield the frames until the files end or `stop` is set.
 
         Raises
         ------
@@ -68,12 +68,12 @@ class FileSource:
         for samples in self._frames():
             frames = Frames(first, samples, self._stamps(first, len(samples)))
             if self._realtime:
-                heard_at = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
-                stop.wait(max(heard_at - time.monotonic(), 0.0))
+                due = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
+                stop.wait(max(due - time.monotonic(), 0.0))
             if stop.is_set():
                 return
             if first % _HEALTH_FRAMES == 0:
-                yield Health(int(frames.stamps[0]), 0, "reading", {"device": self.device})
+                yield SourceHealth(int(frames.stamps[0]), OK, "reading", {"device": self.device})
             yield frames
             first += len(samples)
             self._progress(first * FRAME_NANOSECONDS / NANOSECONDS / self._seconds)
@@ -85,7 +85,7 @@ class FileSource:
         return self._start + np.arange(first, first + count) * FRAME_NANOSECONDS
 
     def _frames(self) -> Iterator[Float32]:
-        """Cut the sound into blocks of frames that divide the interval of the health reports."""
+        """Yield blocks of frames whose number divides the interval of the health reports."""
         size = (_REALTIME_FRAMES if self._realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
         held = np.empty(0, np.float32)
         for path in self._paths:
@@ -101,7 +101,7 @@ class FileSource:
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Name the files in a few words: every diagnostic message repeats them."""
+    """Name the files in a few words, since every diagnostic message repeats them."""
     if len(paths) == 1:
         return paths[0].name
     return f"{paths[0].name} … {paths[-1].name} ({len(paths)} files)"

@@ -1,10 +1,10 @@
-"""The capture process: hears one microphone and writes its sound to standard output.
+"""The capture process: reads one microphone and writes its sound to standard output.
 
-PortAudio hangs inside the process when a device vanishes, so this process is made to be killed.
-It imports no more than PortAudio needs and computes nothing.
+PortAudio hangs inside the process when a device vanishes, so this process can be killed at any
+moment. It imports no more than PortAudio needs and computes nothing.
 
-It writes one line of JSON, a `Format` or an error, and then blocks: a `BLOCK` header and as many
-samples (int16, one channel) as that says.
+It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and
+the samples that it announces (int16, one channel).
 """
 
 import json
@@ -26,14 +26,14 @@ from hearthlog.recorder.sources.devices import Device, find_device, list_devices
 BLOCK = struct.Struct("<QIIdd")
 
 _PREFERRED_RATE = 16_000
-BLOCK_SECONDS = 0.6  # every waking costs more than the sound it brings
+BLOCK_SECONDS = 0.6  # each wake-up costs more than the samples it brings
 LATENCY_SECONDS = 1.0  # what PortAudio holds while this process does not run
 _QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
 
 
 @dataclass(frozen=True)
-class Format:
-    """What the blocks are made of."""
+class CaptureFormat:
+    """Where the blocks come from, and how many samples a second there are."""
 
     device: str
     rate: int
@@ -66,12 +66,12 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
     blocks: queue.Queue[tuple[bytes, bytes]] = queue.Queue(_QUEUE_BLOCKS)
     index = 0
 
-    def hear(samples: Any, count: int, times: Any, status: Any) -> None:
+    def enqueue(samples: Any, count: int, times: Any, status: Any) -> None:
         nonlocal index
         head = BLOCK.pack(
             index,
             count,
-            int(status._flags),  # noqa: SLF001  the only way to hand the flags on
+            int(status._flags),  # noqa: SLF001  the only way to pass the flags on
             times.inputBufferAdcTime,
             time.monotonic(),
         )
@@ -79,8 +79,8 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
         if not blocks.full():  # what is dropped here shows in the next index
             blocks.put_nowait((head, bytes(samples)))
 
-    stream, rate, channels = _open(sounddevice, device, hear)
-    output.write(json.dumps(asdict(Format(device.name, rate))).encode() + b"\n")
+    stream, rate, channels = _open(sounddevice, device, enqueue)
+    output.write(json.dumps(asdict(CaptureFormat(device.name, rate))).encode() + b"\n")
     stream.start()
     parent = os.getppid()
     while os.getppid() == parent:
@@ -92,8 +92,8 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
         output.write(_first_channel(samples, channels))
 
 
-def _open(sounddevice: ModuleType, device: Device, hear: Any) -> tuple[Any, int, int]:
-    """Open the device at 16 kHz and one channel if it can, else as it can."""
+def _open(sounddevice: ModuleType, device: Device, callback: Any) -> tuple[Any, int, int]:
+    """Open the device at 16 kHz and one channel if possible, else at its own rate and channels."""
     reason = ""
     for rate in (_PREFERRED_RATE, int(device.default_rate)):
         for channels in (1, device.channels):
@@ -105,7 +105,7 @@ def _open(sounddevice: ModuleType, device: Device, hear: Any) -> tuple[Any, int,
                     channels=channels,
                     dtype="int16",
                     latency=LATENCY_SECONDS,
-                    callback=hear,
+                    callback=callback,
                 )
             except sounddevice.PortAudioError as error:
                 reason = str(error)

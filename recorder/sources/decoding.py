@@ -15,7 +15,7 @@ from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _BLOCK_SECONDS = 10.0
-_RATES = range(1_000, 768_001)  # what any recording has, and soxr converts in bounded memory
+_RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
 
 
 def read_audio(path: Path) -> Iterator[Float32]:
@@ -31,7 +31,7 @@ def read_audio(path: Path) -> Iterator[Float32]:
     Raises
     ------
     SourceError
-        If the file is missing, or is no audio.
+        If the file is missing, or is not audio.
     """
     with _opened(path) as audio:
         yield from _resampled(_mono_blocks(audio), audio.samplerate)
@@ -71,12 +71,12 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
 
 
 def audio_seconds(path: Path) -> float:
-    """Look whether a file can be read as audio, and how long it says that it is.
+    """Return the length of an audio file in seconds, as its header says.
 
     Raises
     ------
     SourceError
-        If it cannot.
+        If the file is missing, or is not audio.
     """
     with _opened(path) as audio:
         return float(audio.frames / audio.samplerate)

@@ -17,9 +17,9 @@ class Device:
     Attributes
     ----------
     index : int
-        PortAudio's, valid only in this process.
+        Number in PortAudio, valid only in this process.
     name : str
-        Without the number of its sound card, which changes from one start to the next.
+        Name without the number of the sound card, which changes from one start to the next.
     channels : int
     default_rate : float
         In Hz.
@@ -72,12 +72,18 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 
 
 def find_device(devices: list[Device], name: str) -> Device:
-    """Choose a microphone: the default one, or the one with this name or part of a name.
+    """Choose a microphone.
+
+    Parameters
+    ----------
+    devices : list of Device
+    name : str
+        A name or a part of one; empty for the default microphone.
 
     Raises
     ------
     SourceError
-        Listing what there is, if none or several fit.
+        If none or several microphones match; the message lists all of them.
     """
     if not devices:
         raise SourceError("no microphone found: connect one and check `hearthlog devices`")
@@ -85,11 +91,11 @@ def find_device(devices: list[Device], name: str) -> Device:
         defaults = [device for device in devices if device.is_default]
         return (defaults or devices)[0]
     exact = [device for device in devices if device.name == name]
-    fitting = exact or [device for device in devices if name.lower() in device.name.lower()]
-    if len(fitting) == 1:
-        return fitting[0]
+    matching = exact or [device for device in devices if name.lower() in device.name.lower()]
+    if len(matching) == 1:
+        return matching[0]
     listed = ", ".join(repr(device.name) for device in devices)
-    what = "no microphone" if not fitting else "more than one microphone"
+    what = "no microphone" if not matching else "more than one microphone"
     raise SourceError(f"{what} is called {name!r}; there are {listed}")
 
 

@@ -1,4 +1,4 @@
-"""Blocks of captured samples to frames with stamps, and to gaps where samples are missing."""
+"""From blocks of captured samples to frames with stamps, and gaps where samples are missing."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.times import NANOSECONDS
 
-_ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on no clock we know
+_ADC_CLOCK_SECONDS = 60.0  # an ADC time further from now is on an unknown clock
 _LOSS_SECONDS = 0.010
 _STEADY_SECONDS = 0.002  # an ADC that has been this exact for so many blocks
 _STEADY_BLOCKS = 50  # is believed when it says that samples are missing
@@ -20,8 +20,8 @@ _INT16_FULL_SCALE = np.float32(32768.0)
 
 
 @dataclass(frozen=True)
-class Block:
-    """Samples that came in one piece from the capture process.
+class SampleBlock:
+    """Samples that the capture process sent in one piece.
 
     Attributes
     ----------
@@ -53,17 +53,17 @@ class Block:
 
 
 class Framer:
-    """Cuts the sound of one microphone into frames, over all lives of its capture process.
+    """Cuts the sound of one microphone into frames, over all runs of its capture process.
 
-    A frame is never cut from samples that do not follow each other: after a loss the next frame
-    begins with the first sample that was heard again.
+    All samples of a frame follow each other: after a loss the next frame begins with the first
+    sample that was captured again.
     """
 
     def __init__(self) -> None:
         self._next_frame = 0
         self._end: int | None = None  # of the last frame, on CLOCK_MONOTONIC
         self._last_stamp = 0
-        self._end_offset = 0  # of that clock to the time of day, then
+        self._end_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC at that end, in nanoseconds
         self._reason = ""
         self._rate = float(SAMPLE_RATE)
         self._clock = SampleClock(SAMPLE_RATE)
@@ -73,7 +73,7 @@ class Framer:
         self._was_steady = False
         self._lost = 0  # samples that the sound card lost, which its driver did not count
         self._origin = 0  # index of the first sample since the last loss
-        self._heard = 0  # samples at 16 kHz that left as frames since then
+        self._framed = 0  # samples at 16 kHz that became frames since then
         self._held = np.empty(0, np.float32)
         self._resampler: soxr.ResampleStream | None = None
 
@@ -97,7 +97,7 @@ class Framer:
         wall_offset : int
             CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
         reason : str
-            Why there was none in between.
+            Why there was no sound in between.
         """
         self._rate = float(rate)
         self._clock = SampleClock(rate)
@@ -106,12 +106,20 @@ class Framer:
         self._wall_offset = wall_offset
 
     def step_clock(self, wall_offset: int, reason: str) -> None:
-        """Go over to another time of day; no sound is lost but the frame in progress."""
+        """Change to another time of day; only the samples of the unfinished frame are lost.
+
+        Parameters
+        ----------
+        wall_offset : int
+            CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
+        reason : str
+            Why the clock changed.
+        """
         self._restart(self._expected + self._lost, reason)
         self._wall_offset = wall_offset
 
-    def add(self, block: Block) -> list[Frames | Gap]:
-        """Take a block and return the frames that it completes, after the gap before them."""
+    def add(self, block: SampleBlock) -> list[Frames | Gap]:
+        """Add a block and return the frames that it completes, after the gap before them."""
         if block.index != self._expected:
             self._restart(block.index + self._lost, "the recorder was too slow")
         self._expected = block.index + len(block.samples)
@@ -125,8 +133,8 @@ class Framer:
         self._clock.observe(block.index + self._lost, taken)
         return self._cut(block.samples.astype(np.float32) / _INT16_FULL_SCALE)
 
-    def _missing_before(self, block: Block, taken: float) -> int:
-        """Count the samples that the sound card lost, by how late it says that this block is."""
+    def _missing_before(self, block: SampleBlock, taken: float) -> int:
+        """Count the samples that the sound card lost, by how late this block's ADC time is."""
         if not self._clock.started:
             return 0
         late = taken - float(self._clock.time(block.index + self._lost))
@@ -138,7 +146,7 @@ class Framer:
     def _restart(self, origin: int, reason: str) -> None:
         self._reason = reason
         self._origin = origin
-        self._heard = 0
+        self._framed = 0
         self._held = np.empty(0, np.float32)
         self._resampler = None
         if self._rate != SAMPLE_RATE:
@@ -153,20 +161,20 @@ class Framer:
             return []
         frames, self._held = np.split(self._held, [count * FRAME_SAMPLES])
         times = self._times(count)
-        self._heard += count * FRAME_SAMPLES
+        self._framed += count * FRAME_SAMPLES
         gap = self._gap_before(int(times[0]))
         stamps = times + self._wall_offset
-        found = Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
+        complete = Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
         self._next_frame += count
         self._end = int(times[-1]) + FRAME_NANOSECONDS
         self._end_offset = self._wall_offset
         self._last_stamp = int(stamps[-1])
-        return [found] if gap is None else [gap, found]
+        return [complete] if gap is None else [gap, complete]
 
     def _times(self, count: int) -> Int64:
         """Return when the next frames start, in nanoseconds of CLOCK_MONOTONIC."""
-        heard = self._heard + np.arange(count) * FRAME_SAMPLES
-        index = self._origin + heard * np.float64(self._rate / SAMPLE_RATE)
+        position = self._framed + np.arange(count) * FRAME_SAMPLES
+        index = self._origin + position * np.float64(self._rate / SAMPLE_RATE)
         return np.round(self._clock.time(index) * NANOSECONDS).astype(np.int64)
 
     def _gap_before(self, time: int) -> Gap | None:

@@ -1,4 +1,4 @@
-"""A microphone that is heard for years: its capture process, watched and started again."""
+"""A microphone that runs for years: its capture process, watched and started again."""
 
 import itertools
 import math
@@ -9,7 +9,7 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.events import Event, Frames, Gap, Health
+from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import CaptureProcess
 from hearthlog.schemas.times import NANOSECONDS
@@ -22,42 +22,50 @@ _LOOK_SECONDS = 0.25
 _SILENT_FRAMES = 200  # ten seconds
 _STEP_SECONDS = 0.25
 
-_OK, _ERROR = 0, 2  # of diagnostic_msgs
-
 
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
+    Parameters
+    ----------
+    device : str
+        As `hearthlog devices` lists it, or empty for the default one.
+
+    Attributes
+    ----------
+    device : str
+        Name of the microphone that was opened.
+
     Raises
     ------
     SourceError
-        If the microphone cannot be heard at the start; later it is waited for.
+        If the microphone cannot be opened at the start; later it is waited for.
     """
 
     def __init__(self, device: str) -> None:
-        self._wanted = device
+        self._device_option = device
         self._capture: CaptureProcess | None = CaptureProcess(device)
         self.device = self._capture.format.device
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
-        self._health = (_OK, "starting")
+        self._health = (OK, "starting")
         self._last_health = self._health
         self._reported = -math.inf
         self._wall_offset = _wall_offset()
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Hand on what is heard until `stop` is set, however often the microphone is lost."""
+        """Yield frames, gaps and health until `stop` is set, even if the microphone is lost."""
         reason = "the microphone was started"
         while not stop.is_set():
             if self._capture is None:
                 yield from self._wait_for_device(stop)
             if self._capture is not None:
-                reason = yield from self._one_life(self._capture, reason, stop)
+                reason = yield from self._capture_run(self._capture, reason, stop)
                 self.close()
                 if stop.is_set():
                     return
-                self._health = (_ERROR, reason)
+                self._health = (ERROR, reason)
                 yield from self._report(self._now())
 
     def close(self) -> None:
@@ -66,22 +74,22 @@ class MicrophoneSource:
             self._capture.kill()
             self._capture = None
 
-    def _one_life(
+    def _capture_run(
         self, capture: CaptureProcess, reason: str, stop: Flag
     ) -> Generator[Event, None, str]:
-        """Hand on what one capture process hears; return why it ended."""
+        """Yield the events of one run of the capture process; return why it ended."""
         self._framer.begin(capture.format.rate, self._wall_offset, reason)
-        heard = time.monotonic() + _FIRST_BLOCK_SECONDS - _STALE_SECONDS
+        last_block = time.monotonic() + _FIRST_BLOCK_SECONDS - _STALE_SECONDS
         while not stop.is_set():
             blocks = capture.blocks(_LOOK_SECONDS)
             if blocks is None:
                 return "the capture process ended"
             for block in blocks:
-                heard = block.arrival
+                last_block = block.arrival
                 for event in self._framer.add(block):
                     self._watch(event)
                     yield event
-            if time.monotonic() - heard > _STALE_SECONDS and not blocks:
+            if time.monotonic() - last_block > _STALE_SECONDS and not blocks:
                 return "the microphone went silent"
             self._watch_clock()
             if blocks:  # its frames' time: now would be ahead of them
@@ -91,9 +99,9 @@ class MicrophoneSource:
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         for pause in itertools.chain(_RETRY_SECONDS, itertools.repeat(_RETRY_SECONDS[-1])):
             try:
-                self._capture = CaptureProcess(self._wanted)
+                self._capture = CaptureProcess(self._device_option)
             except SourceError as error:
-                self._health = (_ERROR, str(error))
+                self._health = (ERROR, str(error))
             else:
                 return
             yield from self._report(self._now())
@@ -104,13 +112,13 @@ class MicrophoneSource:
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
             return
-        heard = np.flatnonzero(event.samples.any(axis=1))
-        zeros = len(event.samples) - 1 - heard[-1] if len(heard) else len(event.samples)
-        self._silent_frames = int(zeros) if len(heard) else self._silent_frames + int(zeros)
+        sounding = np.flatnonzero(event.samples.any(axis=1))
+        zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
+        self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
         if self._silent_frames >= _SILENT_FRAMES:
-            self._health = (_ERROR, "the microphone gives digital silence: is it muted or dead?")
+            self._health = (ERROR, "the microphone gives digital silence: is it muted or dead?")
         else:
-            self._health = (_OK, "listening")
+            self._health = (OK, "listening")
 
     def _watch_clock(self) -> None:
         offset = _wall_offset()
@@ -122,8 +130,8 @@ class MicrophoneSource:
     def _now(self) -> int:
         return time.monotonic_ns() + self._wall_offset
 
-    def _report(self, stamp: int) -> Iterator[Health]:
-        """Yield the state every ten seconds, and when it has changed."""
+    def _report(self, stamp: int) -> Iterator[SourceHealth]:
+        """Yield the health every ten seconds, and when it has changed."""
         now = time.monotonic()
         if self._health != self._last_health or now - self._reported >= _HEALTH_SECONDS:
             level, summary = self._last_health = self._health
@@ -133,7 +141,7 @@ class MicrophoneSource:
                 "frames_lost": str(self._frames_lost),
                 "clock_ppm": f"{self._framer.ppm:.1f}",
             }
-            yield Health(stamp, level, summary, values)
+            yield SourceHealth(stamp, level, summary, values)
 
 
 def _wall_offset() -> int:

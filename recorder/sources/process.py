@@ -1,4 +1,4 @@
-"""The capture process as the recorder sees it: started, read, and killed however sick it is."""
+"""The capture process as the recorder sees it: started, read, and killed even if it hangs."""
 
 import fcntl
 import json
@@ -11,14 +11,14 @@ import numpy as np
 
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.modules import module_command
-from hearthlog.recorder.sources.capture import BLOCK, Format
+from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
 from hearthlog.recorder.sources.devices import Device
-from hearthlog.recorder.sources.framing import Block
+from hearthlog.recorder.sources.framing import SampleBlock
 
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
-_PIPE_BYTES = 1 << 20  # 32 s of sound: what the recorder may be late by
+_PIPE_BYTES = 1 << 20  # 32 s of sound: how far the recorder may be behind
 _START_SECONDS = 10.0
 _INPUT_OVERFLOW = 2  # paInputOverflow
 
@@ -43,14 +43,14 @@ def query_devices() -> list[Device]:
         raise SourceError(_HANGS) from error
     if not answer:
         raise SourceError(_CRASHES)
-    found = json.loads(answer)
-    if "error" in found:
-        raise SourceError(found["error"])
-    return [Device(**device) for device in found]
+    devices = json.loads(answer)
+    if "error" in devices:
+        raise SourceError(devices["error"])
+    return [Device(**device) for device in devices]
 
 
 class CaptureProcess:
-    """One life of the capture process.
+    """One run of the capture process.
 
     Parameters
     ----------
@@ -81,32 +81,43 @@ class CaptureProcess:
             self.kill()
             raise
 
-    def blocks(self, timeout: float) -> list[Block] | None:
-        """Return the blocks that have come, after waiting for one; None if the process ended."""
+    def blocks(self, timeout: float) -> list[SampleBlock] | None:
+        """Return the blocks that have arrived.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds to wait for the first one.
+
+        Returns
+        -------
+        list of SampleBlock or None
+            None if the process has ended.
+        """
         if not self._wait(timeout):
             return []
         data = self._read()
         if not data:
             return None
         self._held += data
-        found = []
+        blocks = []
         while len(self._held) >= BLOCK.size:
             head = BLOCK.unpack_from(self._held)
             end = BLOCK.size + 2 * head[1]
             if len(self._held) < end:
                 break
-            found.append(_block(head, self._held[BLOCK.size : end]))
+            blocks.append(_block(head, self._held[BLOCK.size : end]))
             self._held = self._held[end:]
-        return found
+        return blocks
 
     def kill(self) -> None:
-        """End the process, however sick it is."""
+        """End the process, even if it hangs."""
         self._process.kill()
         self._process.wait()
         assert self._process.stdout is not None
         self._process.stdout.close()
 
-    def _read_format(self) -> Format:
+    def _read_format(self) -> CaptureFormat:
         deadline = time.monotonic() + _START_SECONDS
         while b"\n" not in self._held:
             if not self._wait(deadline - time.monotonic()):
@@ -119,7 +130,7 @@ class CaptureProcess:
         answer = json.loads(line)
         if "error" in answer:
             raise SourceError(answer["error"])
-        return Format(**answer)
+        return CaptureFormat(**answer)
 
     def _wait(self, timeout: float) -> bool:
         return bool(select.select([self._pipe], [], [], max(timeout, 0.0))[0])
@@ -128,7 +139,7 @@ class CaptureProcess:
         return os.read(self._pipe, _PIPE_BYTES)
 
 
-def _block(head: tuple[int, int, int, float, float], data: bytes) -> Block:
+def _block(head: tuple[int, int, int, float, float], data: bytes) -> SampleBlock:
     index, _, flags, adc_time, arrival = head
     overflowed = bool(flags & _INPUT_OVERFLOW)
-    return Block(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)
+    return SampleBlock(index, np.frombuffer(data, "<i2"), overflowed, adc_time, arrival)

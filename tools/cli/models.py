@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.dataset import Recording
     from hearthlog.analyzer.training.scenario import Scenario
     from hearthlog.models.features.feature_set import FeatureSet
-    from hearthlog.models.modelfile.registry import Entry
+    from hearthlog.models.modelfile.registry import ModelEntry
 
 models = typer.Typer(
     no_args_is_help=True, help="Keep models in a folder: compare them, and choose which one labels."
@@ -209,7 +209,7 @@ def _verdict(comparison: "Comparison") -> str:
     return f"{better.name} is better than {worse.name}: {change}"
 
 
-def _row(entry: "Entry") -> tuple[str, ...]:
+def _row(entry: "ModelEntry") -> tuple[str, ...]:
     alias, size = ", ".join(entry.aliases), f"{entry.size / 1e6:.2f} MB"
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
@@ -226,7 +226,7 @@ def _row(entry: "Entry") -> tuple[str, ...]:
     )
 
 
-def _as_json(entry: "Entry") -> dict[str, object]:
+def _as_json(entry: "ModelEntry") -> dict[str, object]:
     result: dict[str, object] = {
         "name": entry.name,
         "aliases": entry.aliases,

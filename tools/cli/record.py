@@ -13,7 +13,7 @@ from hearthlog.tools.cli.text import number, tell
 from hearthlog.tools.cli.times import parse_time
 
 if TYPE_CHECKING:
-    from hearthlog.recorder.service import Recording
+    from hearthlog.recorder.service import RecordingSummary
 
 
 def record(
@@ -87,22 +87,22 @@ def record(
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda *_: stop.set())
-    asked = _look_at_hangup(stop)
+    reload_requests = _look_at_hangup(stop)
     if files:
         begin = start_time(start, files[0])
         with share_done("recording") as progress:
             source = FileSource(files, begin, realtime=realtime, progress=progress)
-            recording = record_files(settings, microphone, source, stop, asked)
+            recording = record_files(settings, microphone, source, stop, reload_requests)
     elif start is not None or realtime:
         raise typer.BadParameter("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")
-        recording = record_microphone(settings, microphone, stop, asked)
+        recording = record_microphone(settings, microphone, stop, reload_requests)
     _say(recording)
 
 
-def _say(recording: "Recording") -> None:
+def _say(recording: "RecordingSummary") -> None:
     """Print what was recorded, and end with status 3 if something was lost or refused."""
     for log in recording.logs:
         print(log)
@@ -121,17 +121,17 @@ def _say(recording: "Recording") -> None:
 
 def _look_at_hangup(stop: Flag) -> SimpleQueue[None]:
     """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
-    asked: SimpleQueue[None] = SimpleQueue()
+    reload_requests: SimpleQueue[None] = SimpleQueue()
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it
     at_terminal = sys.stderr.isatty() and not ignored
 
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
-        asked.put(None)
+        reload_requests.put(None)
 
     signal.signal(signal.SIGHUP, handle)
-    return asked
+    return reload_requests
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from hearthlog.tools.cli.options import Json
 from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.recorder_info import Origin
-    from hearthlog.analyzer.replay.player import Replay, Wanted
+    from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+    from hearthlog.analyzer.replay.player import Replay, ReplayOptions
     from hearthlog.analyzer.replay.replay import LogSet
     from hearthlog.models.classifiers.model import Model
 
@@ -75,14 +75,14 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from hearthlog.analyzer.replay.player import Wanted
+    from hearthlog.analyzer.replay.player import ReplayOptions
     from hearthlog.analyzer.replay.replay import LogSet
     from hearthlog.schemas.logs.files import find_logs
 
     _check_span(start_offset, playback_duration)
     if loop and output is not None:
         wrong_use("--loop writes no log: it would be written again and again; leave out --output")
-    options = Wanted(
+    options = ReplayOptions(
         kind="audio" if source is Source.clips else "features",
         output=output,
         start_offset=start_offset,
@@ -132,7 +132,7 @@ class _Models:
         self.are_recorded = True
         self.are_lacking = False
 
-    def __call__(self, origin: "Origin") -> "Model | None":
+    def __call__(self, origin: "RecorderInfo") -> "Model | None":
         """Return the model for what a recorder wrote."""
         from hearthlog.analyzer.replay.replay import find_model
 
@@ -143,7 +143,7 @@ class _Models:
             self._models[key] = find_model(*key, self._folders) if origin.model_sha256 else None
         return self._models[key]
 
-    def report(self, origins: Sequence["Origin"]) -> None:
+    def report(self, origins: Sequence["RecorderInfo"]) -> None:
         """Say where the model is not the recorded one."""
         for origin in {(o.model, o.model_sha256): o for o in origins}.values():
             model = self(origin)
@@ -200,11 +200,11 @@ def _check_output(output: Path | None, source: Path) -> None:
         check_new(output)
 
 
-def _run(logs: "LogSet", options: "Wanted", stop: Flag) -> "Replay":
+def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
     from hearthlog.analyzer.replay.replay import replay as replay_logs
     from hearthlog.tools.cli.progress import share_done
 
-    def run(options: "Wanted") -> "Replay":
+    def run(options: "ReplayOptions") -> "Replay":
         with share_done("replaying") as progress:
             return replay_logs(logs, options, stop, progress)
 

@@ -1,0 +1,102 @@
+"""What is to be done with each log: its job, and whether its layer is current."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.analyzer.logs.layers import Chain
+from hearthlog.analyzer.relabel.layer import LayerMetadata
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import relabel_path, stem
+
+_MOST_EARLIER = 24  # logs: within so many a model forgets what was before them
+
+
+class Job(NamedTuple):
+    """A log to label.
+
+    Attributes
+    ----------
+    log, layer : Path
+    earlier : tuple of Path
+        Logs before it, the last first.
+    next_log : Path or None
+        The log after it.
+    model : Path
+    model_sha256 : str
+    replaces : bool
+        Whether there is a layer that may be replaced.
+    continues_layer : bool
+        Whether the open segment at the start of the log is taken from the layer before.
+    """
+
+    log: Path
+    layer: Path
+    earlier: tuple[Path, ...]
+    next_log: Path | None
+    model: Path
+    model_sha256: str
+    replaces: bool
+    continues_layer: bool
+
+
+def make_job(
+    chain: Chain, place: int, model: Model, model_path: Path, *, continues_layer: bool
+) -> Job:
+    """Make the job of one log of a chain, as if it had no layer.
+
+    Parameters
+    ----------
+    chain : Chain
+    place : int
+        Index of the log in the chain.
+    model : Model
+    model_path : Path
+        Where workers find the model.
+    continues_layer : bool
+        As in `Job`.
+    """
+    log = chain.logs[place]
+    first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
+    return Job(
+        log=log,
+        layer=relabel_path(log, model.name),
+        earlier=tuple(reversed(chain.logs[first:place])),
+        next_log=chain.logs[place + 1] if place + 1 < len(chain.logs) else None,
+        model=model_path,
+        model_sha256=model.sha256,
+        replaces=False,
+        continues_layer=continues_layer,
+    )
+
+
+def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
+    """Tell whether a layer is what would be made again, apart from its open segment at the start.
+
+    Parameters
+    ----------
+    job : Job
+    metadata : LayerMetadata
+        Of the layer.
+    log_sha256 : str
+        `log_digest` of the log.
+
+    Raises
+    ------
+    LogError
+        If the layer is of another model, or of another log.
+    """
+    inputs = metadata.inputs
+    if inputs.model_sha256 != job.model_sha256:
+        raise LogError(
+            f"{job.layer}: was made by another model of this name ({inputs.model_sha256[:12]}, not "
+            f"{job.model_sha256[:12]}); move it away, or give the model another name"
+        )
+    if inputs.input_sha256 != log_sha256:
+        raise LogError(
+            f"{job.layer}: was made from another log of this name; move it away, and run again"
+        )
+    # Where a log beside it has been deleted since, the layer knows more than one made now would.
+    same_before = not job.earlier or stem(job.earlier[0]) == inputs.before
+    same_behind = job.next_log is None or stem(job.next_log) == inputs.behind
+    return same_before and same_behind and not metadata.loss

@@ -1,0 +1,75 @@
+"""The features of one microphone, labelled log after log."""
+
+from hearthlog.analyzer.replay.recorded import Features
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.labels.labeller import FrameLabels, Labeller
+from hearthlog.models.labels.segments import Run, Segment
+from hearthlog.recorder.events import Gap
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
+
+_LARGEST_STEP = NANOSECONDS // 5  # by which the time of a sound card may jump between two frames
+
+
+class StreamLabeller:
+    """Labels what one microphone recorded, in the order of time.
+
+    Parameters
+    ----------
+    classifier : Classifier
+
+    Attributes
+    ----------
+    segments : list of Segment
+        Those that have ended.
+    """
+
+    def __init__(self, classifier: Classifier) -> None:
+        self.segments: list[Segment] = []
+        self._labeller = Labeller(classifier)
+        self._next: int | None = None  # number of the next frame
+        self._end = 0  # end of the last frame, in nanoseconds of UTC
+        self._from_start = False  # whether it began where the sound began, or after a gap
+
+    @property
+    def states_converged(self) -> bool:
+        """Whether sound before the first frame would leave no trace in the states to come."""
+        return self._from_start or self._labeller.segmenter.states_converged
+
+    @property
+    def segments_converged(self) -> bool:
+        """Whether sound before the first frame would leave no trace in the segments to come."""
+        return self._from_start or self._labeller.segmenter.segments_converged
+
+    @property
+    def open_run(self) -> Run | None:
+        """The segment that has not ended."""
+        return self._labeller.segmenter.open_run
+
+    def discard_open(self) -> None:
+        """Set the counts of the open run to zero; its label and start stay."""
+        self._labeller.segmenter.discard_open()
+
+    def is_followed_by(self, frame: tuple[int, int]) -> bool:
+        """Tell whether the sound goes on with a frame of this number and time (ns of UTC)."""
+        return frame[0] == self._next and abs(frame[1] - self._end) <= _LARGEST_STEP
+
+    def push(self, event: Features | Gap) -> FrameLabels | None:
+        """Add features or a gap and return the labels of the frames, if there are some."""
+        if isinstance(event, Gap):
+            self.close()
+            return None
+        if self._next is not None and not self.is_followed_by((event.first, int(event.stamps[0]))):
+            self.close()
+        self._from_start |= event.first == 0
+        labels, segments = self._labeller.push(event.values, event.first, event.stamps)
+        self.segments += segments
+        self._next = event.first + len(event.stamps)
+        self._end = int(event.stamps[-1]) + FRAME_NANOSECONDS
+        return labels
+
+    def close(self) -> None:
+        """End the open segment where the last frame ends; the next frame begins anew."""
+        self.segments += self._labeller.close(self._end)
+        self._next = None
+        self._from_start = True
