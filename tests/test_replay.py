@@ -21,8 +21,9 @@ from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
 
-from hearthlog.analyzer.replay.player import ReplayOptions
-from hearthlog.analyzer.replay.replay import LogSet, find_model
+from hearthlog.analyzer.replay.log_set import LogSet
+from hearthlog.analyzer.replay.options import ReplayOptions
+from hearthlog.analyzer.replay.replay import find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.features.auros21.names import FEATURE_NAMES

@@ -1,4 +1,4 @@
-"""Labels and segments as they were recorded, and as they come out now."""
+"""Labels and segments as they were recorded, compared with those of a replay."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,22 +15,22 @@ from hearthlog.schemas.messages.cdr_codec import decode_rows
 from hearthlog.schemas.messages.cdr_layout import MessageType, message_type
 from hearthlog.schemas.messages.fields import fields_of, lacking
 
-_Without = frozenset[str]  # fields that messages of another version do not have
-_Content = bytes | tuple[bytes, ...]  # of a message: all of it, or field by field
+_Absent = frozenset[str]  # fields of ours that messages of another version do not have
+_Content = bytes | tuple[bytes, ...]  # a whole message, or one field after the other
 
 
 @dataclass
 class ReplayComparison:
-    """Counts of what was recorded and of how much of it came out again.
+    """Counts of recorded labels and segments, and of how many came out again.
 
     Attributes
     ----------
     labels, segments : int
-        Recorded ones.
+        Number that were recorded.
     same_labels : int
-        Came out with the same name for the same frame.
+        Came out with the same class for the same frame.
     identical_labels, identical_segments : int
-        Came out bit for bit, in the fields that they were recorded with.
+        Came out bit for bit, in the fields that were recorded.
     """
 
     labels: int = 0
@@ -38,20 +38,28 @@ class ReplayComparison:
     identical_labels: int = 0
     segments: int = 0
     identical_segments: int = 0
-    _waiting: set[tuple[int, _Without | None, _Content]] = field(default_factory=set, repr=False)
+    _unmatched: set[tuple[int, _Absent | None, _Content]] = field(default_factory=set, repr=False)
 
     @property
     def identical(self) -> bool:
-        """Whether all that was recorded came out bit for bit."""
+        """Whether all recorded labels and segments came out bit for bit."""
         return (self.labels, self.segments) == (self.identical_labels, self.identical_segments)
 
     def add_labels(
         self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
-        """Count the labels of one span of time; those from `end` on were not replayed."""
-        for without, same in _by_version(recorded).items():
-            old = {time: data for time, data in _recorded(same, without) if time < end}
-            new = dict(_replayed(replayed, message_types.LABEL, without))
+        """Count the labels of one span of time.
+
+        Parameters
+        ----------
+        recorded : sequence of RawMessages
+        replayed : sequence of EncodedMessage
+        end : int
+            Time from which on nothing was replayed, in nanoseconds of UTC.
+        """
+        for absent, same in _by_version(recorded).items():
+            old = {time: data for time, data in _recorded(same, absent) if time < end}
+            new = dict(_replayed(replayed, message_types.LABEL, absent))
             other = {time for time in old.keys() & new.keys() if new[time] != old[time]}
             identical = len(old.keys() & new.keys()) - len(other)
             self.labels += len(old)
@@ -66,36 +74,43 @@ class ReplayComparison:
 
         Parameters
         ----------
-        recorded, replayed : sequence
+        recorded : sequence of RawMessages
+        replayed : sequence of EncodedMessage
             A segment that closes at a gap is recorded earlier than it is replayed.
         end : int
-            Of the last frame that was replayed: earlier segments come out no more.
+            End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
         """
-        for without, same in _by_version(recorded).items():
-            self._waiting.update((time, without, data) for time, data in _recorded(same, without))
-        met = self._waiting & {
-            (time, without, data)
-            for without in {without for _, without, _ in self._waiting}
-            for time, data in _replayed(replayed, message_types.SEGMENT, without)
+        for absent, same in _by_version(recorded).items():
+            self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))
+        matched = self._unmatched & {
+            (time, absent, data)
+            for absent in {absent for _, absent, _ in self._unmatched}
+            for time, data in _replayed(replayed, message_types.SEGMENT, absent)
         }
-        over = {item for item in self._waiting if item[0] < end}
-        self.segments += len(met | over)
-        self.identical_segments += len(met)
-        self._waiting -= met | over
+        missed = {item for item in self._unmatched if item[0] < end}
+        self.segments += len(matched | missed)
+        self.identical_segments += len(matched)
+        self._unmatched -= matched | missed
 
     def finish(self, *, cut: bool) -> None:
-        """Count what was recorded and never came; not so if the replay was cut before it."""
+        """Count the recorded segments that never came out.
+
+        Parameters
+        ----------
+        cut : bool
+            Whether the replay ended before them: they are not counted.
+        """
         if not cut:
-            self.segments += len(self._waiting)
-        self._waiting.clear()
+            self.segments += len(self._unmatched)
+        self._unmatched.clear()
 
 
-def _by_version(recorded: Iterable[RawMessages]) -> dict[_Without | None, list[RawMessages]]:
-    """Sort messages by what they lack of what is replayed; None: they are of this version."""
-    versions: dict[_Without | None, list[RawMessages]] = {}
+def _by_version(recorded: Iterable[RawMessages]) -> dict[_Absent | None, list[RawMessages]]:
+    """Group messages by the fields of ours that they lack; None where they are of this version."""
+    versions: dict[_Absent | None, list[RawMessages]] = {}
     for raw in recorded:
         kind = _kind_of(raw)
-        versions.setdefault(_without(kind) if kind.growth else None, []).append(raw)
+        versions.setdefault(_absent(kind) if kind.growth else None, []).append(raw)
     return versions
 
 
@@ -104,21 +119,22 @@ def _kind_of(raw: RawMessages) -> MessageType:
     return message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
 
 
-def _without(kind: MessageType) -> _Without:
-    """Name the fields of ours that a file's definition does not have."""
+def _absent(kind: MessageType) -> _Absent:
+    """Return the fields of ours that a file's definition does not have."""
     missing = lacking(kind, fields_of(message_type(kind.name)))
-    absent = kind.growth[kind.name].absent if kind.name in kind.growth else ()
-    return frozenset([*(path.partition(".")[0] for path in missing), *(name for name, _ in absent)])
+    left_out = kind.growth[kind.name].absent if kind.name in kind.growth else ()
+    paths = [*missing, *(name for name, _ in left_out)]
+    return frozenset(path.partition(".")[0] for path in paths)
 
 
 def _recorded(
-    same: Iterable[RawMessages], without: _Without | None
+    same: Iterable[RawMessages], absent: _Absent | None
 ) -> Iterator[tuple[int, _Content]]:
-    """Yield log times, and what messages say."""
+    """Yield log times and contents of messages."""
     for raw in same:
         kind, times = _kind_of(raw), raw.log_times.tolist()
-        if without is not None:
-            contents = _contents(kind, without, raw.buffer, raw.offsets, raw.sizes)
+        if absent is not None:
+            contents = _contents(kind, absent, raw.buffer, raw.offsets, raw.sizes)
             yield from zip(times, contents, strict=True)
             continue
         for time, place, size in zip(times, raw.offsets.tolist(), raw.sizes.tolist(), strict=True):
@@ -126,26 +142,26 @@ def _recorded(
 
 
 def _replayed(
-    records: Sequence[EncodedMessage], typename: str, without: _Without | None
+    records: Sequence[EncodedMessage], typename: str, absent: _Absent | None
 ) -> Iterator[tuple[int, _Content]]:
-    """Yield log times, and what messages say, as `_recorded` does with messages of a version."""
+    """Yield log times and contents of messages, as `_recorded` does for messages of a version."""
     times = (record.log_time for record in records)
     payloads = [record.data for record in records]
-    if without is None or not payloads:
+    if absent is None or not payloads:
         return zip(times, payloads, strict=True)
     sizes = np.array([len(data) for data in payloads])
     buffer = np.frombuffer(b"".join(payloads), np.uint8)
     kind = message_type(typename)
-    contents = _contents(kind, without, buffer, np.cumsum(sizes) - sizes, sizes)
+    contents = _contents(kind, absent, buffer, np.cumsum(sizes) - sizes, sizes)
     return zip(times, contents, strict=True)
 
 
 def _contents(
-    kind: MessageType, without: _Without, buffer: Bytes, offsets: Int64, sizes: Int64
+    kind: MessageType, absent: _Absent, buffer: Bytes, offsets: Int64, sizes: Int64
 ) -> Iterator[_Content]:
-    """Yield what messages say in the fields of ours, except some."""
+    """Yield the fields of messages that we have, except those that are absent."""
     ours = fields_of(message_type(kind.name))
-    paths = [path for path in ours if path.partition(".")[0] not in without]
+    paths = [path for path in ours if path.partition(".")[0] not in absent]
     columns = decode_rows(kind, buffer, offsets, sizes, paths)
     return zip(*(map(_bits, columns[path]) for path in paths), strict=True)
 
@@ -157,7 +173,7 @@ def _bits(value: Any) -> bytes:
 
 
 def _count_same(recorded: Sequence[RawMessages], replayed: Mapping[int, bytes]) -> int:
-    """Count the replayed labels whose names are the recorded ones of their times."""
+    """Count the replayed labels whose class is the recorded one of the same time."""
     if not replayed:
         return 0
     sizes = np.array([len(data) for data in replayed.values()])

@@ -1,4 +1,4 @@
-"""What the log of a replay says of itself."""
+"""The description of the log of a replay."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,41 +15,41 @@ from hearthlog.schemas.messages.topics import topics_of
 
 
 def describe(
-    origin: RecorderInfo,
+    recorded: RecorderInfo,
     features: FeatureSet,
     model: Model | None,
     output: Path,
     replayed: Mapping[str, str],
 ) -> LogDescription:
-    """Say of a new log what the recorder said of the old one.
+    """Describe a new log as the recorder described the old one.
 
     Parameters
     ----------
-    origin : RecorderInfo
-        Of the old one.
+    recorded : RecorderInfo
+        From the old log.
     features : FeatureSet
     model : Model or None
-        Which gives the labels now.
+        That labels the new log.
     output : Path
-        Folder of the new one.
+        Folder of the new log.
     replayed : mapping of str to str
-        What the `hearthlog` record says besides.
+        Further entries of the `hearthlog` record.
     """
-    if model is not None and model.sha256 == origin.model_sha256:
-        model = replace(model, name=origin.model)  # whatever its file is called here
+    if model is not None and model.sha256 == recorded.model_sha256:
+        model = replace(model, name=recorded.model)  # whatever its file is called here
     classes = None if model is None else list(model.classes)
-    info = stream_info(origin.microphone, origin.device, features, model)
-    attachments = [item for item in origin.attachments if item.name not in {CARD, DESCRIPTION}]
+    info = stream_info(recorded.microphone, recorded.device, features, model)
+    attachments = [item for item in recorded.attachments if item.name not in {CARD, DESCRIPTION}]
     if model is not None:
         attachments += model_attachments(model)
     return LogDescription(
         root=output,
-        node=origin.node,
-        topics=topics_of(origin.microphone, features.feature_names, classes),
+        node=recorded.node,
+        topics=topics_of(recorded.microphone, features.feature_names, classes),
         infos=[info],
         metadata={
-            **origin.metadata,
-            **provenance(origin.node),
+            **recorded.metadata,
+            **provenance(recorded.node),
             "feature_set": features.name,
             "feature_set_version": str(features.version),
             "model": info.model,

@@ -1,4 +1,4 @@
-"""What a recorder heard and how it was, read back from its log as what its pipeline was given."""
+"""The events that a recorder's pipeline was given, read back from its log."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ _FIELDS = {
     message_types.LABEL: ("label",),
     message_types.SEGMENT: ("label",),
 }
-_LARGEST_VALUE = 1e30  # of a feature: what statistics and their squares can be made of
+_LARGEST_VALUE = 1e30  # of a feature: its statistics are still finite
 _LARGEST_FRAME = 1 << 62
 _PLACE_BITS = 40
 
@@ -35,7 +35,16 @@ _RawByType = dict[str, list[RawMessages]]
 
 
 class Features(NamedTuple):
-    """Features of successive frames, as `Pipeline.push_features` takes them."""
+    """Features of successive frames, as `Pipeline.push_features` takes them.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    values : np.ndarray [shape=(n, d)], float32
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    """
 
     first: int
     values: Float32
@@ -43,14 +52,14 @@ class Features(NamedTuple):
 
 
 class RecordedBatch(NamedTuple):
-    """A span of time of a log.
+    """The messages of one span of time of a log.
 
     Attributes
     ----------
     events : list of Features, Gap or SourceHealth
         In the order in which they were written.
     labels, segments : list of RawMessages
-        What the recorder made of them.
+        Recorded ones.
     """
 
     events: list[Features | Gap | SourceHealth]
@@ -59,18 +68,18 @@ class RecordedBatch(NamedTuple):
 
 
 def read_recorded(
-    origin: RecorderInfo, start: int, end: int, *, sound_only: bool = False
+    info: RecorderInfo, start: int, end: int, *, sound_only: bool = False
 ) -> Iterator[RecordedBatch]:
-    """Read a log piece by piece.
+    """Read a log, one span of time after the other.
 
     Parameters
     ----------
-    origin : RecorderInfo
+    info : RecorderInfo
         Of the log.
     start, end : int
         Log times, in nanoseconds: from `start` on, before `end`.
     sound_only : bool
-        Read features and gaps and nothing else, and compare the checksums of what is read.
+        Read only features and gaps, and compare the checksums of what is read.
 
     Raises
     ------
@@ -78,47 +87,48 @@ def read_recorded(
         If the log is damaged, or its messages are not those of a recorder, or its feature set is
         not installed.
     """
-    width = features_of(origin).width
+    width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
-    topics = {topic(origin.microphone, kind): type_ for kind, type_ in kinds.items()}
+    topics = {topic(info.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not sound_only:
         topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
-    for batch in iterate_messages([origin.path], topics, start, end, check=sound_only):
-        found: _RawByType = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
+    for batch in iterate_messages([info.path], topics, start, end, check=sound_only):
+        by_type: _RawByType = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]
             if is_compatible(raw.channel, raw.schema, type_, _FIELDS[type_]):
-                found[type_].append(raw)
+                by_type[type_].append(raw)
         buffers = list(dict.fromkeys(id(raw.buffer) for raw in batch))
         try:
-            events = _events(found, origin.microphone, width, buffers)
+            events = _events(by_type, info.microphone, width, buffers)
         except LogError as error:
-            raise LogError(f"{origin.path}: {error}") from error
-        yield RecordedBatch(events, found[message_types.LABEL], found[message_types.SEGMENT])
+            raise LogError(f"{info.path}: {error}") from error
+        yield RecordedBatch(events, by_type[message_types.LABEL], by_type[message_types.SEGMENT])
 
 
 def _events(
-    found: _RawByType, microphone: str, width: int, buffers: Sequence[int]
+    by_type: _RawByType, microphone: str, width: int, buffers: Sequence[int]
 ) -> list[Features | Gap | SourceHealth]:
-    """Put features, gaps and states into the order in which they were written."""
-    heard = [_features(raw, width) for raw in found[message_types.FEATURES]]
+    """Return features, gaps and health in the order in which they were written."""
+    features = [_features(raw, width) for raw in by_type[message_types.FEATURES]]
     others: list[Gap | SourceHealth | None] = [
-        gap for raw in found[message_types.GAP] for gap in _gaps(raw)
+        gap for raw in by_type[message_types.GAP] for gap in _gaps(raw)
     ]
-    others += [
-        state for raw in found[message_types.DIAGNOSTICS] for state in _health(raw, microphone)
+    for raw in by_type[message_types.DIAGNOSTICS]:
+        others += _health(raw, microphone)
+    raws = [
+        *by_type[message_types.FEATURES],
+        *by_type[message_types.GAP],
+        *by_type[message_types.DIAGNOSTICS],
     ]
-    raws = (
-        found[message_types.FEATURES] + found[message_types.GAP] + found[message_types.DIAGNOSTICS]
-    )
     if not raws:
         return []
     times = np.concatenate([raw.log_times for raw in raws])
     places = [raw.offsets + (buffers.index(id(raw.buffer)) << _PLACE_BITS) for raw in raws]
     order = np.lexsort((np.concatenate(places), times))
     frames = {
-        path: np.concatenate([fields[path] for fields in heard])
-        for path in (heard[0] if heard else ())
+        path: np.concatenate([fields[path] for fields in features])
+        for path in (features[0] if features else ())
     }
     count = len(times) - len(others)
     events: list[Features | Gap | SourceHealth] = []
@@ -163,7 +173,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
 
 
 def _health(raw: RawMessages, microphone: str) -> list[SourceHealth | None]:
-    """Read the states of the source; None for messages about something else."""
+    """Read the health of the source; None for messages about something else."""
     (columns,) = decode([raw], _FIELDS[message_types.DIAGNOSTICS])
     name = f"hearthlog: {microphone}"
     return [

@@ -21,8 +21,8 @@ from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-    from hearthlog.analyzer.replay.player import Replay, ReplayOptions
-    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.analyzer.replay.options import Replay, ReplayOptions
+    from hearthlog.analyzer.replay.log_set import LogSet
     from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
@@ -75,8 +75,8 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from hearthlog.analyzer.replay.player import ReplayOptions
-    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.analyzer.replay.options import ReplayOptions
+    from hearthlog.analyzer.replay.log_set import LogSet
     from hearthlog.schemas.logs.files import find_logs
 
     _check_span(start_offset, playback_duration)
@@ -132,29 +132,29 @@ class _Models:
         self.are_recorded = True
         self.are_lacking = False
 
-    def __call__(self, origin: "RecorderInfo") -> "Model | None":
+    def __call__(self, info: "RecorderInfo") -> "Model | None":
         """Return the model for what a recorder wrote."""
         from hearthlog.analyzer.replay.replay import find_model
 
         if self._given is not None:
             return self._given
-        key = origin.model, origin.model_sha256
+        key = info.model, info.model_sha256
         if key not in self._models:
-            self._models[key] = find_model(*key, self._folders) if origin.model_sha256 else None
+            self._models[key] = find_model(*key, self._folders) if info.model_sha256 else None
         return self._models[key]
 
-    def report(self, origins: Sequence["RecorderInfo"]) -> None:
+    def report(self, infos: Sequence["RecorderInfo"]) -> None:
         """Say where the model is not the recorded one."""
-        for origin in {(o.model, o.model_sha256): o for o in origins}.values():
-            model = self(origin)
+        for info in {(o.model, o.model_sha256): o for o in infos}.values():
+            model = self(info)
             digest = "" if model is None else model.sha256
-            if digest == origin.model_sha256:
+            if digest == info.model_sha256:
                 continue
             self.are_recorded = False
             recorded = "recorded without a model"
-            if origin.model_sha256:
-                short = origin.model_sha256[:12]
-                recorded = f"recorded with model {origin.model!r} (sha256 {short})"
+            if info.model_sha256:
+                short = info.model_sha256[:12]
+                recorded = f"recorded with model {info.model!r} (sha256 {short})"
             if model is None:
                 self.are_lacking = True
                 what = "which was not found; no labels: give it, or another, with --model"

@@ -1,0 +1,98 @@
+"""The logs of a replay."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_info
+from hearthlog.analyzer.replay.options import ReplayOptions
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.merged_reading import time_spans
+from hearthlog.schemas.times import NANOSECONDS
+
+_NEVER = (1 << 63) - 1
+
+
+class LogSet:
+    """Logs of one microphone, in the order of their first messages.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Layers and empty logs among them are left out.
+    kind : str
+        What is replayed: "features", or "audio" for clips.
+
+    Attributes
+    ----------
+    first, last : int
+        Log times of the first and the last message, in nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        If they hold no message, or one is damaged.
+    """
+
+    def __init__(self, paths: Sequence[Path], kind: str) -> None:
+        spans = time_spans(paths)
+        if not spans:
+            raise LogError(f"{paths[0]}: no messages, nothing to replay")
+        self.kind = kind
+        self.first, self.last = spans[0][0], max(last for _, last, _ in spans)
+        self._spans = spans
+        self._infos: dict[Path, RecorderInfo | None] = {}
+
+    def span(self, options: ReplayOptions) -> tuple[int, int]:
+        """Return the log times at which the replay starts and before which it ends."""
+        start = self.first + round(options.start_offset * NANOSECONDS)
+        if options.duration is None:
+            return start, _NEVER
+        return start, min(start + round(options.duration * NANOSECONDS), _NEVER)
+
+    def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
+        """Return the logs to replay, at least one.
+
+        Raises
+        ------
+        LogError
+            If there is none, and as `between`.
+        """
+        infos = self.between(*self.span(options))
+        if not infos:
+            raise self.nothing()
+        return infos
+
+    def nothing(self) -> LogError:
+        """Make the error that says that there is nothing to replay."""
+        what = "clips" if self.kind == "audio" else "features"
+        seconds = (self.last - self.first) / NANOSECONDS
+        return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
+
+    def between(self, start: int, end: int) -> list[RecorderInfo]:
+        """Return the logs that have messages with start <= log time < end.
+
+        Raises
+        ------
+        LogError
+            If they are of several microphones or nodes, or one is damaged or there twice.
+        """
+        infos = []
+        for first, last, path in self._spans:
+            if first < end and last >= start:
+                if path not in self._infos:
+                    self._infos[path] = read_recorder_info(path, self.kind)
+                if (info := self._infos[path]) is not None:
+                    infos.append(info)
+        names = sorted({f"{info.node}/{info.microphone}" for info in infos})
+        if len(names) > 1:
+            raise LogError(
+                f"{infos[0].path} and others are of several microphones ({', '.join(names)}); "
+                "replay the logs of one at a time"
+            )
+        by_frame: dict[tuple[int, int], RecorderInfo] = {}
+        for info in infos:
+            if info.first_frame is not None:
+                same = by_frame.setdefault(info.first_frame, info)
+                if same is not info:
+                    raise LogError(f"{same.path} and {info.path} hold the same; leave out one")
+        return infos

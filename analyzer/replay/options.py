@@ -1,0 +1,80 @@
+"""How logs are replayed, and what came of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+from hearthlog.analyzer.replay.comparison import ReplayComparison
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.frames import FRAME_SECONDS
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How logs are replayed.
+
+    Attributes
+    ----------
+    kind : str
+        What is replayed: "features", or "audio" for clips.
+    model : callable
+        Returns the model for the sound of a recorder; None for no labels.
+    output : Path or None
+        A folder for the new log; None for no log.
+    start_offset : float
+        Seconds from the first message.
+    duration : float or None
+        Seconds; None for all.
+    rate : float or None
+        Multiple of real time; None for as fast as possible.
+    loop : bool
+        Begin anew at the end, until stopped.
+    """
+
+    kind: str = "features"
+    model: Callable[[RecorderInfo], Model | None] = lambda _: None
+    output: Path | None = None
+    start_offset: float = 0.0
+    duration: float | None = None
+    rate: float | None = None
+    loop: bool = False
+
+
+@dataclass
+class Replay:
+    """What came of a replay.
+
+    Attributes
+    ----------
+    sources : list of Path
+        Logs that were replayed.
+    logs : list of Path
+        Logs that were written.
+    frames, labels, segments, gaps : int
+    compared : ReplayComparison
+        With the recorded labels and segments.
+    missing : list of int
+        Times (nanoseconds of UTC) before which the logs lack sound that was recorded: the labels
+        of the first second there, and the open segment, cannot be as recorded.
+    unfinished : list of Path
+        Logs that end in the middle, and were replayed up to there.
+    interrupted : bool
+        Whether it was stopped before the end.
+    """
+
+    sources: list[Path]
+    logs: list[Path] = field(default_factory=list)
+    frames: int = 0
+    labels: int = 0
+    segments: int = 0
+    gaps: int = 0
+    compared: ReplayComparison = field(default_factory=ReplayComparison)
+    missing: list[int] = field(default_factory=list)
+    unfinished: list[Path] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of sound that were replayed."""
+        return self.frames * FRAME_SECONDS
