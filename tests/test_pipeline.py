@@ -6,9 +6,9 @@ import pytest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder import rosout as lines
+from hearthlog.recorder import rosout
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.pipeline import Pipeline, opening
+from hearthlog.recorder.pipeline import Pipeline, opening_messages
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import (
@@ -117,7 +117,7 @@ def test_the_first_line_names_the_device_and_the_model():
         model_sha256="0123456789abcdef" * 4,
         labels=["speech", "silence"],
     )
-    records = opening(info)
+    records = opening_messages(info)
     assert [record.topic for record in records] == ["/mic/info", "/rosout"]
     assert decode(records[0].data, STREAM_INFO).device == "Küche"
     ((time, line),) = said(records)
@@ -127,5 +127,5 @@ def test_the_first_line_names_the_device_and_the_model():
 
 def test_the_clock_that_was_set_back_is_a_gap_of_less_than_nothing():
     gap = Gap(START, START - 3 * 10**9, "the clock was set by -3.000 s", 0)
-    line = decode(lines.of_gap("mic", gap), LOG)
+    line = decode(rosout.gap_line("mic", gap), LOG)
     assert line.msg == "gap of -3.00 s: the clock was set by -3.000 s"
