@@ -21,8 +21,8 @@ from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-    from hearthlog.analyzer.replay.options import Replay, ReplayOptions
     from hearthlog.analyzer.replay.log_set import LogSet
+    from hearthlog.analyzer.replay.options import Replay, ReplayOptions
     from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
@@ -75,8 +75,8 @@ def replay(
     SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
     unfinished, sound before or between the logs is missing, or labels were not to be had.
     """
-    from hearthlog.analyzer.replay.options import ReplayOptions
     from hearthlog.analyzer.replay.log_set import LogSet
+    from hearthlog.analyzer.replay.options import ReplayOptions
     from hearthlog.schemas.logs.files import find_logs
 
     _check_span(start_offset, playback_duration)

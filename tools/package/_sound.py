@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.relabel.stream import Stream
-from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set as installed
+from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile import modelfile
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import convert_sound
@@ -155,13 +154,12 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
     """
     classifier = Classifier(model)
     features = extract_features(sound, rate, classifier.feature_set.name, start)
-    stream = Stream(classifier)
-    labels = stream.push(Features(0, features.values, features.times))
-    stream.close()
-    assert labels is not None
+    labeller = Labeller(classifier)
+    labels, segments = labeller.push(features.values, 0, features.times)
+    segments += labeller.close(int(features.times[-1]) + FRAME_NANOSECONDS)
     names = np.array(labels.classes, object)
     starts, ends, states = (
-        np.array([getattr(segment, name) for segment in stream.segments], np.int64)
+        np.array([getattr(segment, name) for segment in segments], np.int64)
         for name in ("start", "end", "label")
     )
     return Labels(
