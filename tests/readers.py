@@ -20,7 +20,7 @@ from rosbags import rosbag1, rosbag2
 from spliced import Result
 
 from hearthlog.analyzer.marks.marks import read_marks
-from hearthlog.analyzer.review.timeline.live import Live
+from hearthlog.analyzer.review.timeline.live import LiveTimeline
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
@@ -170,7 +170,7 @@ def by_timeline(_: Run) -> Any:
 
 
 def by_watching(_: Run) -> Any:
-    live = Live(UTC)
+    live = LiveTimeline(UTC)
     logs = [path for path in find_logs(Path("logs")) if not is_layer(path)]
     return [
         plain(news)
