@@ -12,9 +12,9 @@ from hearthlog._version import __version__
 if TYPE_CHECKING:
     from hearthlog._logs import Columns, Labelling, Logs, Mark, follow, open_logs
     from hearthlog._sound import (
-        Labels,
         Model,
         SoundFeatures,
+        SoundLabels,
         classify,
         extract_features,
         load_model,
@@ -28,11 +28,11 @@ __all__ = [
     "Comparison",
     "HearthlogError",
     "Labelling",
-    "Labels",
     "Logs",
     "Mark",
     "Model",
     "SoundFeatures",
+    "SoundLabels",
     "__version__",
     "classify",
     "compare",

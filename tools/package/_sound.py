@@ -18,9 +18,9 @@ from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 __all__ = [
-    "Labels",
     "Model",
     "SoundFeatures",
+    "SoundLabels",
     "classify",
     "extract_features",
     "load_model",
@@ -46,7 +46,7 @@ class SoundFeatures(NamedTuple):
     values: Float32
 
 
-class Labels(NamedTuple):
+class SoundLabels(NamedTuple):
     """Labels of sound, one a frame of 50 ms, from the end of the first whole window on.
 
     Attributes
@@ -120,7 +120,7 @@ def extract_features(
     return SoundFeatures(described.feature_names, described.units, times, values)
 
 
-def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> Labels:
+def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0) -> SoundLabels:
     """Label sound, to the bits that a recorder would log with this model.
 
     Parameters
@@ -131,7 +131,7 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
 
     Returns
     -------
-    Labels
+    SoundLabels
         Empty if the sound is shorter than the window of the model's feature set.
 
     Raises
@@ -162,7 +162,7 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
         np.array([getattr(segment, name) for segment in segments], np.int64)
         for name in ("start", "end", "label")
     )
-    return Labels(
+    return SoundLabels(
         labels.classes,
         labels.stamps,
         names[labels.probabilities.argmax(axis=1)],
