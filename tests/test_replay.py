@@ -518,12 +518,17 @@ def test_a_part_of_clips_is_as_in_the_whole(real_frames, model_file, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "rate", "channels"), [("mp3", 16_000, 1), ("pcm-s16", 5, 1), ("pcm-s16", 16_000, 300)]
+    ("kind", "rate", "channels", "words"),
+    [
+        ("mp3", 16_000, 1, "its format is 'mp3', not 'pcm-s16'"),
+        ("pcm-s16", 5, 1, "5 samples a second"),
+        ("pcm-s16", 16_000, 300, "300 channels"),
+    ],
 )
-def test_clips_of_another_format_are_refused(tmp_path, kind, rate, channels):
+def test_clips_of_another_format_are_refused(tmp_path, kind, rate, channels, words):
     sound = np.zeros((1000, channels), np.int16)
     log = write_clips(tmp_path / "clips.mcap", [(START, sound)], rate, kind)
-    with pytest.raises(LogError, match="only pcm-s16 can be replayed"):
+    with pytest.raises(LogError, match=rf"a clip cannot be read \({words}\)"):
         replay(log, kind="audio")
 
 

@@ -9,7 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
-from hearthlog.analyzer.export import audacity, wav
+from hearthlog.analyzer.export import audacity
 from hearthlog.analyzer.export.audacity import LabelTrack
 from hearthlog.analyzer.export.csvfile import CsvFile
 from hearthlog.analyzer.export.file_names import file_stem, unused_name
@@ -18,6 +18,7 @@ from hearthlog.analyzer.export.parquet import ParquetFile
 from hearthlog.analyzer.export.rosbag1 import save_rosbag1
 from hearthlog.analyzer.export.rosbag2 import save_rosbag2
 from hearthlog.analyzer.export.wav import WavFiles
+from hearthlog.analyzer.logs.clips import CLIP_FIELDS
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all, is_compatible
 from hearthlog.schemas.errors import LogError
@@ -48,7 +49,7 @@ ONE_TOPIC = {
 }
 _TYPES = {
     ExportFormat.txt: (message_types.SEGMENT, audacity.FIELDS),
-    ExportFormat.wav: (message_types.RAW_AUDIO, wav.FIELDS),
+    ExportFormat.wav: (message_types.RAW_AUDIO, CLIP_FIELDS),
 }
 
 

@@ -1,114 +1,66 @@
-"""Clips of sound in a log, as frames and the gaps between them."""
+"""Clips of sound in a log."""
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import soxr
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
 
 CLIP_FIELDS = ("timestamp", "data", "format", "sample_rate", "number_of_channels")
+SAMPLE_BYTES = 2
 _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)
-_RATES = range(1_000, 768_001)
-_MOST_CHANNELS = 256
-_JOINED = 10_000_000  # nanoseconds between clips that still follow each other
-_REASON = "no clip holds it"
+_RATES = range(1_000, 1_000_001)
+_CHANNELS = range(1, 257)
 
 
-class ClipFramer:
-    """Cuts clips into frames: those that follow each other as one sound.
+class Clip(NamedTuple):
+    """One message of type `RawAudio`: sound from `start` on (ns of UTC), as 16-bit samples."""
 
-    After a hole the next frame begins with the first sample of a clip. What fills no frame before
-    a hole is not heard.
+    start: int
+    rate: int
+    channels: int
+    data: bytes
+
+    @property
+    def end(self) -> int:
+        """When it ends, in nanoseconds of UTC."""
+        samples = len(self.data) // (SAMPLE_BYTES * self.channels)
+        return self.start + samples * NANOSECONDS // self.rate
+
+
+def clips_of(columns: Columns) -> Iterator[Clip]:
+    """Yield the clips of messages.
+
+    Raises
+    ------
+    LogError
+        If one is of another format, or cannot be.
     """
-
-    def __init__(self) -> None:
-        self._next_frame = 0
-        self._end: int | None = None  # of the last frame, in UTC
-        self._rate = 0  # of the clips that follow each other; 0: none was heard yet
-        self._heard = 0  # samples of theirs
-        self._held = np.empty(0, np.float32)
-        self._cut = 0  # frames that were cut from them
-        self._resampler: soxr.ResampleStream | None = None
-        # Where clips begin, in nanoseconds of their sound, and how much later that is in UTC.
-        self._starts: list[int] = []
-        self._offsets: list[int] = []
-
-    def add(self, start: int, rate: int, samples: Float32) -> Iterator[Frames | Gap]:
-        """Take a clip, and hand on the frames that it completes and the gap before them.
-
-        Parameters
-        ----------
-        start : int
-            Time of its first sample, in nanoseconds of UTC.
-        rate : int
-            Samples per second.
-        samples : np.ndarray [shape=(n,)], float32
-        """
-        if rate != self._rate or abs(start - self._expected()) > _JOINED:
-            yield from self.finish()
-            self._rate, self._heard, self._cut = rate, 0, 0
-            self._starts, self._offsets = [], []
-            if rate != SAMPLE_RATE:
-                self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
-        position = self._position()
-        self._starts.append(position)
-        self._offsets.append(start - position)
-        self._heard += len(samples)
-        if self._resampler is not None:
-            samples = self._resampler.resample_chunk(samples)
-        yield from self._frames(samples)
-
-    def finish(self) -> Iterator[Frames | Gap]:
-        """Hand on what is left of the clips that follow each other."""
-        if self._resampler is not None:
-            rest = self._resampler.resample_chunk(np.empty(0, np.float32), last=True)
-            yield from self._frames(rest)
-        self._resampler = None
-        self._held = np.empty(0, np.float32)
-
-    def _position(self) -> int:
-        """Return how long the clips that follow each other last so far, in nanoseconds."""
-        return self._heard * NANOSECONDS // self._rate
-
-    def _expected(self) -> int:
-        return self._position() + self._offsets[-1]
-
-    def _frames(self, samples: Float32) -> Iterator[Frames | Gap]:
-        self._held = np.concatenate([self._held, samples])
-        count = len(self._held) // FRAME_SAMPLES
-        if not count:
-            return
-        frames, self._held = np.split(self._held, [count * FRAME_SAMPLES])
-        stamps = self._stamps(count)
-        if self._cut == 0 and self._end is not None:
-            start, end = self._end, int(stamps[0])
-            lost = max(round((end - start) / FRAME_NANOSECONDS), 1)
-            self._next_frame += lost
-            yield Gap(start, end, _REASON, lost)
-        yield Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
-        self._next_frame += count
-        self._cut += count
-        self._end = int(stamps[-1]) + FRAME_NANOSECONDS
-
-    def _stamps(self, count: int) -> NDArray[np.int64]:
-        """Return when the next frames start: each by the clip that it starts in."""
-        positions = (self._cut + np.arange(count)) * FRAME_NANOSECONDS
-        clips = np.searchsorted(self._starts, positions, side="right") - 1
-        stamps = positions + np.array(self._offsets)[clips]
-        self._starts, self._offsets = self._starts[clips[-1] :], self._offsets[clips[-1] :]
-        return stamps
+    fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
+    for start, data, form, rate, channels in zip(
+        columns["timestamp"].tolist(), columns["data"], *fields, strict=True
+    ):
+        problem = ""
+        if form != _FORMAT:
+            problem = f"its format is {form!r}, not {_FORMAT!r}"
+        elif rate not in _RATES:
+            problem = f"{rate} samples a second"
+        elif channels not in _CHANNELS:
+            problem = f"{channels} channels"
+        elif len(data) % (channels * SAMPLE_BYTES):
+            problem = f"{len(data)} bytes are no whole samples of {channels} channels"
+        if problem:
+            raise LogError(f"{columns.topic}: a clip cannot be read ({problem})")
+        yield Clip(start, rate, channels, bytes(data))
 
 
 def read_clips(
@@ -136,18 +88,13 @@ def read_clips(
                 kind = "no messages of ROS 2" if raw.schema is None else raw.schema.name
                 raise LogError(f"{path}: {name}: holds {kind}, not clips")
         for columns in decode(batch, CLIP_FIELDS):
-            for row in range(len(columns)):
-                yield _clip(columns, row, f"{path}: {name}")
+            try:
+                for clip in clips_of(columns):
+                    yield clip.start, clip.rate, _mono(clip)
+            except LogError as error:
+                raise LogError(f"{path}: {error}") from error
 
 
-def _clip(columns: Columns, row: int, where: str) -> tuple[int, int, Float32]:
-    start, rate = int(columns["timestamp"][row]), int(columns["sample_rate"][row])
-    kind, channels = columns["format"][row], int(columns["number_of_channels"][row])
-    if kind != _FORMAT or rate not in _RATES or not 1 <= channels <= _MOST_CHANNELS:
-        about = f"{kind!r}, {rate} Hz, {channels} channels"
-        raise LogError(f"{where}: a clip is of {about}; only {_FORMAT} can be replayed")
-    data = np.asarray(columns["data"][row], np.uint8).tobytes()
-    if len(data) % (2 * channels):
-        raise LogError(f"{where}: a clip ends in the middle of a sample")
-    samples = np.frombuffer(data, "<i2").astype(np.float32) / _FULL_SCALE
-    return start, rate, samples if channels == 1 else samples.reshape(-1, channels).mean(axis=1)
+def _mono(clip: Clip) -> Float32:
+    samples = np.frombuffer(clip.data, "<i2").astype(np.float32) / _FULL_SCALE
+    return samples if clip.channels == 1 else samples.reshape(-1, clip.channels).mean(axis=1)
