@@ -6,8 +6,9 @@ from threading import Event as Flag
 
 import numpy as np
 
-from hearthlog.analyzer.logs.clips import ClipFramer, read_clips
+from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+from hearthlog.analyzer.replay.clip_frames import ClipFramer
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import Replay, ReplayOptions
 from hearthlog.analyzer.replay.player import Player
