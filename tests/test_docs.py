@@ -1,0 +1,315 @@
+"""The documents agree with the command line, with the files, and with each other."""
+
+import ast
+import importlib
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from spliced import run
+
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.cli.main import app
+from hearthlog.tools.home.simulate import write_day, write_training_set
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    path
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/*.md")]
+    if not path.is_symlink()
+)
+TEXT = "\n".join(path.read_text("utf-8") for path in PAGES)
+CODE = re.compile(r"^(?P<fence>```)(?P<language>\w*)\n(?P<fenced>.*?)^```|`(?P<inline>[^`\n]+)`|"
+                  r"^ {4}(?P<indented>\S[^\n]*)$", re.DOTALL | re.MULTILINE)  # fmt: skip
+# Options of dask, rerun, mcap and systemd that pages name alone.
+FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--nthreads"} | {
+    "--memory-limit"
+}
+# What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
+# a second program, or sound of many collections.
+NOT_HERE = re.compile(
+    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch|.* s3://|.* --web|.*tcp:"
+    r"|.* --microphone USB| evaluate adaptation|.* --folds collection| demo)|hearthlog review(?!.* --save)"
+    r"|.*octaves|.*--config|.*--queue spans.csv$"
+)
+
+
+def commands(command, name=()):
+    """Every verb, by its words, and the command itself."""
+    yield name, command
+    for word, verb in getattr(command, "commands", {}).items():
+        yield from commands(verb, (*name, word))
+
+
+VERBS = dict(commands(typer.main.get_command(app)))
+LEAVES = {name: verb for name, verb in VERBS.items() if not hasattr(verb, "commands")}
+
+
+def options_of(verb):
+    """The long options of a verb, without those that are hidden, and --help."""
+    shown = [one for one in verb.params if not getattr(one, "hidden", False)]
+    names = {name for one in shown for name in one.opts if name.startswith("--")}
+    return names - {"--help"}
+
+
+OPTIONS = {name for verb in VERBS.values() for name in options_of(verb)} | {"--help"}
+
+
+def snippets(text):
+    """What a page has in code: whole lines of blocks, and words within sentences."""
+    for match in CODE.finditer(text):
+        if match["fenced"] is not None:
+            if match["language"] not in {"python", "xml", "toml", "sql"}:
+                yield from match["fenced"].splitlines()
+        else:
+            yield match["inline"] or match["indented"]
+
+
+def shown_commands(text):
+    """The commands of hearthlog in the code blocks of a page."""
+    for match in CODE.finditer(text):
+        for line in (match["fenced"] or match["indented"] or "").splitlines():
+            command = re.split(r"\s{2,}| # | > | \| (?=\w)", line.strip())[0]
+            if re.match(r"(\w+=\S+ )*(\.venv/bin/)?hearthlog ", line):
+                yield re.sub(r"^(\w+=('[^']*'|\S+) )*(\.venv/bin/)?", "", command)
+
+
+SHOWN = sorted({line for path in PAGES for line in shown_commands(path.read_text("utf-8"))})
+
+
+def unknown_options(text):
+    """Options that pages name and no verb has."""
+    ours = [code for code in snippets(text) if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
+    named = {name for code in ours for name in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code)}
+    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt"}
+    foreign = {
+        name
+        for code in ours
+        if code.split()[0] in others
+        for name in re.findall(r"--[a-z][a-z-]*", code)
+    }
+    return named - foreign - OPTIONS - FOREIGN
+
+
+def unknown_verbs(text):
+    """Verbs behind `hearthlog` that there are none of."""
+    unknown = set()
+    for code in snippets(text):
+        for words in re.findall(r"\bhearthlog ((?:[a-z-]+ ?)+)", code):
+            group, *rest = words.split()
+            if group.startswith("-"):
+                continue
+            if (group,) not in VERBS:
+                unknown.add(group)
+            elif (group,) not in LEAVES and rest and (group, rest[0]) not in VERBS:
+                unknown.add(f"{group} {rest[0]}")
+    return unknown
+
+
+def unknown_targets(text):
+    """Targets of make that pages name and the Makefile does not have."""
+    targets = re.findall(r"^([\w.-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+    named = {name for code in snippets(text) for name in re.findall(r"^make ([\w.-]+)", code)}
+    return named - set(targets)
+
+
+def anchors(path):
+    """The places of a page that links lead to."""
+    titles = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def broken_links(path, text):
+    """Links of a page to files and titles that are not there."""
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(CODE, "", text)):
+        name, _, anchor = target.partition("#")
+        if "://" in target:
+            continue
+        file = (path.parent / name).resolve() if name else path
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    return broken
+
+
+def missing_paths(text):
+    """Files, folders, modules and names of ours that pages speak of and that are not there."""
+    folders = r"(?:analyzer|models|recorder|schemas|tools|tests|docs|examples)/[\w./*-]*"
+    missing = [
+        path
+        for path in re.findall(rf"`({folders})`", text)
+        if re.search(r"[a-z_]{2,}/|\.\w+$", path) and not list(ROOT.glob(path.rstrip("/")))
+        if not path.endswith((".safetensors", ".mcap"))
+    ]
+    outside = re.sub(r"^```toml\n.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    names = set(re.findall(r"\bhearthlog(?:\.[a-z_]\w*)+(?:\.[A-Z]\w*)?", outside))
+    return missing + [name for name in sorted(names) if not is_importable(name)]
+
+
+def is_importable(name):
+    """Whether a dotted name is a module, or something in one."""
+    module, *rest = [name]
+    while module.count(".") >= 0:
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError:
+            module, _, last = module.rpartition(".")
+            rest.insert(0, last)
+            if not module:
+                return False
+            continue
+        for part in rest:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("verb", LEAVES, ids=" ".join)
+def test_a_verb_and_its_options_are_documented(verb):
+    assert f"hearthlog {' '.join(verb)}" in TEXT
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", TEXT))
+    assert options_of(LEAVES[verb]) - named == set()
+
+
+def test_the_options_of_the_command_itself_are_documented():
+    assert options_of(VERBS[()]) == {
+        "--version",
+        "--debug",
+        "--install-completion",
+        "--show-completion",
+    }
+    for name in options_of(VERBS[()]):
+        assert name in TEXT
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_a_page_speaks_of_what_there_is(path):
+    text = path.read_text("utf-8")
+    history = path.name == "CHANGELOG.md"  # which names what was
+    assert (unknown_verbs(text) | unknown_options(text)) == set() or history
+    assert unknown_targets(text) == set()
+    assert broken_links(path, text) == []
+    assert missing_paths(text) == []
+
+
+def test_what_is_wrong_in_a_page_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# A title\n")
+    assert unknown_verbs("`hearthlog sing`, `hearthlog evaluate song`") == {"sing", "evaluate song"}
+    assert unknown_options("    hearthlog info logs --louder\n\n`--softer`") == {
+        "--louder",
+        "--softer",
+    }
+    assert unknown_targets("    make tea\n\n`make check`") == {"tea"}
+    text = "[a](page.md#a-title) [b](page.md#b-title) [c](gone.md) [d](https://example.org)"
+    assert broken_links(page, text) == ["page.md#b-title", "gone.md"]
+    text = "`schemas/gone.py` `docs/log.md` `hearthlog.schemas.times` `hearthlog.schemas.gone.f`"
+    assert missing_paths(text) == ["schemas/gone.py", "hearthlog.schemas.gone.f"]
+
+
+@pytest.mark.parametrize("command", SHOWN)
+def test_a_command_that_is_shown_can_be_parsed(command):
+    words = shlex.split(command.replace("…", "logs"))[1:]
+    verb, name = VERBS[()], ()
+    while (*name, *words[:1]) in VERBS and words:
+        name, words = (*name, words[0]), words[1:]
+        verb = VERBS[name]
+    assert name in LEAVES or words[0].startswith("--")
+    verb.make_context("hearthlog", words)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_what_an_example_imports_is_there(path):
+    for match in CODE.finditer(path.read_text("utf-8")):
+        if match["language"] != "python":
+            continue
+        for node in ast.parse(match["fenced"]).body:
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("hearthlog"):
+                module = importlib.import_module(node.module)
+                assert all(hasattr(module, one.name) for one in node.names)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """A folder that has what the documents name: sounds, models, logs, layers, label files."""
+    folder = tmp_path_factory.mktemp("documented")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        make_home(folder)
+    return folder
+
+
+def make_home(folder):
+    write_training_set(folder / "clips", clips_per_class=5, seed=1)
+    rows = (folder / "clips" / "manifest.csv").read_text()
+    (folder / "clips" / "test.csv").write_text(rows)
+    head, *lines = rows.splitlines()
+    (folder / "MANIFEST.csv").write_text(
+        "\n".join([head, *(f"clips/{line}" for line in lines)]) + "\n"
+    )
+    do("train --data clips --scenario general -o general.safetensors")
+    write_day(folder / "day.flac", minutes=2, seed=2)
+    cough = next((folder / "clips" / "coughing").iterdir())
+    for name in ("cough.flac", "cough.wav", "a.wav", "b.flac"):
+        do_copy(cough, folder / name)
+    (folder / "models").mkdir()
+    for name in ("general-1", "general-2", "new", "home"):
+        shutil.copy("general.safetensors", f"{name}.safetensors")
+        shutil.copy("general.safetensors", f"models/{name}.safetensors")
+    do("models promote general-1")
+    do("models promote general-2")
+    do("models promote general-1 --to candidate")
+    do("record day.flac --model general.safetensors --start 2026-03-01T06:59 -o logs")
+    for model in ("general-2", "new"):
+        do(f"relabel logs --model {model}.safetensors")
+    (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
+    shutil.copy("labels.txt", "day.txt")
+    do("annotate import logs labels.txt")
+    shutil.copytree("logs", "homes/anna")
+    log = min(find_logs(folder / "logs"))
+    for name in ("a.mcap", "b.mcap"):
+        shutil.copy(log, name)
+    (folder / "damaged.mcap").write_bytes(log.read_bytes()[:-5000])
+
+
+def do_copy(source, target):
+    import soundfile
+
+    samples, rate = soundfile.read(source)
+    soundfile.write(target, np.tile(samples, 3)[: 4 * rate], rate)
+
+
+def do(words):
+    from typer.testing import CliRunner
+
+    result = CliRunner().invoke(app, shlex.split(words))
+    assert result.exit_code in {0, 3}, f"{words}: {result.output} {result.exception}"
+
+
+@pytest.mark.parametrize("command", [line for line in SHOWN if not NOT_HERE.match(line)])
+def test_a_command_that_is_shown_can_be_run(home, command, tmp_path, monkeypatch, capfd):
+    shutil.copytree(home, tmp_path / "copy", symlinks=True)
+    monkeypatch.chdir(tmp_path / "copy")
+    words = shlex.split(command)[1:]
+    if words[0] == "record" and "-o" not in words:
+        shutil.rmtree("logs")
+    for word, following in zip(words, words[1:], strict=False):
+        if word in {"-o", "--output", "--save", "--list", "--plot"}:
+            place = Path(following)
+            if place.is_dir():
+                shutil.rmtree(place)
+            place.unlink(missing_ok=True)
+    result = run(capfd, *words)
+    assert result.returncode in {0, 3}, result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_most_of_the_shown_commands_are_run():
+    skipped = [line for line in SHOWN if NOT_HERE.match(line)]
+    assert len(skipped) < len(SHOWN) / 3
