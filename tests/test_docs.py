@@ -5,12 +5,15 @@ import importlib
 import re
 import shlex
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
 import typer
 from spliced import run
+from typer.testing import CliRunner
 
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import app
@@ -32,9 +35,9 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 # What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
 # a second program, or sound of many collections.
 NOT_HERE = re.compile(
-    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch|.* s3://|.* --web|.*tcp:"
-    r"|.* --microphone USB| evaluate adaptation|.* --folds collection| demo)|hearthlog review(?!.* --save)"
-    r"|.*octaves|.*--config|.*--queue spans.csv$"
+    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch| demo"
+    r"| evaluate adaptation|.* s3://|.*tcp:|.* --web|.* --microphone USB|.* --folds collection"
+    r"|.*octaves|.*--config|.*--queue spans.csv$| review(?!.* --save))"
 )
 
 
@@ -279,15 +282,11 @@ def make_home(folder):
 
 
 def do_copy(source, target):
-    import soundfile
-
     samples, rate = soundfile.read(source)
     soundfile.write(target, np.tile(samples, 3)[: 4 * rate], rate)
 
 
 def do(words):
-    from typer.testing import CliRunner
-
     result = CliRunner().invoke(app, shlex.split(words))
     assert result.exit_code in {0, 3}, f"{words}: {result.output} {result.exception}"
 
@@ -299,7 +298,7 @@ def test_a_command_that_is_shown_can_be_run(home, command, tmp_path, monkeypatch
     words = shlex.split(command)[1:]
     if words[0] == "record" and "-o" not in words:
         shutil.rmtree("logs")
-    for word, following in zip(words, words[1:], strict=False):
+    for word, following in pairwise(words):
         if word in {"-o", "--output", "--save", "--list", "--plot"}:
             place = Path(following)
             if place.is_dir():

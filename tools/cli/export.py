@@ -9,8 +9,6 @@ from hearthlog.tools.cli.options import End, Logs, Start, Topics
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
 from hearthlog.tools.cli.times import parse_span
 
-_FORMATS = ("parquet", "csv", "npz", "wav", "txt", "bag", "rosbag2")
-
 
 def export(
     logs: Logs,
@@ -45,10 +43,10 @@ def export(
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
-    one_file = output.suffix[1:] in _FORMATS[:-1]
+    one_file = output.suffix[1:] in set(ExportFormat) - {ExportFormat.rosbag2}
     name = output_format or output.suffix[1:]
-    if name not in _FORMATS:
-        wrong_use(f"--format {name}: choose one of {', '.join(_FORMATS)}")
+    if name not in set(ExportFormat):
+        wrong_use(f"--format {name}: choose one of {', '.join(ExportFormat)}")
     if one_file and output.suffix[1:] != name:
         wrong_use(f"--output {output} is not --format {name}")
     if name == "bag" and not one_file:
