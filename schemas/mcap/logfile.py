@@ -6,7 +6,7 @@ import zlib
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from mcap import records
@@ -15,43 +15,26 @@ from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.chunk_table import (
+    CHUNKS,
+    ChunkRow,
+    RecordLocation,
+    by_start,
+    read_chunk_index,
+    read_chunk_row,
+)
 from hearthlog.schemas.mcap.formats import (
     CHUNK,
-    CHUNK_INDEX,
-    CHUNK_INDEX_TAIL,
     FOOTER,
     FOOTER_SIZE,
     HEAD,
-    INDEX_OFFSET,
     MAGIC,
-    MESSAGE,
     UINT16,
-    UINT64,
 )
 from hearthlog.schemas.mcap.records import LIMIT, McapError, parse
 from hearthlog.schemas.storage.byte_ranges import Section, open_file
 
-CHUNKS = np.dtype(
-    [
-        ("offset", "<i8"),  # of the chunk, or of a run of messages outside of chunks
-        ("length", "<i8"),  # in bytes, heads included
-        ("index_length", "<i8"),  # of the message indexes behind it; -1 behind a run of messages
-        ("size", "<i8"),  # uncompressed
-        ("start", "<i8"),  # log time of its first message
-        ("end", "<i8"),  # and of its last
-        ("channels", "<i8"),  # a place in `LogFile.channel_sets`
-    ]
-)
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
-_RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
-
-
-class RecordLocation(NamedTuple):
-    """A record in a file; its length includes opcode and length."""
-
-    opcode: int
-    offset: int
-    length: int
 
 
 class LogFile:
@@ -74,9 +57,9 @@ class LogFile:
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
         Of a file without an index, those inside chunks are not among them.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        All that are known so far, by start time.
+        All chunks that were met so far, by start time.
     channel_sets : list of frozenset of int
-        Channels with messages in a chunk. An empty set: it is not known which.
+        Channels with messages in a chunk; the empty set if the file does not tell which.
     statistics : mcap.records.Statistics or None
     record_locations : list of RecordLocation
         Of metadata records and attachments.
@@ -98,7 +81,7 @@ class LogFile:
         self.record_locations: list[RecordLocation] = []
         self.channel_sets: list[frozenset[int]] = []
         self.chunks = np.empty(0, CHUNKS)
-        self.end = len(MAGIC)  # of the records that were walked through
+        self._end = len(MAGIC)  # of the records that were scanned
         self._file = open_file(path)
         self._sets: dict[frozenset[int], int] = {}
         try:
@@ -136,15 +119,21 @@ class LogFile:
         """Read as many bytes as there is room for, or fewer at the end of the file."""
         self._file.read_into(out, offset)
 
-    def record(self, place: RecordLocation) -> McapRecord | None:
-        """Read a metadata record, an attachment, or another one that holds no messages."""
-        if place.length > LIMIT:
-            raise self.damaged(place.offset, "a record claims to be too large")
-        content = self.read(place.offset, place.length)[HEAD.size :]
+    def record(self, location: RecordLocation) -> McapRecord | None:
+        """Read a metadata record, an attachment, or another one that holds no messages.
+
+        Raises
+        ------
+        LogError
+            If it is too large, or damaged.
+        """
+        if location.length > LIMIT:
+            raise self.damaged(location.offset, "a record claims to be too large")
+        content = self.read(location.offset, location.length)[HEAD.size :]
         try:
-            return parse(place.opcode, content)
+            return parse(location.opcode, content)
         except (McapError, UnicodeDecodeError) as error:
-            raise self.damaged(place.offset, error) from error
+            raise self.damaged(location.offset, error) from error
 
     def damaged(self, offset: int, what: object) -> LogError:
         """Make the error that says where this file is damaged."""
@@ -177,13 +166,13 @@ class LogFile:
         rows = array("q")
         crc = 0
         try:
-            for place, raw in self._records(start, end):
+            for location, raw in self._records(start, end):
                 crc = zlib.crc32(raw, crc)
                 content = raw[HEAD.size :]
-                if place.opcode == Opcode.CHUNK_INDEX:
-                    rows.extend(self._chunk_index(content))
+                if location.opcode == Opcode.CHUNK_INDEX:
+                    self._add_row(rows, read_chunk_index(content))
                 else:
-                    self._add(parse(place.opcode, content))
+                    self._add(parse(location.opcode, content))
             crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
         except (McapError, UnicodeDecodeError, struct.error):
             crc = -1
@@ -193,7 +182,7 @@ class LogFile:
             return False
         opcode, length = HEAD.unpack(self.read(len(MAGIC), HEAD.size))
         self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
-        self.chunks = _by_start(np.frombuffer(rows, CHUNKS))
+        self.chunks = by_start(np.frombuffer(rows, CHUNKS))
         return True
 
     def _records(self, start: int, end: int) -> Iterator[tuple[RecordLocation, bytes]]:
@@ -208,91 +197,80 @@ class LogFile:
                 start += HEAD.size + length
 
     def scan_new(self) -> NDArray[np.void]:
-        """Walk through the records that were written since the last walk.
+        """Walk through the records that were written since the last scan.
 
         Returns
         -------
         np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            The chunks that were met, and the messages outside of chunks.
+            The chunks among them, and runs of messages outside of chunks, by start time.
+
+        Raises
+        ------
+        LogError
+            If a record is damaged.
         """
         rows = array("q")
-        chunk: list[int] = []
-        ids: set[int] = set()
-        for place in self._places(self.size):
-            if place.opcode == Opcode.MESSAGE_INDEX and chunk:
-                chunk[2] += place.length
-                ids.update(UINT16.unpack(self.read(place.offset + HEAD.size, UINT16.size)))
-            elif place.opcode == Opcode.MESSAGE and chunk and self._continues(chunk, place):
-                _, _, _, size, start, end = self._chunk(place)
-                chunk[1:] = [chunk[1] + size, -1, chunk[3] + size, *_span(chunk, start, end)]
-            else:
-                if chunk:
-                    rows.extend([*chunk, self._channel_set(frozenset(ids))])
-                chunk, ids = self._chunk(place), set()
-                self._note(place)
-        if chunk:  # its indexes may not all be there yet
-            rows.extend([*chunk[:2], min(chunk[2], 0), *chunk[3:], self._channel_set(frozenset())])
-        chunks = _by_start(np.frombuffer(rows, CHUNKS))
+        row: ChunkRow | None = None
+        for location in self._new_records(self.size):
+            if location.opcode == Opcode.MESSAGE_INDEX and row is not None:
+                row.index_length += location.length
+                row.channels.update(
+                    UINT16.unpack(self.read(location.offset + HEAD.size, UINT16.size))
+                )
+                continue
+            chunk = self._chunk_row(location)
+            if location.opcode == Opcode.MESSAGE and row is not None and row.continues(location):
+                assert chunk is not None
+                row.extend(chunk)
+                continue
+            self._add_row(rows, row)
+            row = chunk
+            self._note(location)
+        if row is not None:  # its indexes may not all be there yet
+            row.index_length = min(row.index_length, 0)
+            row.channels.clear()
+        self._add_row(rows, row)
+        chunks = by_start(np.frombuffer(rows, CHUNKS))
         if len(chunks):
-            self.chunks = _by_start(np.concatenate([self.chunks, chunks]))
+            self.chunks = by_start(np.concatenate([self.chunks, chunks]))
         return chunks
 
-    @staticmethod
-    def _continues(run: list[int], place: RecordLocation) -> bool:
-        return run[2] < 0 and run[0] + run[1] == place.offset and run[1] < _RUN_LIMIT
+    def _add_row(self, rows: "array[int]", row: ChunkRow | None) -> None:
+        if row is not None:
+            rows.extend([*row.numbers(), self._channel_set(frozenset(row.channels))])
 
-    def _note(self, place: RecordLocation) -> None:
-        if place.opcode in {Opcode.METADATA, Opcode.ATTACHMENT}:
-            self.record_locations.append(place)
-        elif place.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
-            self._add(self.record(place))
+    def _note(self, location: RecordLocation) -> None:
+        if location.opcode in {Opcode.METADATA, Opcode.ATTACHMENT}:
+            self.record_locations.append(location)
+        elif location.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
+            self._add(self.record(location))
 
-    def _places(self, size: int) -> Iterator[RecordLocation]:
+    def _new_records(self, size: int) -> Iterator[RecordLocation]:
         """Go from record to record, up to where the file ends or is cut."""
         while True:
-            head = self.read(self.end, HEAD.size)
+            head = self.read(self._end, HEAD.size)
             if len(head) < HEAD.size and not self.complete:
                 return
             opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
             if opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 self.ended = True
                 return
-            if opcode == 0 or self.end + HEAD.size + length > size:
+            if opcode == 0 or self._end + HEAD.size + length > size:
                 if self.complete:
-                    raise self.damaged(self.end, "a record claims to be longer than the file")
+                    raise self.damaged(self._end, "a record claims to be longer than the file")
                 return
-            yield RecordLocation(opcode, self.end, HEAD.size + length)
-            self.end += HEAD.size + length
+            yield RecordLocation(opcode, self._end, HEAD.size + length)
+            self._end += HEAD.size + length
 
-    def _chunk(self, place: RecordLocation) -> list[int]:
-        """Describe a chunk, or a message outside of one; nothing if this is neither."""
-        if place.opcode not in {Opcode.CHUNK, Opcode.MESSAGE}:
-            return []
-        head = self.read(place.offset, min(place.length, HEAD.size + CHUNK.size))
+    def _chunk_row(self, location: RecordLocation) -> ChunkRow | None:
+        """Describe a chunk, or a message outside of one; None if the record is neither."""
+        if location.opcode not in {Opcode.CHUNK, Opcode.MESSAGE}:
+            return None
+        head = self.read(location.offset, min(location.length, HEAD.size + CHUNK.size))
         try:
-            if place.opcode == Opcode.CHUNK:
-                start, end, size, _, _ = CHUNK.unpack_from(head, HEAD.size)
-                index_length = 0
-            else:
-                start = end = MESSAGE.unpack_from(head)[4]
-                size, index_length = place.length, -1
-        except struct.error as error:
-            raise self.damaged(place.offset, "a record is too short") from error
-        if max(start, end, size) >= 1 << 63:
-            raise self.damaged(place.offset, "a number is out of range")
-        return [place.offset, place.length, index_length, size, start, end]
-
-    def _chunk_index(self, content: bytes) -> tuple[int, ...]:
-        start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
-        first = CHUNK_INDEX.size
-        offsets = INDEX_OFFSET.iter_unpack(content[first : first + entries])
-        ids = frozenset(channel for channel, _ in offsets)
-        first += entries
-        index_length, text = CHUNK_INDEX_TAIL.unpack_from(content, first)
-        (size,) = UINT64.unpack_from(content, first + CHUNK_INDEX_TAIL.size + text + UINT64.size)
-        if max(offset + length + index_length, start, end, size) >= 1 << 63:
-            raise McapError("a number is out of range")
-        return offset, length, index_length, size, start, end, self._channel_set(ids)
+            return read_chunk_row(location, head)
+        except McapError as error:
+            raise self.damaged(location.offset, error) from error
 
     def _channel_set(self, ids: frozenset[int]) -> int:
         if ids not in self._sets:
@@ -326,11 +304,3 @@ class LogFile:
         self.channel_sets.clear()
         self._sets.clear()
         self.statistics = None
-
-
-def _span(chunk: list[int], start: int, end: int) -> tuple[int, int]:
-    return min(chunk[4], start), max(chunk[5], end)
-
-
-def _by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    return chunks[np.argsort(chunks["start"], kind="stable")]

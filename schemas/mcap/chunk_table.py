@@ -1,0 +1,128 @@
+"""Where the chunks of a file are, and what span of time each of them holds."""
+
+import struct
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from hearthlog.schemas.mcap.formats import (
+    CHUNK,
+    CHUNK_INDEX,
+    CHUNK_INDEX_TAIL,
+    HEAD,
+    INDEX_OFFSET,
+    MESSAGE,
+    UINT64,
+)
+
+CHUNKS = np.dtype(
+    [
+        ("offset", "<i8"),  # of the chunk, or of a run of messages outside of chunks
+        ("length", "<i8"),  # in bytes, heads included
+        ("index_length", "<i8"),  # of the message indexes behind it; -1 behind a run of messages
+        ("size", "<i8"),  # bytes, uncompressed
+        ("start", "<i8"),  # log time of its first message, in nanoseconds
+        ("end", "<i8"),  # and of its last
+        ("channels", "<i8"),  # a place in `LogFile.channel_sets`
+    ]
+)
+_RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
+
+
+class RecordLocation(NamedTuple):
+    """A record in a file; its length includes opcode and length."""
+
+    opcode: int
+    offset: int
+    length: int
+
+
+@dataclass
+class ChunkRow:
+    """A row of `CHUNKS` while a file is walked through: a chunk, or a run of messages.
+
+    Attributes
+    ----------
+    offset, length, index_length, size, start, end : int
+        As in `CHUNKS`.
+    channels : set of int
+        Numbers of the channels whose message indexes follow.
+    """
+
+    offset: int
+    length: int
+    index_length: int
+    size: int
+    start: int
+    end: int
+    channels: set[int] = field(default_factory=set)
+
+    def numbers(self) -> tuple[int, ...]:
+        """Return the numbers of the row, without its channels."""
+        return self.offset, self.length, self.index_length, self.size, self.start, self.end
+
+    def continues(self, location: RecordLocation) -> bool:
+        """Tell whether a message belongs to this run."""
+        is_next = self.offset + self.length == location.offset
+        return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
+
+    def extend(self, message: "ChunkRow") -> None:
+        """Add a message to this run."""
+        self.length += message.length
+        self.size += message.size
+        self.start = min(self.start, message.start)
+        self.end = max(self.end, message.end)
+
+
+def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
+    """Describe a chunk, or a message outside of chunks, from the beginning of its record.
+
+    Raises
+    ------
+    McapError
+        If it is too short, or a number in it is out of range.
+    """
+    opcode, offset, length = location
+    try:
+        if opcode == Opcode.CHUNK:
+            start, end, size, _, _ = CHUNK.unpack_from(head, HEAD.size)
+            index_length = 0
+        else:
+            start = end = MESSAGE.unpack_from(head)[4]
+            size, index_length = length, -1
+    except struct.error as error:
+        raise McapError("a record is too short") from error
+    if max(start, end, size) >= 1 << 63:
+        raise McapError("a number is out of range")
+    return ChunkRow(offset, length, index_length, size, start, end)
+
+
+def read_chunk_index(content: bytes) -> ChunkRow:
+    """Describe a chunk from the content of its chunk index.
+
+    Raises
+    ------
+    McapError
+        If a number in it is out of range.
+    struct.error
+        If it is too short.
+    """
+    start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
+    first = CHUNK_INDEX.size
+    offsets = INDEX_OFFSET.iter_unpack(content[first : first + entries])
+    channels = {channel for channel, _ in offsets}
+    first += entries
+    index_length, text = CHUNK_INDEX_TAIL.unpack_from(content, first)
+    (size,) = UINT64.unpack_from(content, first + CHUNK_INDEX_TAIL.size + text + UINT64.size)
+    if max(offset + length + index_length, start, end, size) >= 1 << 63:
+        raise McapError("a number is out of range")
+    return ChunkRow(offset, length, index_length, size, start, end, channels)
+
+
+def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
+    """Sort chunks by the log times of their first messages."""
+    return chunks[np.argsort(chunks["start"], kind="stable")]
