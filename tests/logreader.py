@@ -15,7 +15,6 @@ from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import decode_rows
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import DURATION, TIME
 from hearthlog.schemas.messages.message_types import (
     decode,
@@ -24,6 +23,7 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
     typestore,
 )
+from hearthlog.schemas.messages.type_definitions import message_type
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ from hearthlog.schemas.logs.provenance import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows, encode_rows
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import difference, fields_of, type_hash_of
 from hearthlog.schemas.messages.message_types import definition, encode, header, message
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION
 
 GOLDEN = Path(__file__).parent / "golden"

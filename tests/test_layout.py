@@ -11,8 +11,8 @@ from rosbags.interfaces import Nodetype
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.message_types import definition, typestore
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.times import NANOSECONDS
 
 pytestmark = pytest.mark.fast

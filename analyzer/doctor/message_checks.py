@@ -37,8 +37,8 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import difference
+from hearthlog.schemas.messages.type_definitions import message_type
 
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours

@@ -22,9 +22,9 @@ from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.provenance import METADATA, schema_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.logs.writer import PROFILE, SCHEMA_ENCODING
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import difference, type_hash_of
 from hearthlog.schemas.messages.topics import Topic, topics_of
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 from hearthlog.schemas.times import NANOSECONDS
 

@@ -14,8 +14,8 @@ from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.messages.cdr_layout import message_type
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field, fields_of
+from hearthlog.schemas.messages.type_definitions import message_type
 
 _TEXTS_LIMIT = 1 << 30  # bytes
 

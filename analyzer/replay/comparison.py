@@ -12,8 +12,8 @@ from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import decode_rows
-from hearthlog.schemas.messages.cdr_layout import MessageType, message_type
 from hearthlog.schemas.messages.fields import fields_of, lacking
+from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 
 _Absent = frozenset[str]  # fields of ours that messages of another version do not have
 _Content = bytes | tuple[bytes, ...]  # a whole message, or one field after the other

@@ -16,7 +16,7 @@ from hearthlog.schemas.logs.merged_reading import iterate_pieces
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
 from hearthlog.schemas.mcap.statistics import topic_counts
 from hearthlog.schemas.messages.cdr_codec import Fields, decode_rows, ragged
-from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _HEADS = ("log_times", "publish_times", "sequences")
@@ -96,7 +96,7 @@ def read_columns(
     start, end : int, optional
         Log times, in nanoseconds: from `start` on, before `end`.
     fields : collection of str, optional
-        Paths of the fields that are wanted; all by default.
+        Paths of the fields to read; all by default.
 
     Returns
     -------
@@ -113,11 +113,12 @@ def read_columns(
     logs = list(logs)
     whole = start is None and end is None
     expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
-    found: dict[str, _ColumnBuilder] = {}
+    builders: dict[str, _ColumnBuilder] = {}
     for batch in iterate_columns(logs, topics, start, end, fields):
         for columns in batch:
-            found.setdefault(columns.topic, _ColumnBuilder(expected[columns.topic])).add(columns)
-    return {topic: found.pop(topic).columns() for topic in list(found)}
+            builder = _ColumnBuilder(expected[columns.topic])
+            builders.setdefault(columns.topic, builder).add(columns)
+    return {topic: builders.pop(topic).columns() for topic in list(builders)}
 
 
 def iterate_columns(
@@ -154,8 +155,8 @@ def _joined(pieces: Iterable[Columns]) -> list[Columns]:
     """Join pieces of one topic, type, fields and metadata, in the order of time."""
     parts: dict[Any, list[Columns]] = {}
     for columns in pieces:
-        about = tuple(sorted(columns.metadata.items()))
-        key = columns.topic, columns.type, tuple(columns.fields), about
+        metadata = tuple(sorted(columns.metadata.items()))
+        key = columns.topic, columns.type, tuple(columns.fields), metadata
         parts.setdefault(key, []).append(columns)
     return [_in_order(join(same)) if len(same) > 1 else same[0] for same in parts.values()]
 

@@ -129,23 +129,23 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     LogError
         If there is none, or the path is that of a pipe, a socket or a device.
     """
-    logs = _find_local(path) if is_local(path) else _find_stored(path)
+    every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
-    found = [log for log in logs if enrolled or ENROLLED not in log.parts[depth:-1]]
-    if logs and not found:
+    logs = [log for log in every if enrolled or ENROLLED not in log.parts[depth:-1]]
+    if not logs:
         raise LogError(
             f"{path}: no log (*{SUFFIX}) in this folder but enrolled sounds; name their folder "
             f"{ENROLLED!r} to read those"
         )
-    return found
+    return logs
 
 
 def _find_local(path: Path) -> list[Path]:
     if path.is_dir():
-        found = sorted(filter(is_log, path.rglob("*")))
-        if not found:
+        logs = sorted(filter(is_log, path.rglob("*")))
+        if not logs:
             raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
-        return found
+        return logs
     if not path.exists():
         raise LogError(f"{path}: no such log")
     if not may_be_regular(path):
@@ -159,7 +159,7 @@ def _find_stored(path: Any) -> list[Path]:
         names = path.fs.find(path.path)
     if names == [path.path]:
         return [path]
-    found = [name for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX))]
-    if not found:
+    logs = [name for name in names if name.endswith((SUFFIX, ACTIVE_SUFFIX))]
+    if not logs:
         raise LogError(f"{path}: no log (*{SUFFIX}) under this name")
-    return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(found)]
+    return [path.with_segments(path.fs.unstrip_protocol(name)) for name in sorted(logs)]

@@ -38,10 +38,10 @@ def follow(
     topics : collection of str, optional
         All by default.
     start : int, optional
-        Log time, in nanoseconds, from which on messages are wanted; by default those that are
+        Log time, in nanoseconds, from which on messages are read; by default those that are
         written from now on.
     fields : collection of str, optional
-        Paths of the fields that are wanted; all by default.
+        Paths of the fields to read; all by default.
     stop : threading.Event, optional
         Ends it.
 
@@ -102,14 +102,14 @@ def follow_messages(
             log.file.scan_new()  # and forget what was written before
     try:
         while not stop.is_set():
-            found = False
+            has_news = False
             for log in growing:
                 for messages in log.read(topics, start, damaged):
-                    found = True
+                    has_news = True
                     yield log.file.path, messages
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
-            if not found:
+            if not has_news:
                 stop.wait(_POLL_SECONDS)
     finally:
         for log in growing:
@@ -187,11 +187,11 @@ class _Folder:
 
     def __init__(self, root: Path) -> None:
         self._listed: dict[Path, int] = {root: -1}
-        self._known: set[str] = set()
+        self._listed_logs: set[str] = set()
 
     def new_logs(self) -> list[Path]:
         """Return the logs that were not there the last time, by name."""
-        found: dict[str, Path] = {}
+        new: dict[str, Path] = {}
         todo = list(self._listed)
         while todo:
             folder = todo.pop()
@@ -213,7 +213,7 @@ class _Folder:
                         todo.append(path)
                 elif is_log(path):
                     name = entry.path.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
-                    if name not in self._known:
-                        found[name] = path
-        self._known |= found.keys()
-        return [found[stem] for stem in sorted(found)]
+                    if name not in self._listed_logs:
+                        new[name] = path
+        self._listed_logs |= new.keys()
+        return [new[name] for name in sorted(new)]

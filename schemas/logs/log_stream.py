@@ -70,10 +70,10 @@ class LogStreamWriter:
                 schemas[topic.type] = self._writer.register_schema(
                     topic.type, SCHEMA_ENCODING, definition(topic.type).encode()
                 )
-            about = _channel_metadata(topic)
-            self._counts[topic.name] = rosbag2.TopicCount(topic.type, about)
+            channel_metadata = _channel_metadata(topic)
+            self._counts[topic.name] = rosbag2.TopicCount(topic.type, channel_metadata)
             self._channels[topic.name] = self._writer.register_channel(
-                topic.name, ENCODING, schemas[topic.type], about
+                topic.name, ENCODING, schemas[topic.type], channel_metadata
             )
 
     def continue_on(self, stream: BinaryIO) -> None:
@@ -121,8 +121,8 @@ class LogStreamWriter:
 
     def finish(self, name: str) -> None:
         """Complete the log, whose file will have this name."""
-        about = rosbag2.file_metadata(name, self._counts, self._span or (0, 0))
-        self._writer.add_metadata(rosbag2.METADATA, about)
+        metadata = rosbag2.file_metadata(name, self._counts, self._span or (0, 0))
+        self._writer.add_metadata(rosbag2.METADATA, metadata)
         self._writer.finish()
 
     def _count(self, topic: str, messages: int, first: int, last: int) -> None:

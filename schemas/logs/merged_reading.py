@@ -50,18 +50,18 @@ def time_spans(
         If one is no MCAP file, or is damaged.
     """
     paths = list(logs)
-    found = zip(map_logs(span_of, paths), paths, strict=True)
-    spans = [(*span, path) for span, path in found if span is not None]
+    pairs = zip(map_logs(span_of, paths), paths, strict=True)
+    spans = [(*span, path) for span, path in pairs if span is not None]
     # Paths of this machine and of a store do not compare; their parts do.
     return sorted(spans, key=lambda span: (*span[:2], tuple(span[2].parts)))
 
 
 class _Log:
-    """A log that is open, and the chunks of it that are wanted, by their start times."""
+    """A log that is open, and its chunks that a query asks for, by their start times."""
 
     def __init__(self, path: Path, query: "_Query") -> None:
         self.file = LogFile(path)
-        self.chunks = query.wanted(self.file)
+        self.chunks = query.chunks(self.file)
         sizes = self.chunks["size"] + self.chunks["length"]
         self._ends = np.cumsum(np.clip(sizes, 0, LIMIT))
         self._position = 0
@@ -86,7 +86,7 @@ class _Log:
 
 
 class _Query(NamedTuple):
-    """What is wanted: topics, and log times from `start` on, before `end`."""
+    """What to read: topics, and log times from `start` on, before `end`."""
 
     topics: Collection[str] | None
     start: int
@@ -94,23 +94,23 @@ class _Query(NamedTuple):
     check: bool = False
     every: int = 1
 
-    def wanted(self, file: LogFile) -> NDArray[np.void]:
-        """Return the chunks that may hold a wanted message."""
+    def chunks(self, file: LogFile) -> NDArray[np.void]:
+        """Return the chunks that may hold a message of the query."""
         chunks = file.chunks[(file.chunks["end"] >= self.start) & (file.chunks["start"] < self.end)]
         chunks = chunks[:: self.every]
         if self.topics is None:
             return chunks
         others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}
-        wanted = [not ids or not ids <= others for ids in file.channel_sets]
-        return chunks[np.array(wanted, bool)[chunks["channels"]]]
+        may_hold = [not ids or not ids <= others for ids in file.channel_sets]
+        return chunks[np.array(may_hold, bool)[chunks["channels"]]]
 
     def read(self, batch: "_Batch") -> list[RawMessages]:
-        """Read the wanted messages of a batch."""
-        found: list[RawMessages] = []
+        """Read the messages of a batch that the query asks for."""
+        messages: list[RawMessages] = []
         for file, chunks in batch.parts:
             read = read_chunks(file, chunks, self.topics, check=self.check)
-            found += _between(read, self.start, self.end)
-        return found
+            messages += _between(read, self.start, self.end)
+        return messages
 
 
 class _Batch(NamedTuple):

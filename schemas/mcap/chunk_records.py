@@ -5,10 +5,10 @@ import struct
 from collections.abc import Iterator
 
 import numpy as np
+from mcap.exceptions import McapError
 
 from hearthlog.schemas.arrays import Int64, gather
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES
-from hearthlog.schemas.mcap.records import McapError
 
 _COMPRESSED = re.compile(  # from the length of the compression's name on, with the data's magic
     rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -23,13 +24,7 @@ from hearthlog.schemas.mcap.formats import (
 )
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
-from hearthlog.schemas.mcap.records import (
-    ChunkHead,
-    McapError,
-    chunk_head,
-    decompress_into,
-    parse,
-)
+from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress_into, parse
 
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _CHANNELS_LIMIT = 1 << 16
@@ -65,9 +60,9 @@ def read_chunks(
     if not len(chunks):
         return []
     batch = _read(file, chunks, check=check)
-    indices = batch.indices(_unwanted(file, topics))
+    indices = batch.indices(_other_channels(file, topics))
     _define(file, indices.keys())
-    for identity in _unwanted(file, topics):
+    for identity in _other_channels(file, topics):
         indices.pop(identity, None)
     read = [batch.messages(identity, parts) for identity, parts in indices.items()]
     return [messages for messages in read if len(messages)]
@@ -106,8 +101,8 @@ def read_definitions(file: LogFile) -> None:
             read_chunks(file, file.chunks[number : number + 1], topics=())
 
 
-def _unwanted(file: LogFile, topics: Collection[str] | None) -> list[int]:
-    """Return the channels, of those that are known, of other topics."""
+def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:
+    """Return the channels of a file that are of other topics."""
     if topics is None:
         return []
     return [number for number, channel in file.channels.items() if channel.topic not in topics]
@@ -201,20 +196,21 @@ class _Batch(NamedTuple):
     raw: Bytes
     starts: Int64
 
-    def indices(self, unwanted: Sequence[int]) -> dict[int, list[Entries]]:
-        """Return the index entries of the other channels; chunks without index get one."""
+    def indices(self, others: Sequence[int]) -> dict[int, list[Entries]]:
+        """Return the index entries of all channels but some; chunks without index get one."""
         ends = self.starts + self.chunks["length"]
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
-        found: dict[int, list[Entries]] = {}
-        for number, identity, first, size in parts[~np.isin(parts[:, 1], unwanted)].tolist():
-            found.setdefault(identity, []).append((number, self.raw[first : first + size].data))
-        unknown = not found.keys() <= self.file.channels.keys()
+        entries_of: dict[int, list[Entries]] = {}
+        for number, identity, first, size in parts[~np.isin(parts[:, 1], others)].tolist():
+            part = self.raw[first : first + size].data
+            entries_of.setdefault(identity, []).append((number, part))
+        unknown = not entries_of.keys() <= self.file.channels.keys()
         for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
-            entries_by_channel = self.index_records(number)
-            for identity, entries in entries_by_channel.items() if without[number] else ():
-                found.setdefault(identity, []).append((number, entries))
-        return found
+            made = self.index_records(number)
+            for identity, entries in made.items() if without[number] else ():
+                entries_of.setdefault(identity, []).append((number, entries))
+        return entries_of
 
     def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
         """Go through the message indexes behind all chunks, one of each chunk at a time.

@@ -8,31 +8,8 @@ that opcode and length are part of it; a dtype has rows of whole numbers of reco
 import struct
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC as MAGIC
 
-__all__ = [
-    "ATTACHMENT",
-    "CHUNK",
-    "CHUNK_INDEX",
-    "CHUNK_INDEX_TAIL",
-    "FOOTER",
-    "FOOTER_SIZE",
-    "HEAD",
-    "INDEX_ENTRIES",
-    "INDEX_ENTRY",
-    "INDEX_OFFSET",
-    "MAGIC",
-    "MESSAGE",
-    "MESSAGE_FIXED",
-    "MESSAGE_HEAD",
-    "MESSAGE_INDEX",
-    "MESSAGE_INDEX_HEAD",
-    "SUMMARY_OFFSET",
-    "UINT16",
-    "UINT32",
-    "UINT64",
-]
-
+MAGIC = b"\x89MCAP0\r\n"
 UINT16, UINT32, UINT64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 HEAD = struct.Struct("<BQ")  # opcode, length of the content
 MESSAGE = struct.Struct("<BQHIQQ")  # with HEAD: channel, sequence, log time, publish time; payload

@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ from hearthlog.schemas.mcap.formats import (
     MAGIC,
     UINT16,
 )
-from hearthlog.schemas.mcap.records import LIMIT, McapError, parse
+from hearthlog.schemas.mcap.records import LIMIT, parse
 from hearthlog.schemas.storage.byte_ranges import Section, open_file
 
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written

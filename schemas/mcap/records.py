@@ -20,17 +20,6 @@ from mcap.records import McapRecord
 
 from hearthlog.schemas.mcap.formats import CHUNK, UINT64
 
-__all__ = [
-    "LIMIT",
-    "ChunkHead",
-    "McapError",
-    "chunk_head",
-    "decompress",
-    "decompress_into",
-    "encode",
-    "parse",
-]
-
 LIMIT = 100 << 20  # bytes; ours are below 2 MiB
 _CLASSES: dict[int, Any] = {
     Opcode.HEADER: records.Header,

@@ -6,20 +6,21 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC, SUMMARY_OFFSET
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import McapError, parse
+from hearthlog.schemas.mcap.records import parse
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 
 
 def time_span(path: Path) -> tuple[int, int] | None:
-    """Return the first and the last log time of a log, or None if it has no messages.
+    """Return the first and the last log time of a log in nanoseconds; None without messages.
 
     Raises
     ------
@@ -28,12 +29,12 @@ def time_span(path: Path) -> tuple[int, int] | None:
     """
     try:
         with closing(open_file(path)) as file:
-            about = _statistics(file)
+            statistics = _statistics(file)
     except (McapError, struct.error):
-        about = None
-    if about is not None:
-        times = about.message_start_time, about.message_end_time
-        return times if about.message_count else None
+        statistics = None
+    if statistics is not None:
+        times = statistics.message_start_time, statistics.message_end_time
+        return times if statistics.message_count else None
     with LogFile(path) as log:
         if not len(log.chunks):
             return None
@@ -41,26 +42,26 @@ def time_span(path: Path) -> tuple[int, int] | None:
 
 
 def topic_counts(path: Path) -> Counter[str]:
-    """Count the messages of each topic as a finished log says, so far as that can be true."""
-    found: Counter[str] = Counter()
+    """Count the messages of each topic as a finished log claims, so far as that can be true."""
+    topics: Counter[str] = Counter()
     with (
         suppress(LogError, McapError, UnicodeDecodeError, struct.error),
         closing(open_file(path)) as file,
     ):
-        about = _statistics(file)
-        counts = {} if about is None else about.channel_message_counts
+        statistics = _statistics(file)
+        counts = {} if statistics is None else statistics.channel_message_counts
         for channel in _summary_group(file, Opcode.CHANNEL):
             if isinstance(channel, records.Channel):
                 most = file.size  # a message takes more than a byte
-                found[channel.topic] += min(counts.get(channel.id, 0), most)
-    return found
+                topics[channel.topic] += min(counts.get(channel.id, 0), most)
+    return topics
 
 
 def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
-    """Read the statistics of a finished log, which are found without reading its index."""
-    for found in _summary_group(file, Opcode.STATISTICS):
-        if isinstance(found, records.Statistics):
-            return found
+    """Read the statistics of a finished log, without the rest of its index."""
+    for record in _summary_group(file, Opcode.STATISTICS):
+        if isinstance(record, records.Statistics):
+            return record
     return None
 
 
@@ -83,10 +84,10 @@ def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord
 
 
 def _split(raw: bytes) -> list[McapRecord | None]:
-    found = []
+    group = []
     start = 0
     while start < len(raw):
         opcode, length = HEAD.unpack_from(raw, start)
         start += HEAD.size + length
-        found.append(parse(opcode, raw[start - length : start]))
-    return found
+        group.append(parse(opcode, raw[start - length : start]))
+    return group

@@ -14,10 +14,9 @@ from hearthlog.schemas.messages.cdr_layout import (
     Layout,
     Leaf,
     Messages,
-    MessageType,
     default_rows,
-    message_type,
 )
+from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 from hearthlog.schemas.messages.versions import APPENDED
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -170,7 +169,7 @@ def decode_rows(
     offsets, sizes : np.ndarray [shape=(n,)], int64
         Where in the buffer the payloads are.
     fields : collection of str, optional
-        Paths of the fields that are wanted; all by default.
+        Paths of the fields to read; all by default.
 
     Returns
     -------
@@ -222,11 +221,11 @@ def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[
         rest = rest[~fitting]
         if not len(rest):
             return
-    found: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
+    rows_of: dict[tuple[Any, ...], tuple[Layout, list[int]]] = {}
     for row in rest.tolist():  # so many layouts that trying them one by one would take for ever
         layout = kind.layout_of(memoryview(payloads[row].tobytes()))
-        found.setdefault(tuple(layout.fixed.items()), (layout, []))[1].append(row)
-    yield from ((layout, np.array(same)) for layout, same in found.values())
+        rows_of.setdefault(tuple(layout.fixed.items()), (layout, []))[1].append(row)
+    yield from ((layout, np.array(same)) for layout, same in rows_of.values())
 
 
 def _decode(
@@ -290,7 +289,7 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
     """Put rows that were decoded apart back into their order."""
     if len(parts) == 1:
         return parts[0][1]
-    found: Fields = {}
+    columns_by_path: Fields = {}
     for path in parts[0][1] if parts else ():
         columns = [(rows, fields[path]) for rows, fields in parts]
         like = columns[0][1]
@@ -301,8 +300,8 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
             columns = [(rows, ragged(column)) for rows, column in columns]
         for rows, column in columns:
             values[rows] = column
-        found[path] = values
-    return found
+        columns_by_path[path] = values
+    return columns_by_path
 
 
 def ragged(column: NDArray[Any]) -> NDArray[np.object_]:

@@ -5,32 +5,27 @@ keep their lengths, so one numpy record type describes all rows of the same leng
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.message_types import PACKAGE, definition, number_type, typestore
+from hearthlog.schemas.messages.message_types import number_type, typestore
 from hearthlog.schemas.messages.versions import APPENDED
 
 START = 4  # of the fields: alignment counts from here
 _ENCAPSULATION = {"<": b"\x00\x01", ">": b"\x00\x00"}  # plain CDR, by byte order
-_ORDERS = {value: order for order, value in _ENCAPSULATION.items()}
+ORDERS = {value: order for order, value in _ENCAPSULATION.items()}
 _FORMATS = {
     "int8": "i1", "uint8": "u1", "byte": "u1", "char": "u1", "bool": "?",
     "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _STAMPS = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
-_MESSAGE_LIMIT = 100 << 20  # bytes
-_DEFINITION_LIMIT = 256 << 10  # bytes of text
 _FIELDS_LIMIT = 10_000
 _DEPTH_LIMIT = 32
-_LAYOUTS_KEPT = 256
 
 
 class Leaf(NamedTuple):
@@ -104,124 +99,6 @@ class Growth(NamedTuple):
 _SAME = Growth(frozenset(), ())
 
 
-class MessageType:
-    """A ROS 2 message type as a file defines it.
-
-    What is read of types of ours are the fields that this version has, whichever version wrote
-    them.
-
-    Parameters
-    ----------
-    name : str
-    types : mapping of str to list of (field, description)
-        The fields of this type and of those it builds on, as rosbags describes them.
-    growth : mapping of str to Growth
-        By type, where this definition is of another version.
-    """
-
-    def __init__(
-        self, name: str, types: Mapping[str, Any], growth: Mapping[str, Growth] | None = None
-    ) -> None:
-        self.name = name
-        self.types = types
-        self.growth = growth or {}
-        self._layouts: dict[int, list[Layout]] = {}
-        self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
-
-    def read_fields(self, name: str) -> list[tuple[str, Any]]:
-        """List what is read of one of the types: field and description."""
-        if name not in self.growth:
-            return list(self.types[name])
-        later, absent = self.growth[name]
-        return [*(field for field in self.types[name] if field[0] not in later), *absent]
-
-    def layouts(self, size: int) -> list[Layout]:
-        """Return the layouts of payloads of this size that were met last."""
-        return self._layouts.get(size, [])
-
-    def layout_of(self, payload: memoryview) -> Layout:
-        """Find the layout of an encoded message.
-
-        Raises
-        ------
-        LogError
-            If its bytes are not of this type.
-        """
-        order = _ORDERS.get(bytes(payload[:2]))
-        if order is None or len(payload) < START:
-            raise LogError(f"{self.name}: a message is not encoded as plain CDR")
-
-        def length_at(path: str, offset: int) -> int:
-            word = payload[offset : offset + 4]
-            if len(word) < 4:
-                raise LogError(f"{self.name}: a message ends before its field {path}")
-            return int.from_bytes(word, "little" if order == "<" else "big")
-
-        walk = _Walk(self, order, length_at, len(payload))
-        leaves = walk.message(self.name)
-        if walk.end + 3 < len(payload):  # some middleware pads to four bytes
-            raise LogError(f"{self.name}: a message is longer than its type")
-        found = walk.layout(leaves, len(payload))
-        if not found.fits(np.frombuffer(payload, found.dtype)).all():
-            raise LogError(f"{self.name}: a string in a message has no end")
-        if sum(map(len, self._layouts.values())) >= _LAYOUTS_KEPT:
-            self._layouts.clear()
-        self._layouts.setdefault(len(payload), []).append(found)
-        return found
-
-    def layout_for(self, lengths: Mapping[str, int]) -> Layout:
-        """Lay out a message whose strings (bytes, with their end) and sequences are this long."""
-        key = tuple(lengths.items())
-        if key not in self._made:
-            walk = _Walk(self, "<", lambda path, _: lengths[path], _MESSAGE_LIMIT)
-            leaves = walk.message(self.name)
-            if len(self._made) >= _LAYOUTS_KEPT:
-                self._made.clear()
-            self._made[key] = walk.layout(leaves, walk.end)
-        return self._made[key]
-
-
-@lru_cache(64)
-def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
-    """Read a type's definition; without a text it is one of ROS 2's or ours.
-
-    Raises
-    ------
-    LogError
-        If it cannot be understood.
-    """
-    known = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
-    if not encoding or (name in known and text == definition(name).encode()):
-        return MessageType(name, known)
-    if len(text) > _DEFINITION_LIMIT:
-        raise LogError(f"the definition of {name} is too long")
-    try:
-        if encoding == "ros2msg":
-            own = get_types_from_msg(text.decode(), name)
-        elif encoding == "ros2idl":
-            own = get_types_from_idl(text.decode())
-        else:
-            raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
-    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise LogError(f"the definition of {name} cannot be read") from error
-    theirs = {key: fields for key, (_, fields) in own.items()}
-    growth = {
-        key: _growth(key, fields, known[key])
-        for key, fields in theirs.items()
-        if key.startswith(f"{PACKAGE}/") and key in known and fields != known[key]
-    }
-    return MessageType(name, known | theirs, growth)
-
-
-def _growth(name: str, theirs: Sequence[Any], ours: Sequence[Any]) -> Growth:
-    """Compare a definition of one of our types with that of this version."""
-    appended = APPENDED.get(name, {})
-    there = {field for field, _ in theirs}
-    later = theirs[len(ours) :] if theirs[: len(ours)] == ours else []
-    absent = [field for field in ours if field[0] not in there and field[0] in appended]
-    return Growth(frozenset(field for field, _ in later), absent)
-
-
 def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "") -> list[Default]:
     """Make what stands, in columns, for fields that were appended to a type."""
     appended = APPENDED.get(name, {})
@@ -258,18 +135,51 @@ def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -
     yield Default(path, row)
 
 
-class _Walk:
-    """One way through the fields of a message, on which the layout is noted."""
+class TypeDefinition(NamedTuple):
+    """A message type as a file defines it.
+
+    Attributes
+    ----------
+    name : str
+    types : mapping of str to list of (field, description)
+        The fields of this type and of those it builds on, as rosbags describes them.
+    growth : mapping of str to Growth
+        By type, where this definition is of another version.
+    """
+
+    name: str
+    types: Mapping[str, Any]
+    growth: Mapping[str, Growth]
+
+
+class LayoutWalk:
+    """One way through the fields of a message, on which the layout is noted.
+
+    Parameters
+    ----------
+    definition : TypeDefinition
+    order : str
+        Byte order, as numpy has it.
+    length_at : callable
+        Returns the length of the string or sequence of a path, whose length word lies at an offset.
+    size : int
+        Bytes, at most.
+
+    Attributes
+    ----------
+    end : int
+        Bytes so far.
+    """
 
     def __init__(
         self,
-        kind: MessageType,
+        definition: TypeDefinition,
         order: str,
         length_at: Callable[[str, int], int],
         size: int,
     ) -> None:
         self.end = START
-        self._kind = kind
+        self._name, self._types, self._growth = definition
         self._order = order
         self._length_at = length_at
         self._size = size
@@ -280,25 +190,25 @@ class _Walk:
 
     def layout(self, leaves: tuple[AnyLeaf, ...], size: int) -> Layout:
         """Return what was noted, for payloads of this size."""
-        about = {
+        fields = {
             "names": list(self._fields),
             "formats": [form for form, _ in self._fields.values()],
             "offsets": [offset for _, offset in self._fields.values()],
             "itemsize": size,
         }
-        return Layout(np.dtype(about), leaves, self._fixed)  # type: ignore[call-overload]
+        return Layout(np.dtype(fields), leaves, self._fixed)  # type: ignore[call-overload]
 
     def message(self, name: str, prefix: str = "") -> tuple[AnyLeaf, ...]:
         """Walk through the fields of a message."""
-        if name not in self._kind.types:
-            raise LogError(f"{self._kind.name}: builds on {name}, which is not defined")
+        if name not in self._types:
+            raise LogError(f"{self._name}: builds on {name}, which is not defined")
         self._step()
         self._depth += 1
         if self._depth > _DEPTH_LIMIT:
-            raise LogError(f"{self._kind.name}: contains itself")
-        growth = self._kind.growth.get(name, _SAME)
+            raise LogError(f"{self._name}: contains itself")
+        growth = self._growth.get(name, _SAME)
         leaves: list[AnyLeaf] = []
-        for field, description in self._kind.types[name]:
+        for field, description in self._types[name]:
             walked = self._field(f"{prefix}{field}", *description)
             leaves += walked if field not in growth.later else ()
         leaves += default_rows(name, growth.absent, prefix)
@@ -336,25 +246,25 @@ class _Walk:
 
     def _range(self, path: str, count: int) -> range:
         if count > _FIELDS_LIMIT:
-            raise LogError(f"{self._kind.name}: {count} elements in {path} are too many")
+            raise LogError(f"{self._name}: {count} elements in {path} are too many")
         return range(count)
 
     def _numbers(self, path: str, base: str, count: int | None = None) -> None:
         if base not in _FORMATS:
-            raise LogError(f"{self._kind.name}: {path} is of type {base}, which is not supported")
+            raise LogError(f"{self._name}: {path} is of type {base}, which is not supported")
         form = self._order + _FORMATS[base]
         alignment = np.dtype(form).itemsize
         if count is None:
             self._add(path, form, alignment)
         elif count * alignment > self._size:
-            raise LogError(f"{self._kind.name}: a message ends before its field {path}")
+            raise LogError(f"{self._name}: a message ends before its field {path}")
         else:
             self._add(path, f"({count},){form}", alignment if count else 1)
 
     def _text(self, path: str) -> None:
         length = self._length(path)
         if length > self._size:
-            raise LogError(f"{self._kind.name}: a message ends before its field {path}")
+            raise LogError(f"{self._name}: a message ends before its field {path}")
         if length > 1:
             self._add(path, f"V{length - 1}", 1)
         if length:
@@ -372,11 +282,11 @@ class _Walk:
         start = self.end + (START - self.end) % alignment
         self.end = start + np.dtype(form).itemsize
         if self.end > self._size:
-            raise LogError(f"{self._kind.name}: a message ends before its field {name}")
+            raise LogError(f"{self._name}: a message ends before its field {name}")
         self._fields[name] = form, start
         return start
 
     def _step(self) -> None:
         self._steps += 1
         if self._steps > _FIELDS_LIMIT:
-            raise LogError(f"{self._kind.name}: a message has too many fields")
+            raise LogError(f"{self._name}: a message has too many fields")

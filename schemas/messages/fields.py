@@ -8,8 +8,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.messages.cdr_layout import MessageType, message_type
 from hearthlog.schemas.messages.message_types import PACKAGE
+from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 from hearthlog.schemas.messages.versions import APPENDED
 
 TIME = "builtin_interfaces/msg/Time"
@@ -54,18 +54,18 @@ def _fields(
 ) -> Iterator[tuple[str, Field]]:
     if depth > _DEPTH_LIMIT or name not in kind.types:
         raise LogError(f"{kind.name}: contains itself, or {name}, which is not defined")
-    for field, (node, about) in kind.read_fields(name):
+    for field, (node, details) in kind.read_fields(name):
         if next(left, None) is None:
             raise LogError(f"{kind.name}: has too many fields")
         path = f"{prefix}{field}"
         if node is Nodetype.BASE:
-            yield path, Field(about[0])
-        elif node is Nodetype.NAME and about in {TIME, DURATION}:
-            yield path, Field(about)
+            yield path, Field(details[0])
+        elif node is Nodetype.NAME and details in {TIME, DURATION}:
+            yield path, Field(details)
         elif node is Nodetype.NAME:
-            yield from _fields(kind, about, f"{path}.", depth + 1, left)
+            yield from _fields(kind, details, f"{path}.", depth + 1, left)
         else:
-            (element, base), count = about
+            (element, base), count = details
             size = count if node is Nodetype.ARRAY else 0
             if element is Nodetype.NAME:
                 yield path, Field("", size, dict(_fields(kind, base, "", depth + 1, left)))
@@ -133,8 +133,8 @@ def difference(kind: MessageType, version: int) -> str:
 def _built_on(types: Mapping[str, Any], name: str) -> dict[str, None]:
     """List a type and those it builds on."""
     names = {name: None}
-    for _, (node, about) in types[name]:
-        element, base = (node, about) if node in {Nodetype.BASE, Nodetype.NAME} else about[0]
+    for _, (node, details) in types[name]:
+        element, base = (node, details) if node in {Nodetype.BASE, Nodetype.NAME} else details[0]
         if element is Nodetype.NAME and base not in names:
             names |= _built_on(types, base)
     return names
@@ -142,18 +142,18 @@ def _built_on(types: Mapping[str, Any], name: str) -> dict[str, None]:
 
 def _words(name: str, described: tuple[Nodetype, Any]) -> str:
     """Write a field as message definitions do."""
-    node, about = described
+    node, details = described
     if node is Nodetype.BASE:
-        return f"{_base(about)} {name}"
+        return f"{_base(details)} {name}"
     if node is Nodetype.NAME:
-        return f"{about.replace('/msg/', '/')} {name}"
-    (element, base), count = about
+        return f"{details.replace('/msg/', '/')} {name}"
+    (element, base), count = details
     limit = "" if not count else f"{count}" if node is Nodetype.ARRAY else f"<={count}"
     return f"{_words('', (element, base)).strip()}[{limit}] {name}"
 
 
-def _base(about: tuple[str, int]) -> str:
-    name, limit = about
+def _base(details: tuple[str, int]) -> str:
+    name, limit = details
     return f"{name}<={limit}" if limit else name
 
 

@@ -109,7 +109,7 @@ def topics_of(
 ) -> list[Topic]:
     """List what a recorder writes for a microphone; without classes it writes no labels."""
     statistics = {"mean": feature_names, "std": feature_names}
-    found = [
+    topics = [
         Topic(topic(microphone, "info"), message_types.STREAM_INFO, _LATCHED),
         Topic(
             topic(microphone, "features"),
@@ -123,9 +123,9 @@ def topics_of(
     ]
     if classes is not None:
         names = {"probabilities": classes}
-        found.append(Topic(topic(microphone, "label"), message_types.LABEL, array_names=names))
-        found.append(Topic(topic(microphone, "segment"), message_types.SEGMENT))
-    return found
+        topics.append(Topic(topic(microphone, "label"), message_types.LABEL, array_names=names))
+        topics.append(Topic(topic(microphone, "segment"), message_types.SEGMENT))
+    return topics
 
 
 def audio_topic(microphone: str) -> Topic:

@@ -1,4 +1,4 @@
-"""What was lost where a file is damaged, as far as it can still be known."""
+"""What was lost where a file is damaged, as far as the file still shows it."""
 
 import zlib
 from array import array
@@ -10,26 +10,18 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
-from hearthlog.schemas.mcap.records import LIMIT, McapError, parse
+from hearthlog.schemas.mcap.records import LIMIT, parse
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 
 _BLOCK = 1 << 20
 _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
-_OF_INDEX = {
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.STATISTICS,
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
 
 
 @dataclass(frozen=True)
@@ -42,13 +34,13 @@ class Damage:
         Bytes.
     why : str
     messages : mapping of str to int
-        Messages that are lost, by topic.
+        Lost messages, by topic.
     exact : bool
-        Whether these are all.
+        Whether these are all that are lost.
     times : tuple of int, or None
-        Log times of the first and the last of them, where they are known.
+        Log times of the first and the last lost message, if there is a trace of them.
     others : sequence of str
-        What else is lost.
+        Names of lost metadata records and attachments.
     cut : bool
         Whether the file just ends here.
     """
@@ -68,16 +60,16 @@ class Damage:
         return self.exact and not self.messages and not self.others
 
     def __str__(self) -> str:
-        about = f"damaged at byte {self.start} ({self.why})"
+        where = f"damaged at byte {self.start} ({self.why})"
         if self.lossless:
-            return f"{about}: nothing is lost"
+            return f"{where}: nothing is lost"
         lost = [f"{count} of {topic}" for topic, count in sorted(self.messages.items())]
         if not self.exact:
             lost.append("perhaps more" if lost else "an unknown number of messages")
         span = (
             "" if self.times is None else f", {_moment(self.times[0])} to {_moment(self.times[1])}"
         )
-        return f"{about}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
+        return f"{where}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
 
 
 def _moment(stamp: int) -> str:
@@ -122,7 +114,7 @@ class DamagedRange(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """What was in a stretch; the fields are those of `Damage`, but messages are by channel."""
+    """What was lost in a damaged range; fields as of `Damage`, but messages by channel."""
 
     messages: dict[int, int]
     exact: bool
@@ -168,8 +160,8 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
     chunks = array("q")
     offset = start
     while offset < end:
-        found = reader.whole(offset)
-        record = found.record
+        whole = reader.whole(offset)
+        record = whole.record
         if isinstance(record, records.Schema | records.Channel):
             definitions.append(record)
         elif isinstance(record, records.Statistics):
@@ -191,7 +183,7 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
             names[record.offset] = f"the attachment {record.name!r}"
         elif not isinstance(record, records.SummaryOffset):
             raise McapError("here should be the index")
-        offset = found.end
+        offset = whole.end
     table = np.array(chunks, np.int64).reshape(-1, 5)
     table = table[np.argsort(table[:, 0])]
     ends = table[:, :3].sum(axis=1)
@@ -200,16 +192,16 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
     return Index(start, definitions, messages, table, names)
 
 
-def loss_in(reader: RecordVerifier, stretch: DamagedRange, index: Index | None) -> Loss:
-    """Say what was lost in a stretch."""
+def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) -> Loss:
+    """Find out what was lost in a damaged range."""
     if index is None:
-        return _by_what_is_around(reader, stretch)
+        return _loss_by_neighbours(reader, damaged)
     others = tuple(
-        name for offset, name in index.names.items() if stretch.start <= offset < stretch.end
+        name for offset, name in index.names.items() if damaged.start <= offset < damaged.end
     )
-    first, last = np.searchsorted(index.chunks[:, 0], [stretch.start, stretch.end])
+    first, last = np.searchsorted(index.chunks[:, 0], [damaged.start, damaged.end])
     if first == last:
-        exact = bool(len(index.chunks)) or stretch.end - stretch.start < MESSAGE.size
+        exact = bool(len(index.chunks)) or damaged.end - damaged.start < MESSAGE.size
         return Loss({}, exact, None, others)
     chunks = index.chunks[first:last]
     messages: dict[int, int] = {}
@@ -220,8 +212,8 @@ def loss_in(reader: RecordVerifier, stretch: DamagedRange, index: Index | None) 
     return Loss(messages, exact, (int(chunks[:, 3].min()), int(chunks[:, 4].max())), others)
 
 
-def _by_what_is_around(reader: RecordVerifier, stretch: DamagedRange) -> Loss:
-    start, end, opcode, ends = stretch
+def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
+    start, end, opcode, ends = damaged
     if end - start < MESSAGE.size and (end < reader.end or opcode != Opcode.CHUNK):
         return _NOTHING
     is_record = end in ends or end == reader.end

@@ -9,6 +9,7 @@ import struct
 import zlib
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from hearthlog.schemas.mcap.formats import (
     MESSAGE_INDEX,
     UINT64,
 )
-from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, McapError, decompress, parse
+from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_sizes import FIELDS, SHORTEST, UNKNOWN, longest
 from hearthlog.schemas.salvage.whole_records import (

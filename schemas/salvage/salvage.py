@@ -17,13 +17,14 @@ from typing import Self
 
 import numpy as np
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import MAGIC
-from hearthlog.schemas.mcap.records import LIMIT, McapError
+from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.salvage.damage import Damage, DamagedRange, loss_in, read_index
 from hearthlog.schemas.salvage.doubtful_definitions import DoubtfulDefinitions
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
@@ -37,8 +38,8 @@ from hearthlog.schemas.salvage.whole_records import (
 from hearthlog.schemas.storage.regular_file import open_regular
 
 _VAIN = 8
-_HELD = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
-_HELD_EACH = 256
+_KEPT_LIMIT = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
+_KEPT_EACH = 256
 _DAMAGES = 1000  # as many are told apart
 _WINDOW = 1 << 20
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
@@ -48,15 +49,15 @@ Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
 
 @dataclass
 class Unnamed:
-    """Messages of one channel that are whole, while nothing says what they are.
+    """Whole messages of one channel that is nowhere defined.
 
     Attributes
     ----------
     messages : int
     times : tuple of int
-        The first and the last log time.
+        First and last log time, in nanoseconds.
     place : tuple of int
-        Bytes of the file.
+        First byte of the file, and the one behind.
     """
 
     messages: int
@@ -76,8 +77,8 @@ class Salvage:
     Parameters
     ----------
     path : Path
-    known : iterable of mcap.records.Schema and mcap.records.Channel
-        Definitions of the same file that an earlier salvage met too late.
+    definitions : iterable of mcap.records.Schema and mcap.records.Channel, optional
+        What an earlier salvage of the same file met too late.
 
     Attributes
     ----------
@@ -98,7 +99,7 @@ class Salvage:
         If it cannot be read.
     """
 
-    def __init__(self, path: Path, known: Iterable[Definition] = ()) -> None:
+    def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
         self.header: records.Header | None = None
         self.definitions = DoubtfulDefinitions()
         self.unnamed: dict[int, Unnamed] = {}
@@ -110,17 +111,17 @@ class Salvage:
         self._reader = RecordVerifier(self._descriptor, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
-        self._index = read_index(self._reader, _HELD)
+        self._index = read_index(self._reader, _KEPT_LIMIT)
         self.complete = self._index is not None
         self.expected = None if self._index is None else self._index.messages
         if self._index is not None:
             self._reader.end = self._index.start
-            known = [*self._index.definitions, *known]
-        for record in known:
+            definitions = [*self._index.definitions, *definitions]
+        for record in definitions:
             self.definitions.add(record)
         self._damages: list[tuple[Damage, dict[int, int]]] = []
-        self._found: WholeRecord | None = None  # by the last search
-        self._vain = self._held = 0
+        self._next: WholeRecord | None = None  # by the last search
+        self._vain = self._kept = 0
         self._cost = 0  # of what was last read in vain
         self._has_chunks = False
         self._ended = False  # the data: the index follows
@@ -134,23 +135,23 @@ class Salvage:
 
     @property
     def offset(self) -> int:
-        """How many bytes have been passed."""
+        """Bytes that have been passed."""
         return self._offset
 
     def damages(self) -> list[Damage]:
-        """List what was not whole so far, in the order of the file, and then what has no name."""
-        found = []
+        """List the damages met so far, by offset, and then the messages of undefined channels."""
+        damages = []
         for damage, lost in self._damages:
             messages: dict[str, int] = {}
             for channel, count in lost.items():
                 topic = self.definitions.topic(channel)
                 messages[topic] = messages.get(topic, 0) + count
-            found.append(replace(damage, messages=messages))
+            damages.append(replace(damage, messages=messages))
         for channel, some in self.unnamed.items():
             why = f"nothing that is left says what channel {channel} is"
             messages = {self.definitions.topic(channel): some.messages}
-            found.append(Damage(*some.place, why, messages, times=some.times))
-        return found
+            damages.append(Damage(*some.place, why, messages, times=some.times))
+        return damages
 
     def pieces(self) -> Iterator[Piece]:
         """Read whatever is whole, in the order of the file.
@@ -163,23 +164,23 @@ class Salvage:
         while self._offset < self._reader.end:
             offset = self._offset
             try:
-                found = self._at(offset)
+                whole = self._at(offset)
             except McapError as error:
                 if self._ended and MAGIC.startswith(self._reader.read(offset, len(MAGIC) + 1)):
                     return
                 self._offset = self._pass(offset, str(error))
                 continue
-            if found.corrected:
-                self._add(Damage(offset, found.end, f"{found.corrected} is wrong"))
-            self._offset = found.end
-            yield from self._taken(found)
-            del found  # before the next is read, which may be as large
+            if whole.corrected:
+                self._add_damage(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
+            self._offset = whole.end
+            yield from self._take(whole)
+            del whole  # before the next is read, which may be as large
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
         """Read the record that begins here; raise McapError if there is none that is whole."""
-        if self._found is not None and self._found.offset == offset:
-            found, self._found = self._found, None
-            return found
+        if self._next is not None and self._next.offset == offset:
+            whole, self._next = self._next, None
+            return whole
         reader = self._reader
         self._cost = 0
         if self._vain > 4 * LIMIT + _VAIN * offset:
@@ -188,44 +189,44 @@ class Salvage:
             raise McapError("the file holds more messages than one of its size can")
         work = reader.work
         try:
-            found = reader.chunk(offset) if chunk else reader.whole(offset, 3 if searching else 1)
-            self._hold(found)
-            self._doubt(found, searching=searching)
+            whole = reader.chunk(offset) if chunk else reader.whole(offset, 3 if searching else 1)
+            self._count_kept(whole)
+            self._doubt(whole, searching=searching)
         except (McapError, UnicodeDecodeError) as error:
             self._cost = reader.work - work
             raise McapError(str(error)) from error
-        return found
+        return whole
 
-    def _hold(self, found: WholeRecord) -> None:
-        """Count what will be kept of a record as long as the file is read."""
-        record, held = found.record, _HELD_EACH
+    def _count_kept(self, whole: WholeRecord) -> None:
+        """Count the bytes that will be kept of a record; raise McapError if they are too many."""
+        record, size = whole.record, _KEPT_EACH
         if isinstance(record, WholeChunk):
-            held += 16 * len(record.stored.entries)
-            held += sum(_size(definition) for definition in record.definitions)
+            size += 16 * len(record.stored.entries)
+            size += sum(_size(definition) for definition in record.definitions)
         elif isinstance(record, Definition):
-            held += _size(record)
+            size += _size(record)
         elif isinstance(record, WholeAttachment):
-            held += len(record.index_record.name) + len(record.index_record.media_type)
+            size += len(record.index_record.name) + len(record.index_record.media_type)
         elif isinstance(record, records.Metadata):
-            held += len(record.name)
+            size += len(record.name)
         else:
             return
-        if self._held + held > _HELD:
+        if self._kept + size > _KEPT_LIMIT:
             raise McapError("the file holds more definitions than can be kept")
-        self._held += held
+        self._kept += size
 
-    def _doubt(self, found: WholeRecord, *, searching: bool) -> None:
+    def _doubt(self, whole: WholeRecord, *, searching: bool) -> None:
         """Raise McapError for what may be another record, or look like one only by chance."""
-        if self._astray and isinstance(found.record, records.Message | Definition):
+        if self._astray and isinstance(whole.record, records.Message | Definition):
             raise McapError("what is in a damaged chunk is not proved")
-        if isinstance(found.record, records.Message) and self._has_chunks:
+        if isinstance(whole.record, records.Message) and self._has_chunks:
             if searching or self._ended:
                 raise McapError("messages are in chunks here")
-            if self._reader.like_message_index(found.offset):
+            if self._reader.like_message_index(whole.offset):
                 raise McapError("a message index has become a message")
         if not searching:
             return
-        if not isinstance(found.record, WholeChunk) and not self._reader.plausible(found.end):
+        if not isinstance(whole.record, WholeChunk) and not self._reader.plausible(whole.end):
             raise McapError("no record begins where this one ends")
 
     def _pass(self, offset: int, why: str) -> int:
@@ -239,7 +240,7 @@ class Salvage:
             self._has_chunks = True
         else:  # perhaps only this byte of it is wrong
             try:
-                self._found = self._at(offset, chunk=True)
+                self._next = self._at(offset, chunk=True)
             except McapError:
                 cost += self._cost
             else:
@@ -257,10 +258,10 @@ class Salvage:
         elif not any(reader.read(offset, 64)):
             why = "zeros"
         if self._ended:  # it was part of the index
-            self._add(Damage(offset, end, why, cut=cut))
+            self._add_damage(Damage(offset, end, why, cut=cut))
         else:
             lost = loss_in(reader, DamagedRange(offset, end, opcode, ends), self._index)
-            self._add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
+            self._add_damage(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
         return end
 
     def _search(self, start: int) -> int:
@@ -272,7 +273,7 @@ class Salvage:
             chunks = {place for place in find_chunk_heads(window) if place < _WINDOW}
             for place in sorted(chunks.union(find_record_heads(window[: _WINDOW + 8]))):
                 try:
-                    self._found = self._at(start + place, searching=True, chunk=place in chunks)
+                    self._next = self._at(start + place, searching=True, chunk=place in chunks)
                 except McapError:
                     self._vain += self._cost
                 else:
@@ -280,9 +281,9 @@ class Salvage:
             start += _WINDOW
         return end
 
-    def _taken(self, found: WholeRecord) -> Iterator[Piece]:
-        """Remember what a record says of the file; hand it on if it is to be kept."""
-        record = found.record
+    def _take(self, whole: WholeRecord) -> Iterator[Piece]:
+        """Note what a record tells of the file; yield it if the new log will hold it."""
+        record = whole.record
         if isinstance(record, records.Header):
             self.header = self.header or record
             self._ended = False
@@ -293,19 +294,19 @@ class Salvage:
                 self.definitions.doubt(record)
         elif isinstance(record, WholeChunk):
             self._ended, self._astray, self._has_chunks = False, False, True
-            yield from self._named(record, found)
+            yield from self._take_chunk(record, whole)
         elif isinstance(record, records.Message):
             self._ended = False
             if self.definitions.defines(record.channel_id):
                 yield record
             else:
                 times = record.log_time, record.log_time
-                self._miss(record.channel_id, 1, times, found)
+                self._note_unnamed(record.channel_id, 1, times, whole)
         elif isinstance(record, records.Metadata | WholeAttachment):
             yield record
 
-    def _named(self, chunk: WholeChunk, found: WholeRecord) -> Iterator[Piece]:
-        """Hand on a chunk if all is defined that it holds, else those messages of it that are."""
+    def _take_chunk(self, chunk: WholeChunk, whole: WholeRecord) -> Iterator[Piece]:
+        """Yield a chunk if all its channels are defined, else its messages of those that are."""
         agree = True
         for record in chunk.definitions:
             if not self.definitions.add(record):
@@ -319,29 +320,29 @@ class Salvage:
         for number, entries in chunk.stored.entries.items():
             if not defined[number]:
                 times = np.frombuffer(entries, np.int64)[::2]
-                self._miss(number, len(times), (int(times.min()), int(times.max())), found)
+                self._note_unnamed(number, len(times), (int(times.min()), int(times.max())), whole)
         if any(defined.values()):
             for message in chunk_messages(chunk.stored):
                 if defined[message.channel_id]:
                     yield message
 
-    def _miss(
-        self, channel: int, messages: int, times: tuple[int, int], found: WholeRecord
+    def _note_unnamed(
+        self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
     ) -> None:
-        place = found.offset, found.end
+        place = whole.offset, whole.end
         self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
 
-    def _add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
+    def _add_damage(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
         if len(self._damages) == _DAMAGES:
-            last, known = self._damages.pop()
-            lossless = damage.lossless and last.lossless and not messages and not known
+            last, lost = self._damages.pop()
+            lossless = damage.lossless and last.lossless and not messages and not lost
             damage = Damage(last.start, damage.end, "and more", exact=lossless, cut=damage.cut)
-            messages = known
+            messages = lost
         self._damages.append((damage, messages or {}))
 
 
 def _size(record: Definition) -> int:
     if isinstance(record, records.Schema):
-        return _HELD_EACH + len(record.data) + len(record.name)
+        return _KEPT_EACH + len(record.data) + len(record.name)
     texts = [record.topic, record.message_encoding, *record.metadata, *record.metadata.values()]
-    return _HELD_EACH + sum(map(len, texts))
+    return _KEPT_EACH + sum(map(len, texts))

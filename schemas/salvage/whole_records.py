@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap import records
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
@@ -14,7 +15,7 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
-from hearthlog.schemas.mcap.records import ChunkHead, McapError, decompress, parse
+from hearthlog.schemas.mcap.records import ChunkHead, decompress, parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 

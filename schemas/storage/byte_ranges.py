@@ -111,8 +111,8 @@ class StoredFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._about = _about(path)
-        self.size = int(self._about["size"])
+        self._identity = _identity(path)
+        self.size = int(self._identity["size"])
         self._block: Callable[[int], bytes] = lru_cache(_KEPT)(self._read_block)
 
     def close(self) -> None:
@@ -122,7 +122,7 @@ class StoredFile:
     def is_at(self, path: Path) -> bool:
         """Tell whether the file of this name is this one."""
         try:
-            return path == self._path and _about(path) == self._about
+            return path == self._path and _identity(path) == self._identity
         except LogError:
             return False
 
@@ -156,13 +156,13 @@ class StoredFile:
         return read
 
 
-def _about(path: Any) -> dict[str, Any]:
+def _identity(path: Any) -> dict[str, Any]:
     """Ask a store what it says of a file: its size, and what tells it from another one."""
     with store_errors(path):
-        about = path.fs.info(path.path)
-        if about["type"] != "file" or about["size"] is None:
+        info = path.fs.info(path.path)
+        if info["type"] != "file" or info["size"] is None:
             raise LogError(f"{path}: is no file")
-        return {name: about.get(name) for name in ("size", "ETag", "etag", "mtime", "created")}
+        return {name: info.get(name) for name in ("size", "ETag", "etag", "mtime", "created")}
 
 
 def open_file(path: Path) -> LocalFile | StoredFile:

@@ -2,6 +2,7 @@
 
 import re
 
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 
@@ -9,8 +10,8 @@ from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import HEAD
-from hearthlog.schemas.mcap.records import McapError, encode, parse
-from hearthlog.schemas.messages.cdr_layout import message_type
+from hearthlog.schemas.mcap.records import encode, parse
+from hearthlog.schemas.messages.type_definitions import message_type
 
 PROFILE = "ros2"
 _ENCODINGS = ("ros2msg", "ros2idl")

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -27,7 +28,7 @@ from hearthlog.schemas.mcap.formats import (
     UINT64,
 )
 from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import ChunkHead, McapError, chunk_head, decompress
+from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress
 
 
 class ChunkContent(NamedTuple):

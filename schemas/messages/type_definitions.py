@@ -1,0 +1,138 @@
+"""Message types as files define them, and how their messages are laid out."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages.cdr_layout import (
+    ORDERS,
+    START,
+    Growth,
+    Layout,
+    LayoutWalk,
+    TypeDefinition,
+)
+from hearthlog.schemas.messages.message_types import PACKAGE, definition, typestore
+from hearthlog.schemas.messages.versions import APPENDED
+
+_MESSAGE_LIMIT = 100 << 20  # bytes
+_DEFINITION_LIMIT = 256 << 10  # bytes of text
+_LAYOUTS_KEPT = 256
+
+
+class MessageType:
+    """A ROS 2 message type as a file defines it.
+
+    What is read of types of ours are the fields that this version has, whichever version wrote
+    them.
+
+    Parameters
+    ----------
+    name, types, growth
+        As in `TypeDefinition`.
+    """
+
+    def __init__(
+        self, name: str, types: Mapping[str, Any], growth: Mapping[str, Growth] | None = None
+    ) -> None:
+        self._definition = TypeDefinition(name, types, growth or {})
+        self.name, self.types, self.growth = self._definition
+        self._layouts: dict[int, list[Layout]] = {}
+        self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
+
+    def read_fields(self, name: str) -> list[tuple[str, Any]]:
+        """List what is read of one of the types: field and description."""
+        if name not in self.growth:
+            return list(self.types[name])
+        later, absent = self.growth[name]
+        return [*(field for field in self.types[name] if field[0] not in later), *absent]
+
+    def layouts(self, size: int) -> list[Layout]:
+        """Return the layouts of payloads of this size that were met last."""
+        return self._layouts.get(size, [])
+
+    def layout_of(self, payload: memoryview) -> Layout:
+        """Find the layout of an encoded message.
+
+        Raises
+        ------
+        LogError
+            If its bytes are not of this type.
+        """
+        order = ORDERS.get(bytes(payload[:2]))
+        if order is None or len(payload) < START:
+            raise LogError(f"{self.name}: a message is not encoded as plain CDR")
+
+        def length_at(path: str, offset: int) -> int:
+            word = payload[offset : offset + 4]
+            if len(word) < 4:
+                raise LogError(f"{self.name}: a message ends before its field {path}")
+            return int.from_bytes(word, "little" if order == "<" else "big")
+
+        walk = LayoutWalk(self._definition, order, length_at, len(payload))
+        leaves = walk.message(self.name)
+        if walk.end + 3 < len(payload):  # some middleware pads to four bytes
+            raise LogError(f"{self.name}: a message is longer than its type")
+        layout = walk.layout(leaves, len(payload))
+        if not layout.fits(np.frombuffer(payload, layout.dtype)).all():
+            raise LogError(f"{self.name}: a string in a message has no end")
+        if sum(map(len, self._layouts.values())) >= _LAYOUTS_KEPT:
+            self._layouts.clear()
+        self._layouts.setdefault(len(payload), []).append(layout)
+        return layout
+
+    def layout_for(self, lengths: Mapping[str, int]) -> Layout:
+        """Lay out a message whose strings (bytes, with their end) and sequences are this long."""
+        key = tuple(lengths.items())
+        if key not in self._made:
+            walk = LayoutWalk(self._definition, "<", lambda path, _: lengths[path], _MESSAGE_LIMIT)
+            leaves = walk.message(self.name)
+            if len(self._made) >= _LAYOUTS_KEPT:
+                self._made.clear()
+            self._made[key] = walk.layout(leaves, walk.end)
+        return self._made[key]
+
+
+@lru_cache(64)
+def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
+    """Read a type's definition; without a text it is one of ROS 2's or ours.
+
+    Raises
+    ------
+    LogError
+        If it cannot be understood.
+    """
+    ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
+    if not encoding or (name in ours and text == definition(name).encode()):
+        return MessageType(name, ours)
+    if len(text) > _DEFINITION_LIMIT:
+        raise LogError(f"the definition of {name} is too long")
+    try:
+        if encoding == "ros2msg":
+            types = get_types_from_msg(text.decode(), name)
+        elif encoding == "ros2idl":
+            types = get_types_from_idl(text.decode())
+        else:
+            raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
+    except (TypesysError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise LogError(f"the definition of {name} cannot be read") from error
+    theirs = {key: fields for key, (_, fields) in types.items()}
+    growth = {
+        key: _growth(key, fields, ours[key])
+        for key, fields in theirs.items()
+        if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
+    }
+    return MessageType(name, ours | theirs, growth)
+
+
+def _growth(name: str, theirs: Sequence[Any], ours: Sequence[Any]) -> Growth:
+    """Compare a definition of one of our types with that of this version."""
+    appended = APPENDED.get(name, {})
+    there = {field for field, _ in theirs}
+    later = theirs[len(ours) :] if theirs[: len(ours)] == ours else []
+    absent = [field for field in ours if field[0] not in there and field[0] in appended]
+    return Growth(frozenset(field for field, _ in later), absent)
