@@ -1,5 +1,6 @@
 """Topics read as columns are what is read message by message, whatever the file looks like."""
 
+import io
 import json
 import struct
 import subprocess
@@ -12,8 +13,10 @@ from threading import Event
 
 import numpy as np
 import pytest
+import zstandard
 from logreader import LogReader
-from mcap.records import Channel, Schema
+from mcap.data_stream import ReadDataStream
+from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
@@ -28,6 +31,7 @@ from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.records import encode as encode_record
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
@@ -456,4 +460,32 @@ def test_an_index_that_leads_to_one_message_again_and_again_is_refused(tmp_path)
         writer.copy_chunk(StoredChunk(b"", record, len(record), crc, 7, 7, entries))
         writer.finish()
     with pytest.raises(LogError, match="the index of a chunk does not belong to it"):
+        read_columns([path])
+
+
+@pytest.mark.parametrize(
+    ("claim", "what"),
+    [
+        ({"uncompressed_size": 0}, "chunks are larger than their index claims"),
+        ({"uncompressed_size": 0, "message_index_length": 200_000}, "chunks overlap"),
+    ],
+)
+def test_what_an_index_claims_of_chunks_does_not_make_us_read_all_of_them_at_once(
+    claim, what, tmp_path
+):
+    path = tmp_path / "a.mcap"
+    record = struct.pack("<BQHIQQ", 5, 22 + (40 << 20), 1, 0, 7, 7) + bytes(40 << 20)
+    data = zstandard.compress(record) + bytes(300_000)
+    with path.open("wb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("", "")
+        writer.register_schema("a", "ros2msg", b"")
+        writer.register_channel("/a", "cdr", 1, {})
+        for _ in range(4):
+            entries = {1: struct.pack("<QQ", 7, 0)}
+            writer.copy_chunk(StoredChunk(b"zstd", data, len(record), 0, 7, 7, entries))
+        index = ChunkIndex.read(ReadDataStream(io.BytesIO(writer._chunk_indexes[9:])))
+        writer._chunk_indexes = encode_record(replace(index, **claim)) * 4
+        writer.finish()
+    with pytest.raises(LogError, match=what):
         read_columns([path])

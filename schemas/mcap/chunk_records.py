@@ -40,16 +40,16 @@ def iterate_records(
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from
-    while start < last:
-        try:
+    try:
+        while start < last:
             opcode, length = unpack(content, start)
-        except struct.error as error:
-            raise McapError("a record in a chunk is cut") from error
-        following = start + 9 + length
-        if following > last:
-            raise McapError("a record in a chunk claims to be longer than the chunk")
-        yield opcode, start, following
-        start = following
+            following = start + 9 + length
+            if following > last:
+                raise McapError("a record in a chunk claims to be longer than the chunk")
+            yield opcode, start, following
+            start = following
+    except struct.error as error:
+        raise McapError("a record in a chunk is cut") from error
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:

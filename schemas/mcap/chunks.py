@@ -24,7 +24,7 @@ from hearthlog.schemas.mcap.formats import (
 )
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
-from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress_into, parse
+from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
 
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _CHANNELS_LIMIT = 1 << 16
@@ -120,6 +120,8 @@ def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
         except McapError as error:
             raise file.damaged(int(chunks["offset"][number]), error) from error
     sizes = np.array([len(record) if head is None else head.size for head, record in records], int)
+    if sizes.sum() > np.clip(chunks["size"], 0, LIMIT).sum() + LIMIT:
+        raise file.damaged(int(chunks["offset"][0]), "chunks are larger than their index claims")
     buffer = np.empty(sizes.sum(), np.uint8)
     end = 0
     for number, (head, record) in enumerate(records):
@@ -138,9 +140,12 @@ def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]
     """Read chunks and the indexes behind them, neighbours at once; return where each begins."""
     offsets = chunks["offset"]
     lengths = chunks["length"] + np.maximum(chunks["index_length"], 0)
-    cut = offsets + lengths > file.size
+    size = file.size
+    cut = offsets + lengths > size
     if cut.any():
         raise file.damaged(int(offsets[cut.argmax()]), "a chunk is shorter than it claims")
+    if lengths.sum() > size:
+        raise file.damaged(int(offsets[0]), "chunks overlap")
     ends = np.cumsum(lengths)
     raw = np.empty(lengths.sum(), np.uint8)
     apart = np.flatnonzero(offsets[1:] != (offsets + lengths)[:-1]) + 1

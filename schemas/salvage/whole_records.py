@@ -69,8 +69,16 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
         If a record is damaged, or of a kind that no chunk holds.
     """
     messages, definitions = array("q"), array("q")
-    for opcode, start, _ in _records(content):
-        (messages if opcode == Opcode.MESSAGE else definitions).append(start)
+    kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
+    for opcode, start, end in iterate_records(content):
+        if opcode == kind and end - start >= shortest:
+            messages.append(start)
+        elif opcode not in {Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL}:
+            raise McapError("the records of a chunk are damaged")
+        elif end - start < HEAD.size + SHORTEST[opcode]:
+            raise McapError("a record in a chunk is too short")
+        else:
+            definitions.append(start)
     return np.frombuffer(messages, np.int64), np.frombuffer(definitions, np.int64)
 
 
@@ -115,23 +123,9 @@ def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
     """Read the messages of a chunk that is proved, one by one."""
     head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
     content = decompress(head, chunk.data)
-    for opcode, start, end in _records(content):
+    for opcode, start, end in iterate_records(content):
         if opcode == Opcode.MESSAGE:
             yield read_message(content[start:end])
-
-
-def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Go from record to record inside a chunk, which holds messages and definitions alone."""
-    shortest: dict[int, int] = {
-        opcode: HEAD.size + int(SHORTEST[opcode])
-        for opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
-    }
-    for opcode, start, end in iterate_records(content):
-        if opcode not in shortest:
-            raise McapError("the records of a chunk are damaged")
-        if end - start < shortest[opcode]:
-            raise McapError("a record in a chunk is too short")
-        yield opcode, start, end
 
 
 def read_message(raw: bytes) -> records.Message:
