@@ -18,9 +18,8 @@ from hearthlog.analyzer.logs import typed_columns as known
 from hearthlog.analyzer.relabel.layer import log_digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
 from hearthlog.schemas.logs.provenance import METADATA
-from hearthlog.schemas.messages import cdr_layout as layout
 from hearthlog.schemas.messages import fields as schema_fields
-from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages import message_types, type_definitions
 from hearthlog.schemas.messages.versions import APPENDED, SCHEMA_VERSION, Appended
 
 NEXT = SCHEMA_VERSION + 1
@@ -96,7 +95,7 @@ def _forget() -> None:
         message_types.typestore,
         message_types.definition,
         message_types.type_hash,
-        layout.message_type,
+        type_definitions.message_type,
         schema_fields.fields_of,
         known._lacking,
     ):
