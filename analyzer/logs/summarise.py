@@ -17,10 +17,10 @@ from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.logs.provenance import read_provenance, version_text
+from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.times import NANOSECONDS
