@@ -67,12 +67,12 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve
     splits = [_split(data, number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
     calls = (delayed(_scores)(method, len(data.classes), split, *examples) for split in splits)
     scores = np.empty((len(splits), len(CORRECTED)))
-    for place, found in enumerate(in_parallel(calls)):
-        scores[place] = found
+    for place, row in enumerate(in_parallel(calls)):
+        scores[place] = row
         progress((place + 1) / len(splits))
     each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
-    found = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
-    return Curve(CORRECTED, found, each.mean(axis=0).tolist())
+    curves = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
+    return Curve(CORRECTED, curves, each.mean(axis=0).tolist())
 
 
 def _is_like_a_home(data: Dataset, number: int) -> bool:

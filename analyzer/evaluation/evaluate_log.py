@@ -49,7 +49,7 @@ class Comparison:
         What of that has two labels in the reference; no part of the scores of frames.
     unknown_labels : dict of str to float
         Labels of the reference that the log does not know, and for how many evaluated seconds; no
-        part of the scores of frames. Whatever was found there is a false alarm.
+        part of the scores of frames. Whatever is predicted there is a false alarm.
     """
 
     scores: Scores
@@ -60,7 +60,7 @@ class Comparison:
     unknown_labels: Mapping[str, float]
 
 
-def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> Comparison:
+def compare(reference: Labelling, predicted: Labelling, classes: Sequence[str]) -> Comparison:
     """Compare labels where both the reference and the log have some.
 
     Parameters
@@ -68,7 +68,7 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
     reference : Labelling
         May have several labels at a time, and other names for the classes (see
         `hearthlog.models.classes`).
-    found : Labelling
+    predicted : Labelling
         Has one at a time.
     classes : sequence of str
         What the log may be labelled with.
@@ -79,31 +79,31 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
         If the two have no time in common, or the reference no label that the log knows.
     """
     covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
-    spans = common(covered, joined(found.starts, found.ends, FRAME_NANOSECONDS))
+    spans = common(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
     if not spans.length:
         raise DataError(
             f"the reference ({_between(reference)}) and what is labelled in the log "
-            f"({_between(found)}) have no time in common"
+            f"({_between(predicted)}) have no time in common"
         )
     reference = reference.called_as(classes)
     names = [*classes, *sorted(set(reference.labels) - set(classes))]
-    true, said = (laid_out(events_of(each, names), spans) for each in (reference, found))
-    lengths = np.bincount(true.labels, true.ends - true.starts, len(names)) / NANOSECONDS
+    target, output = (laid_out(events_of(each, names), spans) for each in (reference, predicted))
+    lengths = np.bincount(target.labels, target.ends - target.starts, len(names)) / NANOSECONDS
     unknown = {
         name: float(length)
         for name, length in zip(names[len(classes) :], lengths[len(classes) :], strict=True)
         if length
     }
-    known = true.taken(true.labels < len(classes))
-    if not len(known):
+    named = target.taken(target.labels < len(classes))
+    if not len(named):
         raise DataError(
             f"the reference has none of the labels of the log ({', '.join(classes)}) where they "
             f"have time in common, but {', '.join(unknown)[:200]}"
         )
-    scores, ambiguous = _frames(true, said, classes)
+    scores, ambiguous = _frames(target, output, classes)
     return Comparison(
         scores=scores,
-        detections=detect(known, said, classes, spans.length),
+        detections=detect(named, output, classes, spans.length),
         reference_seconds=_seconds(covered.length),
         evaluated_seconds=_seconds(spans.length),
         ambiguous_seconds=_seconds(ambiguous * FRAME_NANOSECONDS),
@@ -111,7 +111,9 @@ def compare(reference: Labelling, found: Labelling, classes: Sequence[str]) -> C
     )
 
 
-def _frames(reference: Events, found: Events, classes: Sequence[str]) -> tuple[Scores, int]:
+def _frames(
+    reference: Events, predicted_events: Events, classes: Sequence[str]
+) -> tuple[Scores, int]:
     """Score the frames; return also how many have several labels in the reference.
 
     Between two successive times at which anything changes, all frames are alike: they are
@@ -122,13 +124,13 @@ def _frames(reference: Events, found: Events, classes: Sequence[str]) -> tuple[S
     times = np.unique(
         np.concatenate(
             [
-                *(reference.starts, reference.ends, found.starts, found.ends),
+                *(reference.starts, reference.ends, predicted_events.starts, predicted_events.ends),
                 np.arange(0, end + block, block),
             ]
         )
     )
     target, several = _single(reference, times, len(classes))
-    predicted, _ = _single(found, times, len(classes))
+    predicted, _ = _single(predicted_events, times, len(classes))
     # A frame belongs where its middle is.
     weight = np.diff((times + FRAME_NANOSECONDS // 2 - 1) // FRAME_NANOSECONDS)
     ambiguous = int(weight[several & (predicted >= 0)].sum())
@@ -189,8 +191,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
         marks = [mark for log in find_logs(path) for mark in read_marks(log)]
         where = f"{path}: nothing of {microphone} is reviewed; `hearthlog annotate import` does it"
     else:
-        found = read_lines(Path(source), find_coverage(path), microphone)
-        marks = [mark for _, mark in found]
+        marks = [mark for _, mark in read_lines(Path(source), find_coverage(path), microphone)]
         where = f"{source}: has no label of {microphone}"
     marks = [mark for mark in marks if mark.microphone == microphone]
     if not marks:

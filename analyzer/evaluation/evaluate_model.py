@@ -101,14 +101,14 @@ def check_classes(model: Model, scenario: Scenario) -> None:
     lacking = [name for name in scenario.classes if name not in model.classes]
     other = [name for name in model.classes if name not in scenario.classes]
     if lacking or other:
-        said = [
+        differences = [
             f"{what} {', '.join(names)}"
             for what, names in (("the model lacks", lacking), ("the scenario lacks", other))
             if names
         ]
         raise DataError(
             f"model {model.name or model.description.scenario_name} does not fit scenario "
-            f"{scenario.name}: {'; '.join(said)}; use the scenario it was trained for"
+            f"{scenario.name}: {'; '.join(differences)}; use the scenario it was trained for"
         )
 
 
@@ -126,7 +126,7 @@ class _Listener:
         self._classifier = classifier
         self._place = 0
         self._reference: list[tuple[int, int, int]] = []
-        self._found: list[tuple[int, int, int]] = []
+        self._predicted: list[tuple[int, int, int]] = []
 
     def overhear(self, recordings: Iterable[Recording], scenario: Scenario) -> Iterator[Recording]:
         """Add recordings that are on their way."""
@@ -147,7 +147,7 @@ class _Listener:
         smoothing, transitions = self._classifier.smoothing, self._classifier.transitions
         segmenter = Segmenter(smoothing, transitions, FRAME_SECONDS)
         segments = segmenter.push(probabilities, stamps) + segmenter.close(self._place + length)
-        self._found += [(one.start, one.end, one.label) for one in segments]
+        self._predicted += [(one.start, one.end, one.label) for one in segments]
         true = self._classifier.classes.index(label)
         self._reference.append((self._place, self._place + length, true))
         self.duration += length
@@ -155,7 +155,7 @@ class _Listener:
 
     def detections(self) -> Detections:
         """Score all of them."""
-        reference, found = (
-            Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._found)
+        reference, predicted = (
+            Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._predicted)
         )
-        return detect(reference, found, self._classifier.classes, self.duration)
+        return detect(reference, predicted, self._classifier.classes, self.duration)

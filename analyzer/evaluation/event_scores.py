@@ -64,13 +64,13 @@ def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
 
 @dataclass(frozen=True)
 class Detection:
-    """How well something was found; None where it has no meaning.
+    """How well something was detected; None where it has no meaning.
 
     Attributes
     ----------
     precision, recall, f1 : float or None
     reference, found : int
-        How many seconds, or events, there are.
+        How many seconds, or events, there are in the reference and in the prediction.
     """
 
     precision: float | None
@@ -82,7 +82,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """How well the classes were found.
+    """How well the classes were detected.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class DetectionScores:
 
 @dataclass(frozen=True)
 class Detections:
-    """How well events were found in some time.
+    """How well events were detected in some time.
 
     Attributes
     ----------
@@ -116,12 +116,14 @@ class Detections:
     false_alarms_per_day: dict[str, float]
 
 
-def detect(reference: Events, found: Events, classes: Sequence[str], duration: int) -> Detections:
+def detect(
+    reference: Events, predicted: Events, classes: Sequence[str], duration: int
+) -> Detections:
     """Score events by the second and by the event, and count false alarms.
 
     Parameters
     ----------
-    reference, found : Events
+    reference, predicted : Events
         From 0 on, as `laid_out` makes them.
     classes : sequence of str
     duration : int
@@ -133,9 +135,9 @@ def detect(reference: Events, found: Events, classes: Sequence[str], duration: i
         If so many events start together that this is no labelling.
     """
     return Detections(
-        segment_based(reference, found, classes),
-        event_based(reference, found, classes),
-        false_alarms_per_day(reference, found, classes, duration),
+        segment_based(reference, predicted, classes),
+        event_based(reference, predicted, classes),
+        false_alarms_per_day(reference, predicted, classes, duration),
     )
 
 
@@ -157,19 +159,19 @@ def laid_out(events: Events, spans: Spans) -> Events:
     return Events(parts.starts + shift, parts.ends + shift, events.labels[event])
 
 
-def segment_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
+def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score second by second: a class is active in each second that one of its events touches.
 
     Parameters
     ----------
-    reference, found : Events
+    reference, predicted : Events
         From 0 on, as `laid_out` makes them.
     classes : sequence of str
     """
     counts = []
     for label in range(len(classes)):
-        true, said = _seconds(reference.of(label)), _seconds(found.of(label))
-        counts.append((common(true, said).length, true.length, said.length))
+        true, own = _seconds(reference.of(label)), _seconds(predicted.of(label))
+        counts.append((common(true, own).length, true.length, own.length))
     return _scores(counts, classes)
 
 
@@ -178,7 +180,7 @@ def _seconds(events: Events) -> Spans:
     return joined(events.starts // NANOSECONDS, -(-events.ends // NANOSECONDS))
 
 
-def event_based(reference: Events, found: Events, classes: Sequence[str]) -> DetectionScores:
+def event_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score event by event, each matched with at most one.
 
     Two events match if their onsets are at most 0.2 s apart, and their offsets at most 0.2 s or
@@ -186,7 +188,7 @@ def event_based(reference: Events, found: Events, classes: Sequence[str]) -> Det
 
     Parameters
     ----------
-    reference, found : Events
+    reference, predicted : Events
     classes : sequence of str
 
     Raises
@@ -196,36 +198,36 @@ def event_based(reference: Events, found: Events, classes: Sequence[str]) -> Det
     """
     counts = []
     for label in range(len(classes)):
-        true, said = reference.of(label), found.of(label)
-        counts.append((_matches(true, said), len(true), len(said)))
+        true, own = reference.of(label), predicted.of(label)
+        counts.append((_matches(true, own), len(true), len(own)))
     return _scores(counts, classes)
 
 
-def _matches(reference: Events, found: Events) -> int:
+def _matches(reference: Events, predicted: Events) -> int:
     """Size of the largest matching."""
-    found = found.taken(np.argsort(found.starts, kind="stable"))
-    first = np.searchsorted(found.starts, reference.starts - COLLAR, "left")
-    count = np.searchsorted(found.starts, reference.starts + COLLAR, "right") - first
+    predicted = predicted.taken(np.argsort(predicted.starts, kind="stable"))
+    first = np.searchsorted(predicted.starts, reference.starts - COLLAR, "left")
+    count = np.searchsorted(predicted.starts, reference.starts + COLLAR, "right") - first
     if count.sum() > _MOST_PAIRS:
         raise DataError("too many events start within 0.2 s of each other; this is no labelling")
     row, column = runs(first, count)
     tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
-    near = np.abs(reference.ends[row] - found.ends[column]) <= tolerance[row]
+    near = np.abs(reference.ends[row] - predicted.ends[column]) <= tolerance[row]
     if not near.any():
         return 0
-    shape = len(reference), len(found)
+    shape = len(reference), len(predicted)
     hits = coo_array((np.ones(near.sum(), np.int8), (row[near], column[near])), shape)
     return int((maximum_bipartite_matching(hits.tocsr()) >= 0).sum())
 
 
 def false_alarms_per_day(
-    reference: Events, found: Events, classes: Sequence[str], duration: int
+    reference: Events, predicted: Events, classes: Sequence[str], duration: int
 ) -> dict[str, float]:
     """Count events of a class that overlap none of that class in the reference.
 
     Parameters
     ----------
-    reference, found : Events
+    reference, predicted : Events
     classes : sequence of str
     duration : int
         Evaluated time in nanoseconds.
@@ -235,33 +237,37 @@ def false_alarms_per_day(
     dict of str to float
         For 24 hours of evaluated time.
     """
-    alarms = (_false_alarms(reference.of(i), found.of(i)) for i in range(len(classes)))
+    alarms = (_false_alarms(reference.of(i), predicted.of(i)) for i in range(len(classes)))
     return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}
 
 
-def _false_alarms(reference: Events, found: Events) -> int:
+def _false_alarms(reference: Events, predicted: Events) -> int:
     starts, ends = joined(reference.starts, reference.ends)
-    before = np.searchsorted(starts, found.ends, "left")
+    before = np.searchsorted(starts, predicted.ends, "left")
     reached = np.concatenate([[np.iinfo(np.int64).min], ends])[before]
-    return int((reached <= found.starts).sum())
+    return int((reached <= predicted.starts).sum())
 
 
 def _scores(counts: list[tuple[int, int, int]], classes: Sequence[str]) -> DetectionScores:
-    """Make scores of (right, in the reference, found) for each class."""
-    right, reference, found = np.sum(counts, axis=0).tolist()
-    every = _detection(right, reference, found)
+    """Make scores of (right, in the reference, predicted) for each class."""
+    right, reference, predicted = np.sum(counts, axis=0).tolist()
+    every = _detection(right, reference, predicted)
     per_class = {name: _detection(*c) for name, c in zip(classes, counts, strict=True)}
-    known = [d.f1 for d in per_class.values() if d.f1 is not None]
+    f1_scores = [d.f1 for d in per_class.values() if d.f1 is not None]
     return DetectionScores(
-        every.f1, every.precision, every.recall, float(np.mean(known)) if known else None, per_class
+        every.f1,
+        every.precision,
+        every.recall,
+        float(np.mean(f1_scores)) if f1_scores else None,
+        per_class,
     )
 
 
-def _detection(right: int, reference: int, found: int) -> Detection:
+def _detection(right: int, reference: int, predicted: int) -> Detection:
     return Detection(
-        precision=right / found if found else None,
+        precision=right / predicted if predicted else None,
         recall=right / reference if reference else None,
-        f1=2 * right / (reference + found) if reference else None,
+        f1=2 * right / (reference + predicted) if reference else None,
         reference=reference,
-        found=found,
+        found=predicted,
     )

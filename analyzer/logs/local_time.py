@@ -12,13 +12,13 @@ KEY = "timezone"  # in the `hearthlog` metadata record of a log
 Span = tuple[int, int]
 
 
-def home_zone(wanted: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
+def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
     """Find the time zone of a home.
 
     Parameters
     ----------
-    wanted : str or None
-        Its IANA name, where the user says it.
+    name : str or None
+        Its IANA name, where the user gives it.
     records : iterable of mapping of str to str
         The `hearthlog` records of logs; the first that names a zone counts. Without one it is UTC.
 
@@ -27,10 +27,10 @@ def home_zone(wanted: str | None, records: Iterable[Mapping[str, str]] = ()) -> 
     DataError
         If there is no such zone.
     """
-    if wanted is not None:
-        return _zone(wanted, "use a name such as Europe/Vienna, or UTC")
-    said = next((record[KEY] for record in records if record.get(KEY)), DEFAULT)
-    return _zone(said, "the logs say so; name the right one with --timezone")
+    if name is not None:
+        return _zone(name, "use a name such as Europe/Vienna, or UTC")
+    recorded = next((record[KEY] for record in records if record.get(KEY)), DEFAULT)
+    return _zone(recorded, "the logs say so; name the right one with --timezone")
 
 
 def _zone(name: str, advice: str) -> tzinfo:

@@ -110,23 +110,23 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
             raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
         attached = [file.record(p) for p in file.record_locations if p.opcode == Opcode.ATTACHMENT]
         # What was merged is of the last of its recorders.
-        about = next(reversed(read_provenance(file)), {})
+        record = next(reversed(read_provenance(file)), {})
         complete = file.complete
         (microphone,) = microphones
         info = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
-        heard = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
+        frame = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
     attachments = [
         Attachment(r.name, r.media_type, r.data)
         for r in attached
         if isinstance(r, records.Attachment)
     ]
-    info = {**about, **info}
+    info = {**record, **info}
     digest = info.get("model_sha256", "")
     first = None
-    if heard and kind == "features":
-        first = int(heard["frame"]), int(heard["header.stamp"])
+    if frame and kind == "features":
+        first = int(frame["frame"]), int(frame["header.stamp"])
     try:
-        node = check_node_name(about.get("node", "home"))
+        node = check_node_name(record.get("node", "home"))
         check_microphone_name(microphone)
     except LogError as error:
         raise LogError(f"{path}: {error}") from error
@@ -140,7 +140,7 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
         model=info.get("model", ""),
         model_sha256=digest if _DIGEST.fullmatch(digest) else "",
         configuration=_configuration(path, attachments),
-        metadata=about,
+        metadata=record,
         attachments=attachments,
         first_frame=first,
     )
@@ -169,13 +169,13 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
 
 
 def _microphones(file: LogFile, kind: str) -> set[str]:
-    found = set()
+    names = set()
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
         name = channel.topic.removeprefix("/").removesuffix("/" + kind)
         if channel.topic == topic(name, kind) and is_compatible(channel, schema, *TYPES[kind]):
-            found.add(name)
-    return found
+            names.add(name)
+    return names
 
 
 def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict[str, Any]:
@@ -184,8 +184,8 @@ def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict
     for i, number in enumerate(file.chunks["channels"].tolist()):
         if file.channel_sets[number] and not file.channel_sets[number] & ids:
             continue
-        found = read_chunks(file, file.chunks[i : i + 1], [name])
-        for columns in decode_types(file.path, found, {kind: fields}):
+        messages = read_chunks(file, file.chunks[i : i + 1], [name])
+        for columns in decode_types(file.path, messages, {kind: fields}):
             return {field: values[0] for field, values in columns.fields.items()}
     return {}
 

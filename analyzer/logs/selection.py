@@ -1,4 +1,4 @@
-"""What is wanted of some logs: topics, by name or by pattern, and a span of time."""
+"""Topics, by name or by pattern, and a span of time of some logs."""
 
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,11 +40,11 @@ class Selection:
     unfinished : list of Path
         Those of `logs` that were not completed.
     channels : dict of str to list of (Channel, Schema or None)
-        By topic, for the topics that are wanted; those that say the same are there once.
+        By topic, equal ones once.
     metadata : list of dict of str to str
         The `hearthlog` records of the logs; equal ones are there once.
     topics : frozenset of str or None
-        Those that are wanted; None for all.
+        None for all.
     start, end : int or None
         Log times in nanoseconds: from `start` on, before `end`.
     span : (int, int)
@@ -128,14 +128,14 @@ def select(
     catalogs: dict[Path, Catalog | None] = {}
     for each in paths:
         catalogs |= dict.fromkeys(find_logs(each), _catalog(each))
-    found = {path.resolve(): path for path in catalogs}
-    spans = time_spans(found.values(), lambda path: _span(path, catalogs[path]))
-    wanted = [
+    files = {path.resolve(): path for path in catalogs}
+    spans = time_spans(files.values(), lambda path: _span(path, catalogs[path]))
+    chosen = [
         (first, last, path)
         for first, last, path in spans
         if (start is None or last >= start) and (end is None or first < end)
     ]
-    contents = list(map_logs(_Content, [path for _, _, path in wanted]))
+    contents = list(map_logs(_Content, [path for _, _, path in chosen]))
     channels = _by_topic(channel for content in contents for channel in content.channels)
     topics = _matching(patterns, channels) if patterns and contents else None
     metadata: list[Mapping[str, str]] = []
@@ -143,7 +143,7 @@ def select(
         if record not in metadata:
             metadata.append(record)
     return Selection(
-        logs=[path for _, _, path in wanted],
+        logs=[path for _, _, path in chosen],
         earlier=[p for first, _, p in reversed(spans) if start is not None and first < start],
         unfinished=[content.path for content in contents if not content.complete],
         channels={t: same for t, same in channels.items() if topics is None or t in topics},
@@ -152,8 +152,8 @@ def select(
         start=start,
         end=end,
         span=(
-            max([start or 0, *(first for first, _, _ in wanted[:1])]),
-            max((last for _, last, _ in wanted), default=0),
+            max([start or 0, *(first for first, _, _ in chosen[:1])]),
+            max((last for _, last, _ in chosen), default=0),
         ),
     )
 
@@ -191,26 +191,26 @@ class _Content:
 def identity(channel: Channel, schema: Schema | None) -> Hashable:
     """Return what two channels, of two logs perhaps, have in common if they say the same."""
     definition = None if schema is None else (schema.name, schema.encoding, schema.data)
-    about = frozenset(channel.metadata.items())
-    return channel.topic, channel.message_encoding, about, definition
+    metadata = frozenset(channel.metadata.items())
+    return channel.topic, channel.message_encoding, metadata, definition
 
 
 def _by_topic(channels: Iterable[Described]) -> dict[str, list[Described]]:
-    found: dict[Hashable, Described] = {}
+    different: dict[Hashable, Described] = {}
     for channel, schema in channels:
-        found.setdefault(identity(channel, schema), (channel, schema))
+        different.setdefault(identity(channel, schema), (channel, schema))
     topics: dict[str, list[Described]] = {}
-    for channel, schema in found.values():
+    for channel, schema in different.values():
         topics.setdefault(channel.topic, []).append((channel, schema))
     return topics
 
 
 def _matching(patterns: Sequence[str], topics: Iterable[str]) -> frozenset[str]:
-    known = sorted(topics)
-    wanted: set[str] = set()
+    names = sorted(topics)
+    matching: set[str] = set()
     for pattern in patterns:
-        fitting = [topic for topic in known if fnmatchcase(topic, pattern)]
+        fitting = [topic for topic in names if fnmatchcase(topic, pattern)]
         if not fitting:
-            raise LogError(f"no topic {pattern}; there are {', '.join(known)}")
-        wanted.update(fitting)
-    return frozenset(wanted)
+            raise LogError(f"no topic {pattern}; there are {', '.join(names)}")
+        matching.update(fitting)
+    return frozenset(matching)

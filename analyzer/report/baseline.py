@@ -27,7 +27,7 @@ def usual(values: Sequence[Value | None]) -> Usual | None:
     return Usual(float(np.median(numbers)), min(numbers), max(numbers))
 
 
-def compared(value: Value, known: Usual) -> int:
+def compared(value: Value, baseline: Usual) -> int:
     """Compare a figure, as far as it is sure, with what is usual.
 
     Returns
@@ -35,6 +35,6 @@ def compared(value: Value, known: Usual) -> int:
     int
         1: more than on any of those days, or later; -1: less, or earlier; 0: as usual.
     """
-    if whole(value.low) > whole(known.highest):
+    if whole(value.low) > whole(baseline.highest):
         return 1
-    return -1 if whole(value.high) < whole(known.lowest) else 0
+    return -1 if whole(value.high) < whole(baseline.lowest) else 0

@@ -103,8 +103,8 @@ def _top(account: Account, title: str, gist: Sequence[str]) -> Iterator[str]:
     microphones = listed([plain(name) for name in account.microphones])
     many = "s" if len(account.microphones) > 1 else ""
     who = f"Home: {account.home}, microphone{many}: {microphones}."
-    about = f"{who} Times are those of {account.zone}."
-    yield f"<header>\n<h1>{escape(title)}</h1>\n{paragraph(about)}\n</header>"
+    line = f"{who} Times are those of {account.zone}."
+    yield f"<header>\n<h1>{escape(title)}</h1>\n{paragraph(line)}\n</header>"
     yield box("gist", [paragraph(line) for line in gist])
     alerts = [*not_heard(account), *not_well(account)]
     yield box("alert", [paragraph(line, "" if not i else "more") for i, line in enumerate(alerts)])
@@ -144,10 +144,10 @@ def _sounds(account: Account, day: Day) -> Iterator[str]:
 
 def _was_heard(account: Account, name: str) -> bool:
     """Tell whether there is something to say of a class: now, or that it is usual."""
-    known = account.known(events_of(name))
+    baseline = account.baseline(events_of(name))
     values = [day.count(name) for day in account.days]
     missing = all(value is None for value in values)
-    return missing or any(v and v.marked for v in values) or bool(known and known[0].highest)
+    return missing or any(v and v.marked for v in values) or bool(baseline and baseline[0].highest)
 
 
 def _cells(account: Account, figure: Figure, day: Day) -> list[str]:
@@ -155,8 +155,8 @@ def _cells(account: Account, figure: Figure, day: Day) -> list[str]:
     cells = [f'<span class="unit">{escape(_text(figure.value(day)))}</span>']
     if account.comparable:
         change = account.change(figure, day)
-        said = f' <span class="differs">{change}</span>' if change else ""
-        cells.append(escape(account.usually(figure)) + said)
+        mark = f' <span class="differs">{change}</span>' if change else ""
+        cells.append(escape(account.usually(figure)) + mark)
     return cells
 
 
@@ -256,21 +256,21 @@ def _interrai(account: Account) -> Iterator[str]:
     )
     rows = []
     for item in interrai.ITEMS:
-        known = not item.needs or item.needs in account.classes
+        audible = not item.needs or item.needs in account.classes
         values = [value for day in days if (value := item.value(day)) is not None]
-        text = _text(_sum(values)) if known else "this model does not know the sound"
+        text = _text(_sum(values)) if audible else "this model does not know the sound"
         rows.append([escape(cell) for cell in (item.topic, item.heard, text, item.limits)])
     yield table(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
 
 
 def _foot(account: Account) -> Iterator[str]:
     live = account.labelling == LIVE
-    said = "what the recorder heard at the time" if live else f"the labels of {account.labelling}"
+    source = "what the recorder heard at the time" if live else f"the labels of {account.labelling}"
     yield "<footer>"
     yield heading("How to read this")
     yield paragraph(_HOW_TO_READ, "note")
     yield paragraph(_RIGHT_IN_TESTS if account.precisions else "", "note")
-    yield paragraph(f"Made from {said}, and from corrections, if there are any.", "note")
+    yield paragraph(f"Made from {source}, and from corrections, if there are any.", "note")
     yield "</footer>"
 
 

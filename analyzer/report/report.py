@@ -34,7 +34,7 @@ class Period(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Made:
+class WrittenReport:
     """A page that was written, and what could not be read for it."""
 
     page: Path
@@ -43,24 +43,23 @@ class Made:
 
 
 def make_report(
-    shelf: HomeLogs,
+    logs: HomeLogs,
     period: Period,
     page: Path,
     labelling: str = LIVE,
     progress: Progress = ignore_progress,
-) -> Made:
+) -> WrittenReport:
     """Write the report of a day, or of a week.
 
     Parameters
     ----------
-    shelf : HomeLogs
+    logs : HomeLogs
     period : Period
     page : Path
         Of the HTML file; the picture is beside it, with the suffix `.png`.
     labelling : str, optional
         `live`, or the model of relabel layers.
     progress : callable, optional
-        Is called with the share that is done.
 
     Raises
     ------
@@ -76,11 +75,11 @@ def make_report(
         check_new(path)
     first, count, zone = period
     days = [first + timedelta(days=number) for number in range(count)]
-    check_day(shelf, days[0], days[-1], zone)
+    check_day(logs, days[0], days[-1], zone)
     close = day_span(days[0], zone)[0], day_span(days[-1], zone)[1]
     earlier = [first - timedelta(days=number) for number in range(DAYS, 0, -1)]
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
-    data = read_home(shelf, labelling, since, close, progress)
+    data = read_home(logs, labelling, since, close, progress)
     account = _account(data, days, earlier, zone, labelling)
     with new_file(page) as html, new_file(picture) as png:
         if count == 1:
@@ -90,7 +89,7 @@ def make_report(
             save_week(png, account.days)
             text = week_page(account, png.read_bytes())
         html.write_text(text, "utf-8")
-    return Made(page, picture, data.losses)
+    return WrittenReport(page, picture, data.losses)
 
 
 def _account(
@@ -119,11 +118,11 @@ def _account(
 def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
     """Measure for how many hours each microphone heard nothing."""
     whole = end - start
-    found: dict[str, float] = {}
+    hours: dict[str, float] = {}
     for (_, microphone), segments in data.segments.items():
         own = common(segments.spans, one(start, end)).length
-        found[microphone] = max(found.get(microphone, 0.0), (whole - own) / HOUR)
-    return found
+        hours[microphone] = max(hours.get(microphone, 0.0), (whole - own) / HOUR)
+    return hours
 
 
 def _within(troubles: Sequence[Trouble], span: tuple[int, int]) -> list[Trouble]:

@@ -73,24 +73,24 @@ class Account:
         """Whether there are days to compare with."""
         return len(self.earlier) >= FEWEST
 
-    def known(self, figure: Figure) -> tuple[Usual, Value] | None:
+    def baseline(self, figure: Figure) -> tuple[Usual, Value] | None:
         """Return what is usual, and a value that can write it; None if there are too few days."""
         days = [day for day in self.earlier if day.comparable(figure.name)]
         values = [value for day in days if (value := figure.value(day)) is not None]
-        found = usual(values)
-        return None if found is None else (found, values[0])
+        baseline = usual(values)
+        return None if baseline is None else (baseline, values[0])
 
     def usually(self, figure: Figure) -> str:
         """Say what is usual: `4 (3 to 6)`; nothing if there are too few days."""
-        found = self.known(figure)
-        return "" if found is None else found[1].spread(*found[0])
+        baseline = self.baseline(figure)
+        return "" if baseline is None else baseline[1].spread(*baseline[0])
 
     def change(self, figure: Figure, day: Day) -> str:
         """Say in a word or two what is not as on any earlier day; nothing if all is as usual."""
-        value, found = figure.value(day), self.known(figure)
-        if value is None or found is None or not day.comparable(figure.name):
+        value, baseline = figure.value(day), self.baseline(figure)
+        if value is None or baseline is None or not day.comparable(figure.name):
             return ""
-        return _CHANGES.get((type(value), compared(value, found[0])), "")
+        return _CHANGES.get((type(value), compared(value, baseline[0])), "")
 
     @property
     def too_few(self) -> str:

@@ -112,8 +112,8 @@ _ACTIVITY_NOTE = (
 )
 
 
-def _missing(classes: Sequence[str], wanted: Sequence[str]) -> str:
-    if any(name in classes for name in wanted):
+def _missing(classes: Sequence[str], needed: Sequence[str]) -> str:
+    if any(name in classes for name in needed):
         return ""
-    names = listed([in_words(name).lower() for name in wanted])
+    names = listed([in_words(name).lower() for name in needed])
     return f"Cannot be told: the model of this home does not know these sounds ({names})."

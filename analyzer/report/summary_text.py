@@ -49,9 +49,9 @@ def gist_of_week(account: Account) -> Iterator[str]:
         yield f"Nothing was outside of what was heard on the {len(account.earlier)} days before."
         return
     yield f"Not as on any of the {len(account.earlier)} days before this week:"
-    for day, found in changes.items():
-        if found:
-            yield f"{short_day(day)}: {_few(found)}."
+    for day, words in changes.items():
+        if words:
+            yield f"{short_day(day)}: {_few(words)}."
 
 
 def not_heard(account: Account) -> Iterator[str]:
@@ -142,8 +142,7 @@ def _changed(account: Account, day: Day) -> Iterator[str]:
 
 def _figures(day: Day) -> Iterator[tuple[Figure, str]]:
     """Go through the figures, what matters most first; a class is named once."""
-    about = sections(day.home.classes)
-    for section in sorted(about, key=lambda section: section.title != "Night"):
+    for section in sorted(sections(day.home.classes), key=lambda section: section.title != "Night"):
         for figure in section.figures:
             yield figure, " in the night" if section.title == "Night" else ""
     for name in day.home.classes:
@@ -166,8 +165,8 @@ def _unexplained(account: Account) -> int:
     """Return how long nothing was heard without a gap that says why, in nanoseconds."""
     starts = np.array([gap.start for gap in account.gaps], np.int64)
     ends = np.array([gap.end for gap in account.gaps], np.int64)
-    said = joined(starts, ends)
-    missing = (without(without(day.span, day.coverage), said) for day in account.days)
+    explained = joined(starts, ends)
+    missing = (without(without(day.span, day.coverage), explained) for day in account.days)
     return sum(spans.length for spans in missing)
 
 
@@ -175,10 +174,10 @@ def _by_lasting(
     troubles: Iterable[Trouble], name: Callable[[Trouble], str]
 ) -> list[tuple[str, list[Trouble]]]:
     """Put together what has one name; what lasted longest comes first."""
-    found: dict[str, list[Trouble]] = {}
+    groups: dict[str, list[Trouble]] = {}
     for trouble in troubles:
-        found.setdefault(name(trouble), []).append(trouble)
-    return sorted(found.items(), key=lambda pair: (-_lasting(pair[1]), pair[0]))[:_MOST]
+        groups.setdefault(name(trouble), []).append(trouble)
+    return sorted(groups.items(), key=lambda pair: (-_lasting(pair[1]), pair[0]))[:_MOST]
 
 
 def _lasting(troubles: Sequence[Trouble]) -> int:

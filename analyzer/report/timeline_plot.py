@@ -95,13 +95,19 @@ def _hours(axes: Any, day: Day, earlier: Sequence[Day]) -> None:
     minutes = day.sound_by_hour
     places = np.arange(len(minutes))
     axes.bar(places, minutes, width=0.84, align="edge", color="#5b6b7c")
-    for place, (number, known) in enumerate(zip(minutes, _usual_hours(day, earlier), strict=True)):
-        top = max(number, 0.0 if known is None else known.median)
+    for place, (number, baseline) in enumerate(
+        zip(minutes, _usual_hours(day, earlier), strict=True)
+    ):
+        top = max(number, 0.0 if baseline is None else baseline.median)
         if number >= 0.5:
             axes.text(place + 0.42, top + 3, f"{number:.0f}", ha="center", fontsize=7.5)
-        if known is not None:
-            axes.plot((place, place + 0.84), (known.median, known.median), color="black", lw=1.6)
-            axes.plot((place, place + 0.84), (known.median, known.median), color="white", lw=0.5)
+        if baseline is not None:
+            axes.plot(
+                (place, place + 0.84), (baseline.median, baseline.median), color="black", lw=1.6
+            )
+            axes.plot(
+                (place, place + 0.84), (baseline.median, baseline.median), color="white", lw=0.5
+            )
     _unheard(axes, day, day.coverage, (0, 75))
     axes.set_ylim(0, 75)
     axes.set_yticks((0, 30, 60))
@@ -115,8 +121,8 @@ def _usual_hours(day: Day, earlier: Sequence[Day]) -> list[Usual | None]:
     """Return what is usual in each hour; nothing where the clock was changed."""
     same = [each.sound_by_hour for each in earlier if len(each.hours) == len(day.hours)]
     columns: list[NDArray[np.float64]] = list(np.array(same).T) if same else []
-    found = [usual([Minutes(float(number)) for number in column]) for column in columns]
-    return found or [None] * (len(day.hours) - 1)
+    hours = [usual([Minutes(float(number)) for number in column]) for column in columns]
+    return hours or [None] * (len(day.hours) - 1)
 
 
 def _unheard(axes: Any, day: Day, heard: Spans, band: tuple[float, float]) -> None:

@@ -51,14 +51,14 @@ def report(
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
-    shelf = find_home_logs(logs)
-    zone = home_zone(timezone, shelf.records())
+    home_logs = find_home_logs(logs)
+    zone = home_zone(timezone, home_logs.records())
     if first is None:
-        first = shelf.last_whole_day(zone)
+        first = home_logs.last_whole_day(zone)
     count = 1 if week is None else WEEK
-    page = output or Path(_name(shelf, first, count))
+    page = output or Path(_name(home_logs, first, count))
     with share_done("reading what was heard") as progress:
-        made = make_report(shelf, Period(first, count, zone), page, labels, progress)
+        made = make_report(home_logs, Period(first, count, zone), page, labels, progress)
     print(made.page)
     print(made.picture)
     end_with_warnings(made.losses)
@@ -77,8 +77,8 @@ def _first_day(day: str | None, week: str | None) -> date:
     return start if week is None else start - timedelta(days=start.weekday())
 
 
-def _name(shelf: "HomeLogs", first: date, count: int) -> str:
+def _name(home_logs: "HomeLogs", first: date, count: int) -> str:
     """Name a page after the home and the day."""
-    node = next((entry.node for entry in shelf.entries if entry.node), "home")
+    node = next((entry.node for entry in home_logs.entries if entry.node), "home")
     when = f"{first}" if count == 1 else f"{first:%G-W%V}"
     return f"{node}_{when}.html"

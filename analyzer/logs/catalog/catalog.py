@@ -112,10 +112,10 @@ class Catalog:
         """Return which row is that of a file; None where `current` is None."""
         try:
             number = self._numbers.get(_relative(path, self.folder))
-            found = None if number is None else _size_and_time(path)
+            size_and_time = None if number is None else _size_and_time(path)
         except (ValueError, LogError):
             return None
-        if number is None or (self._sizes[number], self._times[number]) != found:
+        if number is None or (self._sizes[number], self._times[number]) != size_and_time:
             return None
         return number
 
@@ -161,14 +161,14 @@ def load_catalog(folder: Path) -> Catalog | None:
 
 
 def write_catalog(
-    folder: Path, known: Catalog | None = None, progress: Progress = ignore_progress
+    folder: Path, before: Catalog | None = None, progress: Progress = ignore_progress
 ) -> Catalog:
     """Make the catalogue of a folder; in one step it takes the place of the one that is there.
 
     Parameters
     ----------
     folder : Path
-    known : Catalog, optional
+    before : Catalog, optional
         Files that are as it says are not read again, damaged ones excepted.
     progress : callable, optional
         Is given how many of how many files are done.
@@ -181,14 +181,14 @@ def write_catalog(
         If interrupted; the catalogue then has what was read so far.
     """
     logs = find_logs(folder)
-    kept, new = _divided(logs, known)
-    tables = [SCHEMA.empty_table() if known is None else known.table.take(kept)]
+    kept, new = _divided(logs, before)
+    tables = [SCHEMA.empty_table() if before is None else before.table.take(kept)]
     rows: list[Row] = []
     interrupt: KeyboardInterrupt | None = None
     with replaced_file(folder / CATALOG) as temporary, temporary.open("wb") as stream:
         try:
-            for done, found in enumerate(map_logs(partial(_read_row, folder), new), 1):
-                rows += found
+            for done, read in enumerate(map_logs(partial(_read_row, folder), new), 1):
+                rows += read
                 if len(rows) == _BATCH:
                     tables.append(table_of([vars(row) for row in rows]))
                     rows = []
@@ -202,14 +202,14 @@ def write_catalog(
     return Catalog(folder, table)
 
 
-def _divided(logs: Sequence[Path], known: Catalog | None) -> tuple[list[int], list[Path]]:
+def _divided(logs: Sequence[Path], before: Catalog | None) -> tuple[list[int], list[Path]]:
     """Tell which rows are still true, and which files are to be read."""
-    if known is None:
+    if before is None:
         return [], list(logs)
     kept: list[int] = []
     new: list[Path] = []
-    states = known.table["state"].to_pylist()
-    for path, number in zip(logs, map_logs(known.find, logs), strict=True):
+    states = before.table["state"].to_pylist()
+    for path, number in zip(logs, map_logs(before.find, logs), strict=True):
         # What could not be read then may be readable now, though the file is the same.
         if number is None or states[number] == DAMAGED:
             new.append(path)
@@ -248,12 +248,12 @@ def _read_row(folder: Path, path: Path) -> list[Row]:
 
 def _filled(row: Row, contents: Contents) -> Row:
     """Add what was found in a file to its row."""
-    about = {name: value for name, value in contents.about.items() if value}
+    record = {name: value for name, value in contents.record.items() if value}
     start, end = contents.span or (None, None)
     first, last = contents.first or (None, None), contents.last or (None, None)
     return replace(
         row,
-        node=about.get("node", row.node),
+        node=record.get("node", row.node),
         state=FINISHED if contents.complete else UNFINISHED,
         microphones=contents.microphones,
         start=start,
@@ -263,11 +263,11 @@ def _filled(row: Row, contents: Contents) -> Row:
         first_stamp=first[1],
         last_frame=last[0],
         last_stamp=last[1],
-        feature_set=about.get("feature_set"),
-        model=about.get("model"),
-        model_sha256=about.get("model_sha256"),
-        input_sha256=about.get("input_sha256"),
-        version=about.get("version"),
+        feature_set=record.get("feature_set"),
+        model=record.get("model"),
+        model_sha256=record.get("model_sha256"),
+        input_sha256=record.get("input_sha256"),
+        version=record.get("version"),
         gaps=contents.gaps,
         gap_seconds=contents.gap_seconds,
         labels=[
@@ -286,6 +286,6 @@ def _relative(path: Path, folder: Path) -> str:
 def _size_and_time(path: Path) -> tuple[int, int]:
     """Return bytes and time of change (ns), by which a changed file is known."""
     with store_errors(path):
-        about = path.stat()
-    made = getattr(about, "st_birthtime", 0)  # an object is not changed, but made anew
-    return about.st_size, about.st_mtime_ns or int(made * NANOSECONDS)
+        status = path.stat()
+    made = getattr(status, "st_birthtime", 0)  # an object is not changed, but made anew
+    return status.st_size, status.st_mtime_ns or int(made * NANOSECONDS)

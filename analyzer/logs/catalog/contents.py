@@ -41,7 +41,7 @@ class Contents:
         Whether it was finished.
     span : (int, int) or None
         First and last log time.
-    about : dict of str to str
+    record : dict of str to str
         What its `hearthlog` records say, so far as they agree.
     microphones : list of str
     frames : int
@@ -58,7 +58,7 @@ class Contents:
 
     complete: bool
     span: tuple[int, int] | None
-    about: dict[str, str] = field(default_factory=dict)
+    record: dict[str, str] = field(default_factory=dict)
     microphones: list[str] = field(default_factory=list)
     frames: int = 0
     first: tuple[int, int] | None = None
@@ -85,8 +85,8 @@ def read_contents(path: Path, labelling: str) -> Contents:
     """
     span = time_span(path)
     with LogFile(path) as file:
-        found = Contents(file.complete, span, _about(file))
-        reading = _Reading(file, found, labelling)
+        contents = Contents(file.complete, span, _common_record(file))
+        reading = _Reading(file, contents, labelling)
         if file.statistics is None:  # nothing says how many messages there are, or where
             reading.read(file.chunks, _EVENTS | _FEATURES)
         else:
@@ -94,21 +94,21 @@ def read_contents(path: Path, labelling: str) -> Contents:
             reading.read(_ends(reading.chunks_with(_FEATURES)), _FEATURES)
             counts = file.statistics.channel_message_counts
             ids = reading.channels_of(_FEATURES)
-            found.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
+            contents.frames = min(sum(counts.get(i, 0) for i in ids), file.size)
         ours = [file.channels[i].topic for i in reading.channels_of(_OTHERS | _FEATURES | _EVENTS)]
-        found.microphones = sorted({microphone_of(topic)[:_LONGEST] for topic in ours} - {""})
+        contents.microphones = sorted({microphone_of(topic)[:_LONGEST] for topic in ours} - {""})
         if len(reading.channels_of(_FEATURES)) > 1:
-            found.first = found.last = None
-    return found
+            contents.first = contents.last = None
+    return contents
 
 
-def _about(file: LogFile) -> dict[str, str]:
+def _common_record(file: LogFile) -> dict[str, str]:
     """Read what the file says of itself, so far as its records agree."""
-    said: dict[str, set[str]] = {}
+    values_by_name: dict[str, set[str]] = {}
     for record in read_provenance(file):
         for name, value in record.items():
-            said.setdefault(name, set()).add(value[:_LONGEST])
-    return {name: values.pop() for name, values in said.items() if len(values) == 1}
+            values_by_name.setdefault(name, set()).add(value[:_LONGEST])
+    return {name: values.pop() for name, values in values_by_name.items() if len(values) == 1}
 
 
 def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
@@ -119,9 +119,9 @@ def _ends(chunks: NDArray[np.void]) -> NDArray[np.void]:
 class _Reading:
     """Reads messages of one log, and notes in its contents what they say."""
 
-    def __init__(self, file: LogFile, found: Contents, labelling: str) -> None:
+    def __init__(self, file: LogFile, contents: Contents, labelling: str) -> None:
         self._file = file
-        self._found = found
+        self._contents = contents
         self._labelling = labelling
 
     def channels_of(self, kinds: Mapping[str, Collection[str]]) -> set[int]:
@@ -141,21 +141,21 @@ class _Reading:
         holds = [not ids or not ids.isdisjoint(channels) for ids in self._file.channel_sets]
         return self._file.chunks[np.array(holds, bool)[self._file.chunks["channels"]]]
 
-    def read(self, chunks: NDArray[np.void], wanted: Mapping[str, Collection[str]]) -> None:
-        """Read some chunks, a few at a time, and note the messages of the wanted types."""
+    def read(self, chunks: NDArray[np.void], types: Mapping[str, Collection[str]]) -> None:
+        """Read some chunks, a few at a time, and note their messages of some types."""
         topics = None
         if self._file.statistics is not None:
-            topics = {self._file.channels[i].topic for i in self.channels_of(wanted)}
+            topics = {self._file.channels[i].topic for i in self.channels_of(types)}
         for batch in read_in_batches(self._file, chunks, topics, check=True):
-            for columns in decode_types(self._file.path, batch, wanted):
+            for columns in decode_types(self._file.path, batch, types):
                 self._note(columns)
 
     def _note(self, columns: Columns) -> None:
         if columns.type == message_types.FEATURES:
             self._note_features(columns)
         elif columns.type == message_types.GAP:
-            self._found.gaps += len(columns)
-            self._found.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
+            self._contents.gaps += len(columns)
+            self._contents.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
         elif self._is_labelled(columns.topic):
             self._note_segments(columns)
 
@@ -167,9 +167,9 @@ class _Reading:
     def _note_features(self, columns: Columns) -> None:
         ends = columns.take(np.array([0, len(columns) - 1]))
         pairs = zip(ends["frame"].tolist(), ends["header.stamp"].tolist(), strict=True)
-        first, self._found.last = pairs
-        self._found.first = self._found.first or first
-        self._found.frames += len(columns)
+        first, self._contents.last = pairs
+        self._contents.first = self._contents.first or first
+        self._contents.frames += len(columns)
 
     def _note_segments(self, columns: Columns) -> None:
         labels, numbers = np.unique(columns["label"], return_inverse=True)
@@ -177,9 +177,9 @@ class _Reading:
         for label, count, length in zip(
             labels.tolist(), np.bincount(numbers).tolist(), seconds.tolist(), strict=True
         ):
-            self._found.segments[label[:_LONGEST]] += count
-            self._found.seconds[label[:_LONGEST]] += length
-        if len(self._found.segments) > _MOST_CLASSES:
+            self._contents.segments[label[:_LONGEST]] += count
+            self._contents.seconds[label[:_LONGEST]] += length
+        if len(self._contents.segments) > _MOST_CLASSES:
             raise LogError(
                 f"{self._file.path}: has more than {_MOST_CLASSES} different labels; "
                 "no classifier has so many"

@@ -90,15 +90,15 @@ def read_table(stream: BinaryIO) -> pa.Table:
     digest = data[footer - _DIGEST : footer]
     if _digest(data[: footer - _DIGEST], data[footer:]) != digest:
         raise ValueError("it is damaged, or was not made by hearthlog")
-    about = pq.read_metadata(pa.BufferReader(data))
-    leaves = {about.schema.column(number).path for number in range(about.num_columns)}
-    version = about.schema.to_arrow_schema().metadata
+    parquet = pq.read_metadata(pa.BufferReader(data))
+    leaves = {parquet.schema.column(number).path for number in range(parquet.num_columns)}
+    version = parquet.schema.to_arrow_schema().metadata
     if leaves != _LEAVES or version != SCHEMA.metadata:
         raise ValueError("it is of another version of hearthlog")
     room = _ROOM + _GROWTH * len(data)
-    _check_size(about, room)
+    _check_size(parquet, room)
     tables = [SCHEMA.empty_table()]
-    with pq.ParquetFile(pa.BufferReader(data), metadata=about, read_dictionary=_TEXTS) as file:
+    with pq.ParquetFile(pa.BufferReader(data), metadata=parquet, read_dictionary=_TEXTS) as file:
         for batch in file.iter_batches(_BATCH):
             room -= _size(batch)
             if room < 0:
@@ -120,9 +120,9 @@ def _digest(body: memoryview, footer: memoryview) -> bytes:
     return digest.digest()
 
 
-def _check_size(about: pq.FileMetaData, room: int) -> None:
+def _check_size(parquet: pq.FileMetaData, room: int) -> None:
     """Raise ValueError if the file would not have room in memory."""
-    for group in map(about.row_group, range(about.num_row_groups)):
+    for group in map(parquet.row_group, range(parquet.num_row_groups)):
         for column in map(group.column, range(group.num_columns)):
             room -= column.num_values * _VALUE
             if column.compression != "UNCOMPRESSED":

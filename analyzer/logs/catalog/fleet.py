@@ -114,5 +114,5 @@ def _grouped(
     """Aggregate the rows that agree in some columns, in the order of these."""
     grouped = table.group_by(keys, use_threads=False).aggregate(functions)
     names = [*keys, *(name for name, _ in functions)]
-    found = grouped.select([*keys, *map("_".join, functions)]).rename_columns(names)
-    return found.sort_by([(key, "ascending") for key in keys]).to_pylist()
+    sums = grouped.select([*keys, *map("_".join, functions)]).rename_columns(names)
+    return sums.sort_by([(key, "ascending") for key in keys]).to_pylist()
