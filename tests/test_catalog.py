@@ -19,7 +19,7 @@ from spliced import record_logs, run
 from stores import put
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.catalog import (
+from hearthlog.analyzer.logs.catalog.catalog import (
     DAMAGED,
     FINISHED,
     LOG,

@@ -21,7 +21,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.catalog import Catalog
+    from hearthlog.analyzer.logs.catalog.catalog import Catalog
 
 _LAST = (1 << 63) - 1  # log time
 Described = tuple[Channel, Schema | None]
@@ -165,7 +165,7 @@ def _catalog(folder: Path) -> "Catalog | None":
     if not exists:
         return None
     try:
-        from hearthlog.analyzer.logs.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
+        from hearthlog.analyzer.logs.catalog.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
     except ModuleNotFoundError:
         return None
     return read_catalog(folder)

@@ -54,13 +54,10 @@ class Overlay(NamedTuple):
     ends: Int64
     rows: Int64
 
-    def taken(self, which: NDArray[np.bool_]) -> "Overlay":
-        """Return some of its parts."""
-        return Overlay(self.starts[which], self.ends[which], self.rows[:, which])
-
     def in_all(self) -> "Overlay":
         """Return the parts in which all have a span."""
-        return self.taken(np.logical_and.reduce(self.rows >= 0))
+        which = np.logical_and.reduce(self.rows >= 0)
+        return Overlay(self.starts[which], self.ends[which], self.rows[:, which])
 
 
 NONE = Spans(np.empty(0, np.int64), np.empty(0, np.int64))

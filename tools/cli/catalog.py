@@ -14,7 +14,7 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.catalog import Catalog
+    from hearthlog.analyzer.logs.catalog.catalog import Catalog
     from hearthlog.analyzer.logs.catalog.fleet import Home, LabelAmount
 
 _HOMES_SHOWN = 40  # that is a page
@@ -39,7 +39,7 @@ def catalog(
     Files that have not changed since the last catalogue are not read again. Exit status 3: a file
     is unfinished or damaged.
     """
-    from hearthlog.analyzer.logs.catalog import DAMAGED, UNFINISHED
+    from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, UNFINISHED
     from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 
     if folder.is_file():
@@ -66,7 +66,7 @@ def catalog(
 
 def _write(folder: Path) -> "Catalog":
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.catalog import load_catalog, write_catalog
+    from hearthlog.analyzer.logs.catalog.catalog import load_catalog, write_catalog
 
     previous = None
     try:
