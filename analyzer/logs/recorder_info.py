@@ -108,18 +108,13 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
         if len(microphones) > 1:
             names = ", ".join(sorted(microphones))
             raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
-        attached = [file.record(p) for p in file.record_locations if p.opcode == Opcode.ATTACHMENT]
+        attachments = attachments_of(file)
         # What was merged is of the last of its recorders.
         record = next(reversed(read_provenance(file)), {})
         complete = file.complete
         (microphone,) = microphones
         info = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
         frame = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
-    attachments = [
-        Attachment(r.name, r.media_type, r.data)
-        for r in attached
-        if isinstance(r, records.Attachment)
-    ]
     info = {**record, **info}
     digest = info.get("model_sha256", "")
     first = None
@@ -144,6 +139,13 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
         attachments=attachments,
         first_frame=first,
     )
+
+
+def attachments_of(file: LogFile) -> list[Attachment]:
+    """Read what is attached to a log."""
+    locations = [each for each in file.record_locations if each.opcode == Opcode.ATTACHMENT]
+    attached = [r for r in map(file.record, locations) if isinstance(r, records.Attachment)]
+    return [Attachment(r.name, r.media_type, r.data) for r in attached]
 
 
 def features_of(origin: RecorderInfo) -> FeatureSet:

@@ -5,14 +5,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.opcode import Opcode
-from mcap.records import Attachment
-
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import MOST_CLASSES
+from hearthlog.analyzer.logs.recorder_info import attachments_of
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.spans import common, one
 from hearthlog.analyzer.marks.marks import Mark, read_marks
@@ -257,9 +255,7 @@ def _precisions(entries: Iterable[HomeLog]) -> dict[str, float]:
 
 def _precisions_of(path: Path) -> dict[str, float]:
     with LogFile(path) as file:
-        locations = [at for at in file.record_locations if at.opcode == Opcode.ATTACHMENT]
-        records = [file.record(location) for location in locations]
-    texts = [r.data for r in records if isinstance(r, Attachment) and r.name == DESCRIPTION]
+        texts = [each.data for each in attachments_of(file) if each.name == DESCRIPTION]
     precisions: dict[str, float] = {}
     for text in texts:
         for label, metrics in class_metrics(text).items():
