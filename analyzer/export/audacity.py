@@ -2,14 +2,14 @@
 
 from typing import BinaryIO
 
+from hearthlog.analyzer.export.exporter import stream_exporter
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.logs.columns import iterate_columns
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import topic as topic_of
 from hearthlog.schemas.text import printable
 from hearthlog.schemas.times import NANOSECONDS
-
-FIELDS = {"header.stamp", "duration", "label"}
 
 
 class LabelTrack:
@@ -54,3 +54,6 @@ def _first_frame(topic: str, selection: Selection) -> int | None:
     )
     first = next(found, None)
     return None if first is None else int(first[0]["header.stamp"].min())
+
+
+EXPORTER = stream_exporter(LabelTrack, message_types.SEGMENT, {"header.stamp", "duration", "label"})

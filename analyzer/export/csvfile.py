@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
+from hearthlog.analyzer.export.exporter import stream_exporter
 from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.selection import Selection
@@ -120,3 +121,6 @@ def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
     rows = [list(row) for row in values]
     columns = zip_longest(*rows)  # None where a row is shorter
     return [pa.array(column, type_of(element)) for column in columns]
+
+
+EXPORTER = stream_exporter(CsvFile)

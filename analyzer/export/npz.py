@@ -1,13 +1,12 @@
 """A topic as NumPy arrays, in one file that loads without pickle."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.file_names import file_stem
 from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
@@ -16,39 +15,31 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field, fields_of
 from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.progress import Progress
 
 _TEXTS_LIMIT = 1 << 30  # bytes
 
 
-def save_npz(topic: str, selection: Selection, name: Callable[[str], Path]) -> bool:
-    """Write an array a field, by its path, and `log_time`, `publish_time` and `sequence`.
+def _save(selection: Selection, files: OutputFiles, _: Progress) -> None:
+    """Write an array for each field, by its path, and `log_time`, `publish_time` and `sequence`.
 
     Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths lie one
     after the other, their lengths in `<field>.lengths`; arrays of messages are JSON. The names
     that the channel has for the elements of an array are in `<field>_names`.
-
-    Parameters
-    ----------
-    topic : str
-    selection : Selection
-    name : callable
-        Gives a path for the stem of a file name; it is called if there is a message.
-
-    Returns
-    -------
-    bool
-        Whether there was a message.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, or if texts are too long for NumPy.
     """
-    found = read_columns(selection.logs, {topic}, selection.start, selection.end)
-    if topic not in found:
+    selection.verify()
+    saved = [_save_topic(topic, selection, files) for topic in selection.channels]
+    if not any(saved):
+        raise selection.nothing()
+
+
+def _save_topic(topic: str, selection: Selection, files: OutputFiles) -> bool:
+    """Write a file if there is a message."""
+    by_topic = read_columns(selection.logs, {topic}, selection.start, selection.end)
+    if topic not in by_topic:
         return False
-    arrays = _arrays(found.pop(topic), _fields(topic, selection))
-    with ZipFile(name(file_stem(topic)), "x") as archive:
+    arrays = _arrays(by_topic.pop(topic), _fields(topic, selection))
+    with ZipFile(files.new(file_stem(topic)), "x") as archive:
         for key, array in arrays.items():  # np.savez has no place for a field named `file`
             with archive.open(f"{key}.npy", "w", force_zip64=True) as part:
                 np.lib.format.write_array(part, array, allow_pickle=False)
@@ -61,10 +52,10 @@ def _fields(topic: str, selection: Selection) -> dict[str, Field]:
         for _, schema in selection.channels[topic]
         if schema is not None
     }
-    found = [fields_of(kind) for kind in kinds]
-    if any(fields != found[0] for fields in found):
+    definitions = [fields_of(kind) for kind in kinds]
+    if any(fields != definitions[0] for fields in definitions):
         raise LogError(f"{topic}: is defined in two ways; choose one log")
-    return found[0]
+    return definitions[0]
 
 
 def _arrays(columns: Columns, fields: dict[str, Field]) -> dict[str, NDArray[Any]]:
@@ -100,3 +91,6 @@ def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:
     if values.size * longest * 4 > _TEXTS_LIMIT:
         raise LogError(f"{path}: texts are too long for NPZ; choose parquet")
     return values.astype(f"U{max(longest, 1)}")
+
+
+EXPORTER = Exporter(_save)

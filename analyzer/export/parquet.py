@@ -6,6 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hearthlog.analyzer.export.arrow import batch_of, schema_of
+from hearthlog.analyzer.export.exporter import stream_exporter
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 
@@ -51,3 +52,6 @@ class ParquetFile:
             writer.write_table(pa.Table.from_batches(self._batches))
         self._batches.clear()
         self._size = 0
+
+
+EXPORTER = stream_exporter(ParquetFile)

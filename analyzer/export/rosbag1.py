@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Hashable
-from pathlib import Path
 from typing import NamedTuple
 
 from mcap.records import Schema
@@ -12,6 +11,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import is_latched
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
@@ -27,15 +27,10 @@ _TIME_LIMIT = NANOSECONDS << 32  # the year 2106
 _LITTLE_ENDIAN = b"\x00\x01"
 
 
-def save_rosbag1(path: Path, selection: Selection, progress: Progress) -> None:
-    """Write a bag of ROS 1; the sequence numbers of headers, which ROS 2 does not have, are 0.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, if there is no message, or one that ROS 1 cannot have.
-    """
-    with Writer(path) as writer:
+def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+    """Write a bag; the sequence numbers of headers, which ROS 2 does not have, are 0."""
+    selection.verify()
+    with Writer(files.path) as writer:
         bag = _Bag(writer)
         for batch in selection.messages(progress):
             bag.write(batch)
@@ -87,7 +82,7 @@ class _Bag:
     def _trim(self) -> None:
         """Forget where messages are in chunks that are written: how many there are is enough."""
         for chunk in self._writer.chunks[self._trimmed : -1]:
-            counts = {key: range(len(found)) for key, found in chunk.connections.items()}
+            counts = {key: range(len(each)) for key, each in chunk.connections.items()}
             chunk.connections = counts  # type: ignore[assignment]
         self._trimmed = len(self._writer.chunks) - 1
 
@@ -131,3 +126,6 @@ def _types_of(schema: Schema) -> Typestore:
     except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {schema.name!r} cannot be read") from error
     return types
+
+
+EXPORTER = Exporter(_save)

@@ -2,10 +2,18 @@
 
 import wave
 from collections.abc import Callable
+from contextlib import ExitStack
+from datetime import UTC, datetime
 from pathlib import Path
 
-from hearthlog.analyzer.logs.clips import SAMPLE_BYTES, Clip, clips_of
+from hearthlog.analyzer.export.exporter import Exporter, OutputFiles, write_topics
+from hearthlog.analyzer.export.file_names import file_stem
+from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, Clip, clips_of
+from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
+from hearthlog.schemas.messages.message_types import RAW_AUDIO
+from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.times import NANOSECONDS
 
 _HOLE = 5_000_000  # ns: stamps are as good as 1 ms, and what is lost is a frame at least
 _FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB
@@ -14,10 +22,7 @@ _FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB
 class WavFiles:
     """The clips of one topic, those that follow each other without a hole in one file.
 
-    Parameters
-    ----------
-    name : callable
-        Gives the path of the file that begins at a time, in nanoseconds of UTC.
+    `name` gives the path of the file that begins at a time, in nanoseconds of UTC.
     """
 
     def __init__(self, name: Callable[[int], Path]) -> None:
@@ -57,3 +62,18 @@ class WavFiles:
             and abs(clip.start - last.end) <= _HOLE
             and self._size + len(clip.data) <= _FILE_LIMIT
         )
+
+
+def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
+    def opened(topic: str, _: ExitStack) -> WavFiles:
+        return WavFiles(lambda start: files.new(f"{file_stem(topic)}_{_moment(start)}"))
+
+    write_topics(selection, progress, opened)
+
+
+def _moment(time: int) -> str:
+    seconds, rest = divmod(time, NANOSECONDS)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}.{rest // 1000:06}Z"
+
+
+EXPORTER = Exporter(_save, RAW_AUDIO, CLIP_FIELDS)

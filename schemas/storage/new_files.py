@@ -1,6 +1,7 @@
 """New files: whole or not there at all, on this machine and in a store."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -88,9 +89,23 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder as `new_file` makes a file; raises LogError as it does."""
+    check_new(path)
+    with _temporary(path) as temporary:
+        temporary.mkdir()
+        yield temporary
+        for file in temporary.iterdir():
+            sync_file(file)
+        sync_folder(temporary)
+        path.mkdir()  # the name is ours now; only an empty folder is replaced
+        temporary.replace(path)
+        sync_folder(path.parent)
+
+
+@contextmanager
 def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
-    temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
-    try:
+    with _temporary(path) as temporary:
         yield temporary
         sync_file(temporary)
         if new:
@@ -98,12 +113,23 @@ def _put_in_place(path: Path, *, new: bool) -> Iterator[Path]:
         else:
             temporary.replace(path)
         sync_folder(path.parent)
+
+
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Name a temporary file or folder beside a path, and remove what is left of it."""
+    temporary = path.with_name(f".{path.name}.{os.urandom(8).hex()}.tmp")
+    try:
+        yield temporary
     except FileExistsError as error:
         raise _exists(path) from error
     except OSError as error:
         raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
 
 
 def _name(temporary: Path, path: Path) -> None:

@@ -6,6 +6,8 @@ A format is a module of this folder, with the functions of `label_files.LabelCod
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.schemas.text import listed
+
 _MEGABYTE = 1 << 20
 
 
@@ -45,7 +47,7 @@ FORMATS = (
     LabelFormat("Label Studio", ".json", "labelstudio"),
     LabelFormat("RTTM", ".rttm", "rttm"),
 )
-PATTERNS = f"{', '.join(each.pattern for each in FORMATS[:-1])} or {FORMATS[-1].pattern}"
+PATTERNS = listed([each.pattern for each in FORMATS])
 
 
 def find_format(path: Path) -> LabelFormat | None:
