@@ -19,24 +19,14 @@ def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
     -------
     np.ndarray [shape=(n,)], of dtype V`size`
     """
-    # A view whose elements overlap: one for every offset at which a piece may begin.
-    view: NDArray[np.void] = np.ndarray(
-        (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
-    )
-    return view[offsets]
+    return _pieces(buffer, size)[offsets]
 
 
 def scatter(rows: NDArray[np.void], buffer: Bytes, offsets: Int64) -> None:
-    """Copy rows of bytes to any offsets of a buffer, at which they do not overlap.
+    """Copy rows of dtype V`size` to offsets of a buffer, at which they do not overlap."""
+    _pieces(buffer, rows.dtype.itemsize)[offsets] = rows
 
-    Parameters
-    ----------
-    rows : np.ndarray [shape=(n,)], of dtype V`size`
-    buffer : np.ndarray [shape=(b,)], uint8
-    offsets : np.ndarray [shape=(n,)], int64
-    """
-    size = rows.dtype.itemsize
-    view: NDArray[np.void] = np.ndarray(
-        (len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,)
-    )
-    view[offsets] = rows
+
+def _pieces(buffer: Bytes, size: int) -> NDArray[np.void]:
+    """View a buffer as pieces that overlap: one for every offset at which one may begin."""
+    return np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer.data, strides=(1,))

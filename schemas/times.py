@@ -9,13 +9,7 @@ _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 
 
 def read_time(text: str) -> int:
-    """Read a time, in nanoseconds of UTC.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-    """
+    """Read a time, in nanoseconds of UTC; raise ValueError if it is none."""
     rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for them
     moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
     if moment.tzinfo is None:

@@ -143,10 +143,7 @@ def iterate_columns(
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
     """Decode messages, those of one topic, type, fields and metadata together.
 
-    Raises
-    ------
-    LogError
-        If they are not of the type that their channel says, or not encoded as CDR.
+    Raise LogError if they are not of the type that their channel says, or not encoded as CDR.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -184,10 +181,7 @@ def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
 def join(parts: Sequence[Columns]) -> Columns:
     """Put pieces of one topic one after the other; fields that not all of them have are left out.
 
-    Raises
-    ------
-    LogError
-        If they are of different types.
+    Raise LogError if they are of different types.
     """
     builder = _ColumnBuilder()
     for part in parts:

@@ -20,23 +20,9 @@ CHUNK_HEAD_LIMIT = 64  # bytes, in which the head of a compressed chunk and its 
 def iterate_records(
     content: bytes | memoryview, start: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Go from record to record in the uncompressed content of a chunk, or in a part of it.
+    """Go from record to record in the content of a chunk: yield opcode, start and end of each.
 
-    Parameters
-    ----------
-    content : bytes-like
-    start, end : int, optional
-        Bytes of the content; all of it by default.
-
-    Yields
-    ------
-    opcode, start, end : int
-        Whatever the opcode; from the first byte of the record up to that of the next one.
-
-    Raises
-    ------
-    McapError
-        If the last record is cut, or claims to be longer than the content.
+    Raise McapError if the last one is cut, or claims to be longer than the content.
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from
@@ -53,13 +39,7 @@ def iterate_records(
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
-    """Make the message index that a chunk should have.
-
-    Parameters
-    ----------
-    content : bytes-like
-    starts : np.ndarray [shape=(n,)], int64
-        Where its messages begin, ascending.
+    """Make the message index of a chunk, given where its messages begin, ascending.
 
     Returns
     -------
@@ -83,14 +63,7 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
 
 
 def find_chunk_heads(window: bytes) -> Iterator[int]:
-    """Search for the heads of compressed chunks, by their compression and its magic.
-
-    Yields
-    ------
-    int
-        Bytes of the window at which a head may begin, ascending. What is there, its opcode too,
-        may be damaged.
-    """
+    """Yield the bytes at which the head of a compressed chunk may begin, damaged or not."""
     for match in _COMPRESSED.finditer(window):
         if match.start() >= _BEFORE_COMPRESSED:
             yield match.start() - _BEFORE_COMPRESSED

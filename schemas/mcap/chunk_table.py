@@ -43,15 +43,7 @@ class RecordLocation(NamedTuple):
 
 @dataclass
 class ChunkRow:
-    """A row of `CHUNKS` while a file is walked through: a chunk, or a run of messages.
-
-    Attributes
-    ----------
-    offset, length, index_length, size, start, end : int
-        As in `CHUNKS`.
-    channels : set of int
-        Numbers of the channels whose message indexes follow.
-    """
+    """A row of `CHUNKS` in the making, and the channels whose message indexes follow."""
 
     offset: int
     length: int
@@ -81,10 +73,7 @@ class ChunkRow:
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Describe a chunk, or a message outside of chunks, from the beginning of its record.
 
-    Raises
-    ------
-    McapError
-        If it is too short, or a number in it is out of range.
+    Raise McapError if it is too short, or a number in it is out of range.
     """
     opcode, offset, length = location
     try:
@@ -104,12 +93,7 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
 def read_chunk_index(content: bytes) -> ChunkRow:
     """Describe a chunk from the content of its chunk index.
 
-    Raises
-    ------
-    McapError
-        If a number in it is out of range.
-    struct.error
-        If it is too short.
+    Raise McapError if a number is out of range, struct.error if the content is too short.
     """
     start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
     first = CHUNK_INDEX.size

@@ -123,10 +123,7 @@ class LogFile:
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages.
 
-        Raises
-        ------
-        LogError
-            If it is too large, or damaged.
+        Raise LogError if it is too large, or damaged.
         """
         if location.length > LIMIT:
             raise self.damaged(location.offset, "a record claims to be too large")

@@ -72,17 +72,7 @@ def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> 
 
 
 class MessageRecords(NamedTuple):
-    """Message records one behind the other.
-
-    Attributes
-    ----------
-    data : np.ndarray [shape=(b,)], uint8
-    ends, sizes : np.ndarray [shape=(n,)], int64
-        Where in the data each record ends, and its bytes.
-    channels : np.ndarray [shape=(n,)], int64
-    times : np.ndarray [shape=(n,)], int64
-        Log times in nanoseconds, ascending.
-    """
+    """Message records one behind the other: where each ends, its bytes, channel and log time."""
 
     data: Bytes
     ends: Int64

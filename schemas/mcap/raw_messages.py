@@ -60,18 +60,7 @@ def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
 
 
 def gather_heads(buffer: Bytes | bytes, starts: Int64) -> NDArray[np.void]:
-    """Copy the heads of the messages that begin at some bytes of a buffer.
-
-    Parameters
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8, or bytes
-    starts : np.ndarray [shape=(n,)], int64
-        At most `b - MESSAGE_HEAD.itemsize`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-    """
+    """Copy the heads (`MESSAGE_HEAD`) of the messages that begin at some bytes of a buffer."""
     if not len(starts):
         return np.empty(0, MESSAGE_HEAD)
     array = np.frombuffer(buffer, np.uint8)

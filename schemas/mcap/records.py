@@ -50,12 +50,7 @@ class _Content(ReadDataStream):
 def parse(opcode: int, content: bytes) -> McapRecord | None:
     """Parse a record that holds no messages; None if this is not one of them.
 
-    Raises
-    ------
-    McapError
-        If it is too short for what it claims to hold.
-    UnicodeDecodeError
-        If a text in it is not UTF-8.
+    Raise McapError, or UnicodeDecodeError, if it is too short for what it claims to hold.
     """
     kind = _CLASSES.get(opcode)
     return None if kind is None else kind.read(_Content(BytesIO(content)))
@@ -69,18 +64,7 @@ def encode(record: McapRecord) -> bytes:
 
 
 class ChunkHead(NamedTuple):
-    """The head of a chunk.
-
-    Attributes
-    ----------
-    start, end : int
-        Log times of its first and last message, in nanoseconds.
-    size, crc : int
-        Bytes and CRC-32 of its records, uncompressed; a CRC of 0 is none.
-    compression : bytes
-    data : slice
-        Bytes of the chunk's content that are its compressed records.
-    """
+    """The head of a chunk; size and CRC (0: none) of its records, and which bytes are its data."""
 
     start: int
     end: int
@@ -93,10 +77,7 @@ class ChunkHead(NamedTuple):
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from its content.
 
-    Raises
-    ------
-    McapError
-        If it contradicts itself, or claims to be larger than `LIMIT`.
+    Raise McapError if it contradicts itself, or claims to be larger than `LIMIT`.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)

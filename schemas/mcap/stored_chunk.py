@@ -13,7 +13,6 @@ from hearthlog.schemas.arrays import Bytes, Int64
 from hearthlog.schemas.mcap.formats import INDEX_ENTRY
 
 LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
-_COMPRESSION = b"zstd"
 
 
 class StoredChunk(NamedTuple):
@@ -52,17 +51,7 @@ _LOCAL = _Local()
 
 
 class ChunkBuilder:
-    """A chunk in progress.
-
-    Attributes
-    ----------
-    content : bytearray
-        Its records.
-    entries : dict of int to bytearray
-        Its message index, by channel.
-    start, end : int
-        Log times of its first and last message, in nanoseconds.
-    """
+    """A chunk in progress: its records, its message index by channel, its span of log times."""
 
     def __init__(self) -> None:
         self.content = bytearray()
@@ -73,20 +62,11 @@ class ChunkBuilder:
         """Append one message: the beginning of its record, and its payload."""
         entry = INDEX_ENTRY.pack(log_time, len(self.content))
         self.entries.setdefault(channel, bytearray()).extend(entry)
-        self.content += head
-        self.content += payload
+        self.content += head + payload
         self.start, self.end = min(self.start, log_time), max(self.end, log_time)
 
     def add_messages(self, data: Bytes, channels: Int64, entries: NDArray[np.void]) -> None:
-        """Append messages.
-
-        Parameters
-        ----------
-        data : np.ndarray [shape=(b,)], uint8
-            Their records.
-        channels : np.ndarray [shape=(n,)], int64
-        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-        """
+        """Append message records, with the channel and the `INDEX_ENTRIES` of each."""
         self.content += data.data
         numbers, firsts = np.unique(channels, return_index=True)
         for channel in numbers[np.argsort(firsts)].tolist():
@@ -97,7 +77,6 @@ class ChunkBuilder:
 
     def compress(self) -> StoredChunk:
         """Return the chunk as a file will hold it."""
-        data = _LOCAL.zstd.compress(self.content)
-        crc = zlib.crc32(self.content)
-        size = len(self.content)
-        return StoredChunk(_COMPRESSION, data, size, crc, self.start, self.end, self.entries)
+        data, crc = _LOCAL.zstd.compress(self.content), zlib.crc32(self.content)
+        span = self.start, self.end
+        return StoredChunk(b"zstd", data, len(self.content), crc, *span, self.entries)

@@ -67,13 +67,7 @@ class RecordVerifier:
         return data
 
     def head(self, offset: int) -> tuple[int, int]:
-        """Read opcode and length, whatever they claim.
-
-        Raises
-        ------
-        McapError
-            If the file ends before.
-        """
+        """Read opcode and length, whatever they claim; raise McapError if the file ends before."""
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
             raise McapError("the file ends within a record")
@@ -249,10 +243,7 @@ class RecordVerifier:
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index: its channel, its entries, and where it ends.
 
-        Raises
-        ------
-        McapError
-            If there is none.
+        Raise McapError if there is none.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")

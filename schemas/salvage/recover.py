@@ -120,10 +120,7 @@ def _keep(log: Path, name: Path) -> None:
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     """Read a recovered log with all its checksums, and count its messages.
 
-    Raises
-    ------
-    LogError
-        If it is damaged, or does not hold the messages that were recovered.
+    Raise LogError if it is damaged, or does not hold the messages that were recovered.
     """
     expected = Counter({name: topic.messages for name, topic in topics.items() if topic.messages})
     counts: Counter[str] = Counter()

@@ -22,11 +22,10 @@ from mcap.opcode import Opcode
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.mcap.records import LIMIT
 from hearthlog.schemas.salvage.damage import Damage, DamagedRange, loss_in, read_index
-from hearthlog.schemas.salvage.doubtful_definitions import DoubtfulDefinitions
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
@@ -87,7 +86,7 @@ class Salvage:
     complete : bool
         Whether it is finished, and its index is whole.
     header : mcap.records.Header or None
-    definitions : DoubtfulDefinitions
+    definitions : Definitions
         Those met so far.
     expected : dict of int to int, or None
         How many messages each channel should have, if an index says so that is whole.
@@ -101,7 +100,7 @@ class Salvage:
 
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
         self.header: records.Header | None = None
-        self.definitions = DoubtfulDefinitions()
+        self.definitions = Definitions()
         self.unnamed: dict[int, Unnamed] = {}
         try:
             self._descriptor = open_regular(path)

@@ -85,12 +85,7 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
     """Read the schemas and channels that begin at some bytes of a chunk.
 
-    Raises
-    ------
-    McapError
-        If one is damaged, or they are too many.
-    UnicodeDecodeError
-        If a text in one is not UTF-8.
+    Raise McapError, or UnicodeDecodeError, if one is damaged, or they are too many.
     """
     if len(starts) > _DEFINITIONS_LIMIT:
         raise McapError("a chunk holds more definitions than can be kept")
@@ -106,10 +101,7 @@ def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
 def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
     """Return the first and last log time of a message index; 0 and 0 if it is empty.
 
-    Raises
-    ------
-    McapError
-        If a log time is out of range.
+    Raise McapError if a log time is out of range.
     """
     if not entries:
         return 0, 0
@@ -145,12 +137,7 @@ def read_message(raw: bytes) -> records.Message:
 def read_attachment(raw: bytes) -> WholeAttachment:
     """Read an attachment from its record, whose lengths add up.
 
-    Raises
-    ------
-    McapError
-        If its checksum is wrong.
-    UnicodeDecodeError
-        If a text in it is not UTF-8.
+    Raise McapError, or UnicodeDecodeError, if its checksum is wrong.
     """
     record = memoryview(raw)
     (crc,) = UINT32.unpack(record[-UINT32.size :])

@@ -51,13 +51,7 @@ def _line(error: Exception) -> str:
 
 
 class LocalFile:
-    """A file of this machine, open for reading.
-
-    Raises
-    ------
-    LogError
-        If it cannot be read.
-    """
+    """A file of this machine, open for reading; raise LogError if it cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -103,10 +97,7 @@ class LocalFile:
 class StoredFile:
     """A file of a store, as it is when this is made; may be read from several threads.
 
-    Raises
-    ------
-    LogError
-        If it cannot be read, or is another one by now.
+    Raise LogError if it cannot be read, or is another one by now.
     """
 
     def __init__(self, path: Path) -> None:
@@ -166,13 +157,7 @@ def _identity(path: Any) -> dict[str, Any]:
 
 
 def open_file(path: Path) -> LocalFile | StoredFile:
-    """Open a file for reading by ranges.
-
-    Raises
-    ------
-    LogError
-        If it cannot be read.
-    """
+    """Open a file for reading by ranges; raise LogError if it cannot be read."""
     return LocalFile(path) if is_local(path) else StoredFile(path)
 
 

@@ -78,10 +78,7 @@ def new_file(path: Path) -> Iterator[Path]:
 def replaced_file(path: Path) -> Iterator[Path]:
     """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
 
-    Raises
-    ------
-    LogError
-        If it cannot be written.
+    Raise LogError if it cannot be written.
     """
     put = _put_in_place if is_local(path) else _put_in_store
     with put(path, new=False) as temporary:
