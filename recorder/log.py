@@ -11,7 +11,8 @@ from typing import Any
 from hearthlog.recorder.pipeline import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import active_path, log_path
-from hearthlog.schemas.logs.writer import Attachment, LogWriter
+from hearthlog.schemas.logs.log_stream import Attachment
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import header
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS

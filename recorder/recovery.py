@@ -24,7 +24,6 @@ class Recovered:
 
     Attributes
     ----------
-    path : Path
     end : int
         End of the last frame, in nanoseconds of UTC; 0 if the log has none.
     damage : str

@@ -25,8 +25,8 @@ from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.messages.topics import topics_of
 
 

@@ -18,6 +18,15 @@ def read_time(text: str) -> int:
     return nanoseconds + (int(rest.group().ljust(3, "0")) if rest else 0)
 
 
+def millisecond_text(nanoseconds: int) -> str:
+    """Write a time in UTC to the millisecond; one that no calendar has as its nanoseconds."""
+    try:
+        moment = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
+    except (OverflowError, ValueError, OSError):
+        return f"{nanoseconds} ns"
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
 def time_text(nanoseconds: int) -> str:
     """Write a time so that none of its digits is lost."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)

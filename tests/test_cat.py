@@ -21,8 +21,9 @@ from spliced import run, write_log
 from hearthlog.analyzer.export.text import in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.typed_columns import decode_all
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import (
     FEATURES,

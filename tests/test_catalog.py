@@ -37,7 +37,8 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types

@@ -27,7 +27,8 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile

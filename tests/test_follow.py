@@ -14,7 +14,8 @@ from logs import features
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.follow import follow
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 

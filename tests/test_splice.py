@@ -15,7 +15,8 @@ from spliced import LOST, raw_messages, run, small_disk, write_log
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.writer import Attachment, LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import message
 from hearthlog.schemas.messages.topics import Quality, Topic

@@ -26,7 +26,8 @@ from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.files import active_path, find_logs
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import (
     definition,

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import LogStreamWriter
+from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile

@@ -18,7 +18,6 @@ def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
 
     Parameters
     ----------
-    path : Path
     progress : callable
         Told the share of the bytes that were read.
 

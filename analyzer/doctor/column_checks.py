@@ -25,9 +25,6 @@ def check_stamps(
 
     Parameters
     ----------
-    findings : Findings
-    kind : str
-    columns : Columns
     microphone : str
         Empty for a topic of none.
     named : bool

@@ -40,10 +40,8 @@ class ExaminedFile:
 
     Attributes
     ----------
-    findings : Findings
     ours : bool
         Whether it is a log of hearthlog, and no layer beside one.
-    node : str
     span : tuple of int, or None
         First and last log time, in nanoseconds.
     frames : dict of str to FrameSequence
@@ -62,7 +60,6 @@ def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFi
 
     Parameters
     ----------
-    path : Path
     progress : callable, optional
         Called with the share of the file that was read, 0 to 1.
     """

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.text import printable
+from hearthlog.schemas.times import millisecond_text
 
 Level = Literal["error", "warning"]
 _SHOWN = 5  # findings of one kind in one file
@@ -26,11 +26,8 @@ class Finding(NamedTuple):
 
     Attributes
     ----------
-    path : Path
-    level : "error" or "warning"
     rule : str
         Which rule of docs/doctor.md is broken.
-    what : str
     advice : str
         What to do; empty where the finding says it all.
     offset : int or None
@@ -52,7 +49,7 @@ class Finding(NamedTuple):
         if self.offset is not None:
             parts.append(f"byte {self.offset}")
         if self.time is not None:
-            parts.append(time_text(self.time))
+            parts.append(millisecond_text(self.time))
         parts.append(f"{self.what} [{self.rule}]")
         line = ": ".join(parts) + (f"; {self.advice}" if self.advice else "")
         return printable(line[:_LENGTH])
@@ -60,14 +57,7 @@ class Finding(NamedTuple):
 
 @dataclass
 class Findings:
-    """The findings of one file: of every rule the first few, and the number of all.
-
-    Attributes
-    ----------
-    path : Path
-    shown : list of Finding
-    counts : Counter of (level, rule)
-    """
+    """The findings of one file: of every rule the first few, and the number of all."""
 
     path: Path
 
@@ -127,12 +117,3 @@ class Findings:
         self.counts[kind] += 1
         if self.counts[kind] <= _SHOWN:
             self.shown.append(finding)
-
-
-def time_text(stamp: int) -> str:
-    """Write a time in UTC, to the millisecond; one that no calendar has as its nanoseconds."""
-    try:
-        moment = datetime.fromtimestamp(stamp / 1e9, UTC)
-    except (OverflowError, ValueError, OSError):
-        return f"{stamp} ns"
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

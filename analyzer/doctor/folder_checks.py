@@ -5,10 +5,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from hearthlog.analyzer.doctor.file_checks import ExaminedFile
-from hearthlog.analyzer.doctor.findings import Findings, time_text
+from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX
+from hearthlog.schemas.times import millisecond_text
 
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
 _LEFT = {
@@ -99,7 +100,7 @@ def _say_missing(microphone: str, previous: ExaminedFile, file: ExaminedFile, mi
     name = previous.findings.path.name
     if missing > 0 and abs(elapsed - counted) <= _TOLERANCE * elapsed + FRAME_NANOSECONDS:
         what = f"{microphone}: {missing} frames between {name} and this log are in neither"
-        advice = f"a log from {time_text(last[1])} on is missing"
+        advice = f"a log from {millisecond_text(last[1])} on is missing"
         file.findings.warning("missing-log", what, advice, time=frames.first[1])
     else:
         what = (

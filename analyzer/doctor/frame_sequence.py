@@ -24,8 +24,6 @@ class FrameSequence:
 
     Parameters
     ----------
-    findings : Findings
-    microphone : str
     statistics_every : int or None
         Frames from one statistics message to the next, if the file has that.
     window_frames : int

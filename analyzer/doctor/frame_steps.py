@@ -76,8 +76,6 @@ def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.
 
     Parameters
     ----------
-    report : callable
-    steps : Steps
     gaps : np.ndarray [shape=(m, 3)], int64
         End and start (ns), and frames that were lost.
     following : np.ndarray [shape=(m,)], int

@@ -8,14 +8,7 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.doctor.column_checks import (
-    STAMP,
-    check_gaps,
-    check_labels,
-    check_segments,
-    check_stamps,
-    check_values,
-)
+from hearthlog.analyzer.doctor import column_checks
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
@@ -153,7 +146,7 @@ class MessageChecks:
 
     def _check(self, kind: str, columns: Columns) -> None:
         microphone = split_topic(columns.topic)[0]
-        check_stamps(self._findings, kind, columns, microphone, named=self._named)
+        column_checks.check_stamps(self._findings, kind, columns, microphone, named=self._named)
         if not microphone:
             return
         if kind == "info":
@@ -169,13 +162,14 @@ class MessageChecks:
         if kind in _WIDTHS and info is not None:
             names = info["labels"] if kind == LABEL else info["feature_names"]
             for field in _WIDTHS[kind]:
-                check_values(self._findings, columns, field, len(names))
+                column_checks.check_values(self._findings, columns, field, len(names))
         if kind == LABEL and info is not None:
-            check_labels(self._findings, columns, list(info["labels"]))
+            column_checks.check_labels(self._findings, columns, list(info["labels"]))
         if kind == SEGMENT:
-            check_segments(self._findings, columns, None if info is None else list(info["labels"]))
+            classes = None if info is None else list(info["labels"])
+            column_checks.check_segments(self._findings, columns, classes)
         if kind == GAP:
-            check_gaps(self._findings, columns)
+            column_checks.check_gaps(self._findings, columns)
         rows = _sequence_rows(kind, columns)
         if rows is not None:
             self.frames[microphone].add(kind, rows)
@@ -183,7 +177,7 @@ class MessageChecks:
     def _check_infos(self, columns: Columns, microphone: str) -> None:
         """Keep what a file says of itself; where it says so again another recording begins."""
         for row, values in enumerate(_rows(columns)):
-            info = dict(zip(columns.fields, values, strict=True)) | {STAMP: 0}
+            info = dict(zip(columns.fields, values, strict=True)) | {column_checks.STAMP: 0}
             time = int(columns.log_times[row])
             if microphone not in self.infos:
                 self.infos[microphone] = info
@@ -218,7 +212,7 @@ def _rows(columns: Columns) -> Any:
 
 def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
     """Return the rows of a kind for `FrameSequence.add`; None for a kind that it does not take."""
-    times, stamps = columns.log_times, columns[STAMP]
+    times, stamps = columns.log_times, columns[column_checks.STAMP]
     if kind == GAP:
         parts = times, stamps, columns["frames_lost"]
     elif kind == SEGMENT:

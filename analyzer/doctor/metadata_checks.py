@@ -19,9 +19,9 @@ from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.logs.log_stream import PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, schema_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
-from hearthlog.schemas.logs.writer import PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.messages.fields import difference, type_hash_of
 from hearthlog.schemas.messages.topics import Topic, topics_of
 from hearthlog.schemas.messages.type_definitions import message_type
@@ -38,10 +38,8 @@ class MetadataChecks:
 
     Parameters
     ----------
-    data : DataSection
     messages : MessageChecks
         The checks of its messages, which are over.
-    findings : Findings
     finished : bool
         Whether the file was completed.
     whole : bool

@@ -17,8 +17,8 @@ from hearthlog.analyzer.export.file_names import unused_name
 from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.logs.writer import ENCODING
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks

@@ -15,7 +15,7 @@ from hearthlog.analyzer.export.exporter import Exporter, OutputFiles
 from hearthlog.analyzer.export.merge import is_latched
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
+from hearthlog.schemas.logs.log_stream import ENCODING, SCHEMA_ENCODING
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.message_types import definition, typestore
 from hearthlog.schemas.progress import Progress

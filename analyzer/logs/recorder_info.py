@@ -17,8 +17,8 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import check_node_name
+from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types

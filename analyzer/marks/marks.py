@@ -21,8 +21,9 @@ from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import SUFFIX, review_path, stem
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW, Topic, check_microphone_name, labelling_topic

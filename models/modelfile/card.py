@@ -4,7 +4,7 @@ import json
 
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.logs.writer import Attachment
+from hearthlog.schemas.logs.log_stream import Attachment
 
 CARD = "model_card.md"
 DESCRIPTION = "model.json"

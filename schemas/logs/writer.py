@@ -9,19 +9,10 @@ from typing import BinaryIO
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import active_path
-from hearthlog.schemas.logs.log_stream import (
-    ENCODING,
-    PROFILE,
-    SCHEMA_ENCODING,
-    Attachment,
-    LogStreamWriter,
-    TopicBatch,
-)
+from hearthlog.schemas.logs.log_stream import Attachment, LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.storage.new_files import sync_folder
-
-__all__ = ["ENCODING", "PROFILE", "SCHEMA_ENCODING", "Attachment", "LogWriter", "TopicBatch"]
 
 
 class LogWriter:

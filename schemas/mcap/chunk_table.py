@@ -9,15 +9,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from hearthlog.schemas.mcap.formats import (
-    CHUNK,
-    CHUNK_INDEX,
-    CHUNK_INDEX_TAIL,
-    HEAD,
-    INDEX_OFFSET,
-    MESSAGE,
-    UINT64,
-)
+from hearthlog.schemas.mcap import formats
+from hearthlog.schemas.mcap.formats import HEAD
 
 CHUNKS = np.dtype(
     [
@@ -78,10 +71,10 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     opcode, offset, length = location
     try:
         if opcode == Opcode.CHUNK:
-            start, end, size, _, _ = CHUNK.unpack_from(head, HEAD.size)
+            start, end, size, _, _ = formats.CHUNK.unpack_from(head, HEAD.size)
             index_length = 0
         else:
-            start = end = MESSAGE.unpack_from(head)[4]
+            start = end = formats.MESSAGE.unpack_from(head)[4]
             size, index_length = length, -1
     except struct.error as error:
         raise McapError("a record is too short") from error
@@ -95,13 +88,14 @@ def read_chunk_index(content: bytes) -> ChunkRow:
 
     Raise McapError if a number is out of range, struct.error if the content is too short.
     """
-    start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
-    first = CHUNK_INDEX.size
-    offsets = INDEX_OFFSET.iter_unpack(content[first : first + entries])
+    start, end, offset, length, entries = formats.CHUNK_INDEX.unpack_from(content)
+    first = formats.CHUNK_INDEX.size
+    offsets = formats.INDEX_OFFSET.iter_unpack(content[first : first + entries])
     channels = {channel for channel, _ in offsets}
     first += entries
-    index_length, text = CHUNK_INDEX_TAIL.unpack_from(content, first)
-    (size,) = UINT64.unpack_from(content, first + CHUNK_INDEX_TAIL.size + text + UINT64.size)
+    index_length, text = formats.CHUNK_INDEX_TAIL.unpack_from(content, first)
+    first += formats.CHUNK_INDEX_TAIL.size + text + formats.UINT64.size
+    (size,) = formats.UINT64.unpack_from(content, first)
     if max(offset + length + index_length, start, end, size) >= 1 << 63:
         raise McapError("a number is out of range")
     return ChunkRow(offset, length, index_length, size, start, end, channels)

@@ -13,19 +13,8 @@ import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
 
-from hearthlog.schemas.mcap.formats import (
-    CHUNK,
-    FOOTER,
-    HEAD,
-    INDEX_ENTRIES,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_FIXED,
-    MESSAGE_INDEX,
-    UINT32,
-    UINT64,
-)
+from hearthlog.schemas.mcap import formats
+from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.message_blocks import Block, MessageRecords, merge_blocks
 from hearthlog.schemas.mcap.records import encode
 from hearthlog.schemas.mcap.stored_chunk import LATEST, ChunkBuilder, StoredChunk
@@ -63,7 +52,7 @@ class ChunkWriter:
 
     def start(self, profile: str, library: str) -> None:
         """Begin the file."""
-        self._stream.write(MAGIC)
+        self._stream.write(formats.MAGIC)
         self._write(records.Header(profile, library))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -124,8 +113,8 @@ class ChunkWriter:
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
         """Append a message."""
-        length = MESSAGE_FIXED + len(data)
-        head = MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, log_time, publish_time)
+        fields = channel_id, sequence, log_time, publish_time
+        head = formats.MESSAGE.pack(Opcode.MESSAGE, formats.MESSAGE_FIXED + len(data), *fields)
         self._chunk.add_message(channel_id, log_time, head, data)
         if len(self._chunk.content) > self._chunk_size:
             self.flush()
@@ -168,11 +157,11 @@ class ChunkWriter:
             summary += group
         offset_start = summary_start + len(summary)
         summary += offsets
-        footer = HEAD.pack(Opcode.FOOTER, FOOTER.size + UINT32.size)
-        footer += FOOTER.pack(summary_start, offset_start)
+        footer = HEAD.pack(Opcode.FOOTER, formats.FOOTER.size + formats.UINT32.size)
+        footer += formats.FOOTER.pack(summary_start, offset_start)
         crc = zlib.crc32(footer, zlib.crc32(summary))
         self._stream.write(summary)
-        self._stream.write(footer + UINT32.pack(crc) + MAGIC)
+        self._stream.write(footer + formats.UINT32.pack(crc) + formats.MAGIC)
 
     def _statistics(self) -> records.Statistics:
         start, end = self._file_span
@@ -191,8 +180,8 @@ class ChunkWriter:
     def _put(self, chunk: StoredChunk) -> None:
         """Write a chunk and its message index."""
         text = len(chunk.compression)
-        head = CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
-        head += chunk.compression + UINT64.pack(len(chunk.data))
+        head = formats.CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
+        head += chunk.compression + formats.UINT64.pack(len(chunk.data))
         offset = self._stream.tell()
         self._stream.write(HEAD.pack(Opcode.CHUNK, len(head) + len(chunk.data)) + head)
         self._stream.write(chunk.data)
@@ -200,10 +189,10 @@ class ChunkWriter:
         index_offsets = {}
         for channel, entries in chunk.entries.items():
             index_offsets[channel] = self._stream.tell()
-            head = HEAD.pack(Opcode.MESSAGE_INDEX, MESSAGE_INDEX.size + len(entries))
-            self._stream.write(head + MESSAGE_INDEX.pack(channel, len(entries)))
+            head = HEAD.pack(Opcode.MESSAGE_INDEX, formats.MESSAGE_INDEX.size + len(entries))
+            self._stream.write(head + formats.MESSAGE_INDEX.pack(channel, len(entries)))
             self._stream.write(entries)
-            self._counts[channel] += len(entries) // INDEX_ENTRY.size
+            self._counts[channel] += len(entries) // formats.INDEX_ENTRY.size
         self._chunk_indexes += encode(
             records.ChunkIndex(
                 chunk_length=first - offset,
@@ -232,7 +221,7 @@ class ChunkWriter:
             beyond = int(np.searchsorted(ends, offset + room, side="right"))
             last = min(beyond + 1, len(ends))
             part = slice(first, last)
-            entries = np.empty(last - first, INDEX_ENTRIES)
+            entries = np.empty(last - first, formats.INDEX_ENTRIES)
             entries["time"] = times[part]
             entries["offset"] = ends[part] - sizes[part] - offset + len(chunk.content)
             chunk.add_messages(data[offset : ends[last - 1]], channels[part], entries)

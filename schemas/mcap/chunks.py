@@ -14,14 +14,9 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
-from hearthlog.schemas.mcap.formats import (
-    HEAD,
-    INDEX_ENTRIES,
-    MESSAGE_FIXED,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX_HEAD,
-)
+from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
@@ -46,9 +41,7 @@ def read_chunks(
 
     Parameters
     ----------
-    file : LogFile
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-    topics : collection of str, optional
     check : bool
         Whether to compare chunks with their checksums, which takes longer than to decompress.
 
@@ -153,10 +146,8 @@ def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]
 
 
 def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
-    if len(record) < HEAD.size or HEAD.unpack_from(record) != (
-        Opcode.CHUNK,
-        len(record) - HEAD.size,
-    ):
+    expected = Opcode.CHUNK, len(record) - HEAD.size
+    if len(record) < HEAD.size or HEAD.unpack_from(record) != expected:
         raise McapError("here should be a chunk")
     content = record[HEAD.size :]
     return chunk_head(content), content
@@ -222,22 +213,23 @@ class _Batch(NamedTuple):
         np.ndarray [shape=(n, 4)]
             Number of the chunk, of the channel, and place and size of its entries.
         """
+        index_head = formats.MESSAGE_INDEX_HEAD
         parts = [np.empty((0, 4), np.int64)]
         numbers = np.flatnonzero(starts < ends)
         starts, ends = starts[numbers], ends[numbers]
         while len(numbers):
             if len(parts) > _CHANNELS_LIMIT:
                 raise self._damaged(numbers[0], "a chunk has more indexes than there are channels")
-            first = starts + MESSAGE_INDEX_HEAD.itemsize
+            first = starts + index_head.itemsize
             if (first > ends).any():
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
-            heads = gather(self.raw, starts, MESSAGE_INDEX_HEAD.itemsize).view(MESSAGE_INDEX_HEAD)
+            heads = gather(self.raw, starts, index_head.itemsize).view(index_head)
             length, size = heads["length"], heads["size"].astype(np.int64)
             sound = (
                 (heads["opcode"] == Opcode.MESSAGE_INDEX)
-                & (length >= size + MESSAGE_INDEX_HEAD.itemsize - HEAD.size)
+                & (length >= size + index_head.itemsize - HEAD.size)
                 & (length <= ends - starts - HEAD.size)
-                & (size % INDEX_ENTRIES.itemsize == 0)
+                & (size % formats.INDEX_ENTRIES.itemsize == 0)
             )
             if not sound.all():
                 raise self._damaged(numbers[sound.argmin()], "here should be a message index")
@@ -259,8 +251,8 @@ class _Batch(NamedTuple):
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
         """Follow the index entries of a channel to its messages, and check every one of them."""
-        entries = np.frombuffer(b"".join(part for _, part in parts), INDEX_ENTRIES)
-        counts = [len(part) // INDEX_ENTRIES.itemsize for _, part in parts]
+        entries = np.frombuffer(b"".join(part for _, part in parts), formats.INDEX_ENTRIES)
+        counts = [len(part) // formats.INDEX_ENTRIES.itemsize for _, part in parts]
         number = np.repeat([number for number, _ in parts], counts)
         channel = self.file.channels.get(identity)
         if channel is None:
@@ -275,7 +267,7 @@ class _Batch(NamedTuple):
             (heads["opcode"] == Opcode.MESSAGE)
             & (heads["channel"] == identity)
             & (heads["log_time"] == entries["time"])
-            & (heads["length"] >= MESSAGE_FIXED)
+            & (heads["length"] >= formats.MESSAGE_FIXED)
             & (heads["length"] <= rest - HEAD.size)
             & (heads["log_time"] >= self.chunks["start"][number])
             & (heads["log_time"] <= self.chunks["end"][number])

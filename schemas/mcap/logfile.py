@@ -24,14 +24,7 @@ from hearthlog.schemas.mcap.chunk_table import (
     read_chunk_index,
     read_chunk_row,
 )
-from hearthlog.schemas.mcap.formats import (
-    CHUNK,
-    FOOTER,
-    FOOTER_SIZE,
-    HEAD,
-    MAGIC,
-    UINT16,
-)
+from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
 from hearthlog.schemas.mcap.records import LIMIT, parse
 from hearthlog.schemas.storage.byte_ranges import Section, open_file
 
@@ -54,14 +47,12 @@ class LogFile:
         Whether the file was finished.
     ended : bool
         Whether `scan_new` came to the end of a finished log.
-    header : mcap.records.Header or None
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
         Of a file without an index, those inside chunks are not among them.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         All chunks that were met so far, by start time.
     channel_sets : list of frozenset of int
         Channels with messages in a chunk; the empty set if the file does not tell which.
-    statistics : mcap.records.Statistics or None
     record_locations : list of RecordLocation
         Of metadata records and attachments.
 

@@ -17,7 +17,6 @@ class Block(NamedTuple):
 
     Attributes
     ----------
-    channel : int
     log_times, publish_times : np.ndarray [shape=(n,)], int64
     sequences : np.ndarray [shape=(n,)], uint32
     payloads : np.ndarray [shape=(n,)], of a dtype of the payloads' size
@@ -52,7 +51,6 @@ def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> 
 
     Parameters
     ----------
-    messages : RawMessages
     channel : int
         Number of the channel that they are written to.
     first_rank : int

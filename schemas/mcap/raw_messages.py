@@ -16,8 +16,6 @@ class RawMessages:
 
     Attributes
     ----------
-    channel : mcap.records.Channel
-    schema : mcap.records.Schema or None
     buffer : np.ndarray [shape=(b,)], uint8
         Holds the messages, and others.
     offsets : np.ndarray [shape=(n,)], int64

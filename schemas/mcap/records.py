@@ -99,7 +99,6 @@ def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = Fa
 
     Parameters
     ----------
-    head : ChunkHead
     content : bytes-like
         The chunk's record, without opcode and length.
     check : bool

@@ -20,7 +20,6 @@ class StoredChunk(NamedTuple):
 
     Attributes
     ----------
-    compression : bytes
     data : bytes-like
         Compressed records.
     size, crc : int

@@ -32,12 +32,10 @@ def encode_groups(
 
     Parameters
     ----------
-    typename : str
     columns : mapping from field path, such as "header.frame_id", to its values
         An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
         for an array of numbers; for a string, one for all messages or a sequence of `count`.
         Fields that were appended to the type may be left out.
-    count : int
 
     Yields
     ------
@@ -164,7 +162,6 @@ def decode_rows(
 
     Parameters
     ----------
-    kind : MessageType
     buffer : np.ndarray [shape=(b,)], uint8
     offsets, sizes : np.ndarray [shape=(n,)], int64
         Where in the buffer the payloads are.

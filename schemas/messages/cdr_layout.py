@@ -64,7 +64,6 @@ class Layout(NamedTuple):
     dtype : np.dtype
         Of the whole payload. A field bears its path as name, and the word before a string or a
         sequence, which says how long it is, that name and " length".
-    leaves : tuple of Leaf, Messages or Default
     fixed : dict of str to int or np.void
         What every payload of this layout has in common: byte order, lengths, ends of strings.
     """
@@ -140,7 +139,6 @@ class TypeDefinition(NamedTuple):
 
     Attributes
     ----------
-    name : str
     types : mapping of str to list of (field, description)
         The fields of this type and of those it builds on, as rosbags describes them.
     growth : mapping of str to Growth
@@ -157,7 +155,6 @@ class LayoutWalk:
 
     Parameters
     ----------
-    definition : TypeDefinition
     order : str
         Byte order, as numpy has it.
     length_at : callable

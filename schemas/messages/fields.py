@@ -106,7 +106,6 @@ def difference(kind: MessageType, version: int) -> str:
 
     Parameters
     ----------
-    kind : MessageType
     version : int
         Of the file's messages: what was appended up to it must be there. More may be, as a later
         version would have appended it.

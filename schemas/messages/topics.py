@@ -70,7 +70,6 @@ class TopicName(NamedTuple):
 
     Attributes
     ----------
-    microphone : str
     labelling : str
         `live`, `review` or `relabel/<model>`.
     kind : str

@@ -5,7 +5,6 @@ from array import array
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +14,12 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
 from hearthlog.schemas.mcap.records import LIMIT, parse
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
+from hearthlog.schemas.times import millisecond_text
 
 _BLOCK = 1 << 20
 _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
@@ -32,7 +33,6 @@ class Damage:
     ----------
     start, end : int
         Bytes.
-    why : str
     messages : mapping of str to int
         Lost messages, by topic.
     exact : bool
@@ -66,15 +66,8 @@ class Damage:
         lost = [f"{count} of {topic}" for topic, count in sorted(self.messages.items())]
         if not self.exact:
             lost.append("perhaps more" if lost else "an unknown number of messages")
-        span = (
-            "" if self.times is None else f", {_moment(self.times[0])} to {_moment(self.times[1])}"
-        )
+        span = "" if self.times is None else ", " + " to ".join(map(millisecond_text, self.times))
         return f"{where}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
-
-
-def _moment(stamp: int) -> str:
-    moment = datetime.fromtimestamp(stamp / 1e9, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 class Index(NamedTuple):
@@ -84,7 +77,6 @@ class Index(NamedTuple):
     ----------
     start : int
         Where it begins.
-    definitions : list of mcap.records.Schema and mcap.records.Channel
     messages : dict of int to int
         By channel.
     chunks : np.ndarray [shape=(n, 5)], int64
@@ -95,7 +87,7 @@ class Index(NamedTuple):
     """
 
     start: int
-    definitions: list[records.Schema | records.Channel]
+    definitions: list[Definition]
     messages: dict[int, int]
     chunks: NDArray[np.int64]
     names: dict[int, str]
@@ -130,7 +122,6 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
 
     Parameters
     ----------
-    reader : RecordVerifier
     limit : int
         Bytes; a longer index is not read.
     """
@@ -154,7 +145,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
 
 
 def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
-    definitions: list[records.Schema | records.Channel] = []
+    definitions: list[Definition] = []
     names: dict[int, str] = {}
     messages: dict[int, int] = {}
     chunks = array("q")
@@ -162,20 +153,14 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
     while offset < end:
         whole = reader.whole(offset)
         record = whole.record
-        if isinstance(record, records.Schema | records.Channel):
+        if isinstance(record, Definition):
             definitions.append(record)
         elif isinstance(record, records.Statistics):
             messages = record.channel_message_counts
         elif isinstance(record, records.ChunkIndex):
-            chunks.extend(
-                (
-                    record.chunk_start_offset,
-                    record.chunk_length,
-                    record.message_index_length,
-                    record.message_start_time,
-                    record.message_end_time,
-                )
-            )
+            chunks.extend([record.chunk_start_offset, record.chunk_length])
+            chunks.extend([record.message_index_length, record.message_start_time])
+            chunks.append(record.message_end_time)
         elif isinstance(record, records.MetadataIndex):
             if record.name != rosbag2.METADATA:  # it is made anew
                 names[record.offset] = f"the metadata {record.name!r}"
@@ -224,10 +209,8 @@ def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
         behind, span = _count(reader, end, messages)
         head = reader.read(start + HEAD.size, CHUNK.size).ljust(CHUNK.size, b"\0")
         times = CHUNK.unpack(head)[:2]
-        exact = bool(messages) and end in ends and behind < reader.end
-        exact = (
-            exact and reader.plausible(behind) and reader.head(behind)[0] != Opcode.MESSAGE_INDEX
-        )
+        exact = bool(messages) and end in ends and behind < reader.end and reader.plausible(behind)
+        exact = exact and reader.head(behind)[0] != Opcode.MESSAGE_INDEX
         is_sound = 0 < times[0] <= times[1] < 1 << 63
         return Loss(messages, exact, span or (times if is_sound else None))
     if opcode in _NAME_AFTER and is_record:

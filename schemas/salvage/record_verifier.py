@@ -14,14 +14,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.mcap.chunk_records import index_messages
-from hearthlog.schemas.mcap.formats import (
-    CHUNK,
-    HEAD,
-    INDEX_ENTRIES,
-    MAGIC,
-    MESSAGE_INDEX,
-    UINT64,
-)
+from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES, MAGIC, MESSAGE_INDEX, UINT64
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_sizes import FIELDS, SHORTEST, UNKNOWN, longest
@@ -117,7 +110,6 @@ class RecordVerifier:
 
         Parameters
         ----------
-        offset : int
         chained : int
             How many plausible records must follow a message outside of chunks, which has nothing
             else to be known by.

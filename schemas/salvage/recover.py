@@ -30,7 +30,6 @@ def recover_log(
 
     Parameters
     ----------
-    source, copy : Path
     name : str
         Name that the copy will have in the end.
     progress : callable, optional

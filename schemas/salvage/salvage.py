@@ -52,7 +52,6 @@ class Unnamed:
 
     Attributes
     ----------
-    messages : int
     times : tuple of int
         First and last log time, in nanoseconds.
     place : tuple of int
@@ -75,7 +74,6 @@ class Salvage:
 
     Parameters
     ----------
-    path : Path
     definitions : iterable of mcap.records.Schema and mcap.records.Channel, optional
         What an earlier salvage of the same file met too late.
 
@@ -85,12 +83,10 @@ class Salvage:
         Whether it begins as such a file does.
     complete : bool
         Whether it is finished, and its index is whole.
-    header : mcap.records.Header or None
     definitions : Definitions
         Those met so far.
     expected : dict of int to int, or None
         How many messages each channel should have, if an index says so that is whole.
-    unnamed : dict of int to Unnamed
 
     Raises
     ------

@@ -1,22 +1,21 @@
 """A new log of what is whole in a damaged one, and the count of what it holds."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 import numpy as np
-from mcap.records import Message
+from mcap.records import Channel, Header, Message
 
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.salvage import Piece, Salvage
 from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
-
-_PROFILE = "ros2"  # where the header is lost, and messages are encoded as in ROS 2
-_ENCODING = "cdr"
 
 
 @dataclass
@@ -25,8 +24,6 @@ class TopicRecovery:
 
     Attributes
     ----------
-    type : str
-    messages : int
     expected : int or None
         Messages that there should be, if the index of the log says so.
     end : int
@@ -45,8 +42,6 @@ class Recovery:
 
     Attributes
     ----------
-    topics : dict of str to TopicRecovery
-    damages : list of Damage
     complete : bool
         Whether the log was finished, and its index is whole.
     """
@@ -73,7 +68,6 @@ class SalvagedCopy:
     ----------
     stream : BinaryIO
         Of the new log, at its start.
-    salvage : Salvage
     profile : str
         What the header of the new log says if that of the old one is lost.
 
@@ -90,7 +84,7 @@ class SalvagedCopy:
         self._writer = ChunkWriter(stream)
         self._begun = False
         self._written: set[tuple[type, int]] = set()
-        self._counts: dict[int, int] = {}
+        self._counts: Counter[int] = Counter()
         self._ends: dict[int, int] = {}
         self._span = (1 << 63, 0)
 
@@ -118,24 +112,28 @@ class SalvagedCopy:
         return late or (self._salvage.header is None and self.profile() != self._profile)
 
     def profile(self) -> str:
-        """Guess the profile from the channels."""
+        """Guess the profile, where the header is lost, from how messages are encoded."""
         channels = self._salvage.definitions.channels.values()
-        return _PROFILE if any(c.message_encoding == _ENCODING for c in channels) else ""
+        return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
 
     def recovery(self) -> Recovery:
         """Count what was saved, and list what was not."""
         topics: dict[str, TopicRecovery] = {}
-        for number, channel in self._salvage.definitions.channels.items():
-            schema = self._salvage.definitions.schemas.get(channel.schema_id)
-            kind = "" if schema is None else schema.name
+        expected = self._salvage.expected
+        for number, channel, kind in self._channel_types():
             topic = topics.setdefault(channel.topic, TopicRecovery(kind))
-            topic.messages += self._counts.get(number, 0)
+            topic.messages += self._counts[number]
             topic.end = max(topic.end, self._ends.get(number, 0))
-            if self._salvage.expected is not None:
-                expected = self._salvage.expected.get(number, 0)
-                topic.expected = (topic.expected or 0) + expected
+            if expected is not None:
+                topic.expected = (topic.expected or 0) + expected.get(number, 0)
         damages = self._salvage.damages()
         return Recovery(topics, [*damages, *_untraced(topics, damages)], self._salvage.complete)
+
+    def _channel_types(self) -> Iterator[tuple[int, Channel, str]]:
+        definitions = self._salvage.definitions
+        for number, channel in definitions.channels.items():
+            schema = definitions.schemas.get(channel.schema_id)
+            yield number, channel, "" if schema is None else schema.name
 
     def _add(self, piece: Piece) -> None:
         self._begin()
@@ -159,11 +157,8 @@ class SalvagedCopy:
 
     def _begin(self) -> None:
         if not self._begun:
-            header = self._salvage.header
-            profile, library = (
-                (self._profile, "") if header is None else (header.profile, header.library)
-            )
-            self._writer.start(profile, library)
+            header = self._salvage.header or Header(self._profile, library="")
+            self._writer.start(header.profile, header.library)
             self._begun = True
 
     def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
@@ -179,19 +174,16 @@ class SalvagedCopy:
                     self._written.add((type(record), record.id))
 
     def _count(self, number: int, count: int, first: int, last: int) -> None:
-        self._counts[number] = self._counts.get(number, 0) + count
+        self._counts[number] += count
         self._ends[number] = max(self._ends.get(number, 0), last)
         self._span = min(self._span[0], first), max(self._span[1], last)
 
     def _rosbag2(self, name: str) -> dict[str, str] | None:
         """Make the `rosbag2` record, by which rosbag2 lists topics; None if that is impossible."""
-        definitions = self._salvage.definitions
         topics: dict[str, rosbag2.TopicCount] = {}
-        for number, channel in definitions.channels.items():
-            schema = definitions.schemas.get(channel.schema_id)
-            kind = "" if schema is None else schema.name
+        for number, channel, kind in self._channel_types():
             topic = topics.setdefault(channel.topic, rosbag2.TopicCount(kind, channel.metadata))
-            topic.messages += self._counts.get(number, 0)
+            topic.messages += self._counts[number]
         try:
             return rosbag2.file_metadata(name, topics, self._span if self._counts else (0, 0))
         except (KeyError, ValueError, RecursionError):  # other writers describe channels otherwise

@@ -18,7 +18,6 @@ def prefetch(
     ----------
     function : callable
         Should spend its time where the interpreter is not needed: reading, decompressing, numpy.
-    items : iterable
     workers : int
         Threads; one item more than these is worked on, or waits for the consumer.
 

@@ -11,7 +11,8 @@ from mcap.writer import Writer
 
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import definition, encode, message, time_message
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.tools.bench.table import Row, Table, Target

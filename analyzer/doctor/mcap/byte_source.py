@@ -16,7 +16,6 @@ class ByteSource:
 
     Attributes
     ----------
-    size : int
     offset : int
         Of the next byte.
     crc : int or None

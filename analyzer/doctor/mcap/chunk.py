@@ -15,18 +15,9 @@ from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.mcap.checked_definitions import CheckedDefinitions, name_of
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import iterate_records
-from hearthlog.schemas.mcap.formats import (
-    CHUNK_INDEX,
-    CHUNK_INDEX_TAIL,
-    HEAD,
-    INDEX_ENTRIES,
-    INDEX_OFFSET,
-    MESSAGE_FIXED,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    UINT64,
-)
+from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress
 
@@ -77,18 +68,18 @@ class Chunk:
         """Take a message index that stands behind the chunk."""
         self._index_length += record.length
         try:
-            channel, size = MESSAGE_INDEX.unpack_from(record.content)
+            channel, size = formats.MESSAGE_INDEX.unpack_from(record.content)
         except struct.error:
             channel, size = 0, -1
-        most = len(record.content) - MESSAGE_INDEX.size
-        if size % INDEX_ENTRIES.itemsize or not 0 <= size <= most:
+        most = len(record.content) - formats.MESSAGE_INDEX.size
+        if size % formats.INDEX_ENTRIES.itemsize or not 0 <= size <= most:
             what = "a message index has another length than it says"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         elif channel in self._indexes:
             what = f"a second message index of channel {channel} behind one chunk"
             self._findings.error("message-index", what, REINDEX, offset=record.offset)
         else:
-            entries = record.content[MESSAGE_INDEX.size : MESSAGE_INDEX.size + size]
+            entries = record.content[formats.MESSAGE_INDEX.size : formats.MESSAGE_INDEX.size + size]
             self._indexes[channel] = entries
             if entries:
                 self._places.append((channel, record.offset))
@@ -97,8 +88,8 @@ class Chunk:
         """Check what is in it; `cut`: its message indexes may not all be there."""
         if not self.whole:
             return
-        counts = [len(entries) // INDEX_ENTRIES.itemsize for entries in self._indexes.values()]
-        entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
+        counts = [len(e) // formats.INDEX_ENTRIES.itemsize for e in self._indexes.values()]
+        entries = np.frombuffer(b"".join(self._indexes.values()), formats.INDEX_ENTRIES)
         channels = np.repeat([*self._indexes], counts)
         order = np.argsort(entries["offset"], kind="stable")
         entries, channels = entries[order], channels[order]
@@ -113,13 +104,14 @@ class Chunk:
         if self._head is None:
             return None
         head = self._head
-        first = CHUNK_INDEX.pack(
-            head.start, head.end, self.offset, self._length, len(self._places) * INDEX_OFFSET.size
+        places = b"".join(formats.INDEX_OFFSET.pack(*place) for place in self._places)
+        first = formats.CHUNK_INDEX.pack(
+            head.start, head.end, self.offset, self._length, len(places)
         )
-        places = b"".join(INDEX_OFFSET.pack(*place) for place in self._places)
-        text = CHUNK_INDEX_TAIL.pack(self._index_length, len(head.compression)) + head.compression
+        text = formats.CHUNK_INDEX_TAIL.pack(self._index_length, len(head.compression))
+        text += head.compression
         size = head.data.stop - head.data.start
-        return first + places + text + UINT64.pack(size) + UINT64.pack(head.size)
+        return first + places + text + formats.UINT64.pack(size) + formats.UINT64.pack(head.size)
 
     def _find_records(self, hints: Int64) -> None:
         """Find messages, take schemas and channels."""
@@ -193,7 +185,6 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
 
     Parameters
     ----------
-    records : bytes
     hints : np.ndarray [shape=(n,)], int64
         Where messages begin, ascending, if the index can be believed.
 
@@ -206,13 +197,13 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
     end : int
         Of the last record; not the length of the chunk if that is damaged.
     """
-    if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
+    if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - formats.MESSAGE_HEAD.itemsize:
         heads = gather_heads(records, hints)
         lengths = np.minimum(heads["length"], len(records))  # or their sums may overflow
         firsts = np.concatenate([[0], hints + HEAD.size + lengths])
         lasts = np.concatenate([hints, [len(records)]])
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
-            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= MESSAGE_FIXED)
+            (heads["opcode"] == Opcode.MESSAGE) & (lengths >= formats.MESSAGE_FIXED)
         ).all():
             others: list[tuple[int, int, int]] = []
             for place in np.flatnonzero(firsts < lasts).tolist():
@@ -231,7 +222,7 @@ def _walk(content: bytes, start: int, end: int) -> tuple[Int64, list[tuple[int, 
     others: list[tuple[int, int, int]] = []
     with suppress(McapError):
         for opcode, first, last in iterate_records(content, start, end):
-            if opcode == Opcode.MESSAGE and last - first >= MESSAGE_HEAD.itemsize:
+            if opcode == Opcode.MESSAGE and last - first >= formats.MESSAGE_HEAD.itemsize:
                 messages.append(first)
             else:
                 others.append((opcode, first, last))
@@ -250,9 +241,6 @@ def check_channels(
 
     Parameters
     ----------
-    findings : Findings
-    definitions : CheckedDefinitions
-    content : ChunkContent
     new : dict of int to int
         Channels that were defined among these messages, and where.
     offset : int

@@ -43,7 +43,6 @@ class DataSection:
 
     Parameters
     ----------
-    findings : Findings
     names : collection of str
         Names of the metadata records and attachments that are kept.
     ours : bool
@@ -51,9 +50,6 @@ class DataSection:
 
     Attributes
     ----------
-    findings : Findings
-    definitions : CheckedDefinitions
-    header : mcap.records.Header or None
     metadata : dict of str to list of dict
         By name: the first two records of the names to keep, if they are not too large.
     attachments : dict of str to list of bytes
@@ -99,10 +95,6 @@ class DataSection:
 
     def add(self, record: Record) -> Iterator[MessageBatch | None]:
         """Take the next record.
-
-        Parameters
-        ----------
-        record : Record
 
         Yields
         ------

@@ -21,11 +21,8 @@ class Record(NamedTuple):
 
     Attributes
     ----------
-    opcode : int
-    offset : int
     length : int
         In bytes, opcode and length included.
-    content : bytes
     crc : int or None
         CRC-32 of the file up to here, if all of it was read.
     """
@@ -44,7 +41,6 @@ class RecordWalk:
     ----------
     source : ByteSource
         Behind the magic.
-    findings : Findings
     finished : bool
         Whether the file has an end.
     places : sequence of int
