@@ -17,12 +17,7 @@ class LogError(HearthlogError):
 class HearthlogWarning(UserWarning):
     """Something is read in part only; the command line prints the line once, and exits with 3.
 
-    Parameters
-    ----------
-    text : str
-        Python shows each text once, so it names no file.
-    where : Path or str
-        The file or the topic.
+    The text names no file, for Python shows each text once; `where` is the file or the topic.
     """
 
     def __init__(self, text: str, where: object) -> None:

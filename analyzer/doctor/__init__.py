@@ -16,11 +16,6 @@ __all__ = ["ExaminedFile", "Finding", "Findings", "examine", "examine_file"]
 def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
     """Check a log, or all logs of a folder and how they follow each other.
 
-    Parameters
-    ----------
-    progress : callable
-        Told the share of the bytes that were read.
-
     Returns
     -------
     list of Findings

@@ -36,33 +36,17 @@ _KEPT = {METADATA, ROSBAG2, *ATTACHMENTS}
 
 @dataclass
 class ExaminedFile:
-    """A file that was checked.
-
-    Attributes
-    ----------
-    ours : bool
-        Whether it is a log of hearthlog, and no layer beside one.
-    span : tuple of int, or None
-        First and last log time, in nanoseconds.
-    frames : dict of str to FrameSequence
-        By microphone.
-    """
+    """A file that was checked."""
 
     findings: Findings
-    ours: bool = False
+    ours: bool = False  # whether it is a log of hearthlog, and no layer beside one
     node: str = ""
-    span: tuple[int, int] | None = None
-    frames: dict[str, FrameSequence] = field(default_factory=dict)
+    span: tuple[int, int] | None = None  # first and last log time, in nanoseconds
+    frames: dict[str, FrameSequence] = field(default_factory=dict)  # by microphone
 
 
 def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFile:
-    """Check one file against the specification of MCAP and, if it is ours, against the contract.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the share of the file that was read, 0 to 1.
-    """
+    """Check one file against the specification of MCAP and, if it is ours, docs/log.md."""
     examined = ExaminedFile(Findings(path))
     try:
         with ByteSource(path) as source:
@@ -73,21 +57,11 @@ def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFi
 
 
 class _Outline(NamedTuple):
-    """What the index of a file tells before the file is read from its beginning.
+    """What the index of a file tells before the file is read from its beginning."""
 
-    Attributes
-    ----------
-    offsets : list of int
-        Bytes at which records begin, ascending.
-    summary_start : int
-        0 if there is no summary.
-    ours : bool
-        Whether a recorder of hearthlog wrote the file.
-    """
-
-    offsets: list[int]
-    summary_start: int
-    ours: bool
+    offsets: list[int]  # bytes at which records begin, ascending
+    summary_start: int  # 0 if there is no summary
+    ours: bool  # whether a recorder of hearthlog wrote the file
 
 
 def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> None:

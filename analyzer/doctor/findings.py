@@ -22,27 +22,15 @@ DISTRUST = "do not train from it; if hearthlog wrote it as it is, report that"
 
 
 class Finding(NamedTuple):
-    """One thing that is wrong.
-
-    Attributes
-    ----------
-    rule : str
-        Which rule of docs/doctor.md is broken.
-    advice : str
-        What to do; empty where the finding says it all.
-    offset : int or None
-        Byte of the file at which the record begins.
-    time : int or None
-        Log time in nanoseconds.
-    """
+    """One thing that is wrong."""
 
     path: Path
     level: Level
-    rule: str
+    rule: str  # which rule of docs/doctor.md is broken
     what: str
-    advice: str = ""
-    offset: int | None = None
-    time: int | None = None
+    advice: str = ""  # what to do; empty where the finding says it all
+    offset: int | None = None  # byte of the file at which the record begins
+    time: int | None = None  # log time in nanoseconds
 
     def __str__(self) -> str:
         parts = [f"{self.level}: {self.path}"]

@@ -30,15 +30,6 @@ class FrameSequence:
         Frames of a window, at whose end there is a label.
     labelled : bool
         Whether there is a model.
-
-    Attributes
-    ----------
-    first, last : tuple of int, or None
-        Frame and stamp of the first and the last frame.
-    lost_before : int
-        Frames that gaps before the first frame lost.
-    gap_before : tuple of int, or None
-        Start and end of the first of these gaps.
     """
 
     def __init__(
@@ -50,10 +41,10 @@ class FrameSequence:
         *,
         labelled: bool,
     ) -> None:
-        self.first: tuple[int, int] | None = None
+        self.first: tuple[int, int] | None = None  # frame and stamp of the first and the last frame
         self.last: tuple[int, int] | None = None
-        self.lost_before = 0
-        self.gap_before: tuple[int, int] | None = None
+        self.lost_before = 0  # frames that gaps before the first frame lost
+        self.gap_before: tuple[int, int] | None = None  # start and end of the first of these gaps
         self._findings = findings
         self._name = microphone
         self._every = statistics_every

@@ -188,15 +188,8 @@ class LogFile:
     def scan_new(self) -> NDArray[np.void]:
         """Walk through the records that were written since the last scan.
 
-        Returns
-        -------
-        np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            The chunks among them, and runs of messages outside of chunks, by start time.
-
-        Raises
-        ------
-        LogError
-            If a record is damaged.
+        Return the chunks among them, and runs of messages outside of chunks, by start time. Raise
+        LogError if a record is damaged.
         """
         rows = array("q")
         row: ChunkRow | None = None

@@ -47,14 +47,9 @@ class Block(NamedTuple):
 
 
 def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
-    """Group messages that were read by the sizes of their payloads, to write them as they are.
+    """Group messages by the sizes of their payloads, to write them as they are to a channel.
 
-    Parameters
-    ----------
-    channel : int
-        Number of the channel that they are written to.
-    first_rank : int
-        Rank of the first of them; the others follow.
+    The first of them has the rank `first_rank`, the others follow.
     """
     for size in np.unique(messages.sizes).tolist():
         rows = np.flatnonzero(messages.sizes == size)

@@ -12,22 +12,13 @@ from hearthlog.schemas.mcap.formats import MESSAGE_FIXED, MESSAGE_HEAD
 
 @dataclass(frozen=True)
 class RawMessages:
-    """Messages of one channel, in the order of their log times.
-
-    Attributes
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8
-        Holds the messages, and others.
-    offsets : np.ndarray [shape=(n,)], int64
-        Where in the buffer the payloads begin.
-    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-    """
+    """Messages of one channel, in the order of their log times."""
 
     channel: Channel
     schema: Schema | None
-    buffer: Bytes
-    offsets: Int64
-    heads: NDArray[np.void]
+    buffer: Bytes  # [shape=(b,)], uint8: holds the messages, and others
+    offsets: Int64  # [shape=(n,)], int64: where in the buffer the payloads begin
+    heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
 
     def __len__(self) -> int:
         return len(self.offsets)

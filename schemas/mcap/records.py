@@ -95,19 +95,10 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = False) -> bytes:
-    """Decompress the records of a chunk.
+    """Decompress the records of a chunk, given the content of its record.
 
-    Parameters
-    ----------
-    content : bytes-like
-        The chunk's record, without opcode and length.
-    check : bool
-        Whether to compare with its checksum, which takes longer than to decompress.
-
-    Raises
-    ------
-    McapError
-        If the data are damaged.
+    `check` compares them with their checksum, which takes longer than to decompress. Raise
+    McapError if the data are damaged.
     """
     out = bytearray(head.size)
     decompress_into(memoryview(out), head, content, check=check)

@@ -16,27 +16,15 @@ LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
 
 
 class StoredChunk(NamedTuple):
-    """A chunk as a file holds it.
-
-    Attributes
-    ----------
-    data : bytes-like
-        Compressed records.
-    size, crc : int
-        Bytes and CRC-32 of the records, uncompressed.
-    start, end : int
-        Log times of the first and the last message, in nanoseconds.
-    entries : mapping of int to bytes-like
-        The message index: by channel, log times and offsets of the messages (`INDEX_ENTRIES`).
-    """
+    """A chunk as a file holds it."""
 
     compression: bytes
-    data: bytes | memoryview
-    size: int
-    crc: int
-    start: int
-    end: int
-    entries: Mapping[int, bytes | bytearray]
+    data: bytes | memoryview  # compressed records
+    size: int  # bytes of the records, uncompressed
+    crc: int  # CRC-32 of the same
+    start: int  # log time of the first message, in nanoseconds
+    end: int  # and of the last
+    entries: Mapping[int, bytes | bytearray]  # the message index, `INDEX_ENTRIES` by channel
 
 
 class _Local(threading.local):

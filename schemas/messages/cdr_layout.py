@@ -81,18 +81,10 @@ class Layout(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How a file's definition of one of our types is an older or a newer one.
+    """How a file's definition of one of our types is an older or a newer one."""
 
-    Attributes
-    ----------
-    later : frozenset of str
-        Fields that were appended by a later version, which are not read.
-    absent : list of (field, description)
-        Fields that were appended since, in whose place there are defaults.
-    """
-
-    later: frozenset[str]
-    absent: Sequence[tuple[str, Any]]
+    later: frozenset[str]  # fields that a later version appended, which are not read
+    absent: Sequence[tuple[str, Any]]  # fields that were appended since: they have defaults
 
 
 _SAME = Growth(frozenset(), ())
@@ -135,37 +127,18 @@ def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -
 
 
 class TypeDefinition(NamedTuple):
-    """A message type as a file defines it.
-
-    Attributes
-    ----------
-    types : mapping of str to list of (field, description)
-        The fields of this type and of those it builds on, as rosbags describes them.
-    growth : mapping of str to Growth
-        By type, where this definition is of another version.
-    """
+    """A message type as a file defines it, and the types that it builds on."""
 
     name: str
-    types: Mapping[str, Any]
-    growth: Mapping[str, Growth]
+    types: Mapping[str, Any]  # by name: fields and their descriptions, as rosbags has them
+    growth: Mapping[str, Growth]  # by name, where the file has another version of the type
 
 
 class LayoutWalk:
     """One way through the fields of a message, on which the layout is noted.
 
-    Parameters
-    ----------
-    order : str
-        Byte order, as numpy has it.
-    length_at : callable
-        Returns the length of the string or sequence of a path, whose length word lies at an offset.
-    size : int
-        Bytes, at most.
-
-    Attributes
-    ----------
-    end : int
-        Bytes so far.
+    `order` is the byte order as numpy has it, `length_at` returns the length of the string or
+    sequence of a path by the offset of its length word, `size` are the bytes at most.
     """
 
     def __init__(
@@ -175,7 +148,7 @@ class LayoutWalk:
         length_at: Callable[[str, int], int],
         size: int,
     ) -> None:
-        self.end = START
+        self.end = START  # bytes so far
         self._name, self._types, self._growth = definition
         self._order = order
         self._length_at = length_at

@@ -19,21 +19,11 @@ _TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_OF_LAYER})/)?(\w+)", re.ASCII)
 
 @dataclass(frozen=True)
 class Quality:
-    """The quality of service of a topic, where topics differ: the defaults are those of ROS 2.
+    """The quality of service of a topic, where topics differ: the defaults are those of ROS 2."""
 
-    Attributes
-    ----------
-    depth : int
-        How many messages are kept.
-    transient_local : bool
-        They are kept for those who come late.
-    lifespan_seconds : int or None
-        For how long; None: for ever.
-    """
-
-    depth: int = 10
-    transient_local: bool = False
-    lifespan_seconds: int | None = None
+    depth: int = 10  # how many messages are kept
+    transient_local: bool = False  # they are kept for those who come late
+    lifespan_seconds: int | None = None  # for how long; None: for ever
 
 
 _LATCHED = Quality(depth=1, transient_local=True)
@@ -66,19 +56,11 @@ def topic(microphone: str, kind: str) -> str:
 
 
 class TopicName(NamedTuple):
-    """The parts of the name of a topic.
-
-    Attributes
-    ----------
-    labelling : str
-        `live`, `review` or `relabel/<model>`.
-    kind : str
-        `features`, `label`, `segment` …
-    """
+    """The parts of the name of a topic."""
 
     microphone: str
-    labelling: str
-    kind: str
+    labelling: str  # `live`, `review` or `relabel/<model>`
+    kind: str  # `features`, `label`, `segment` …
 
 
 def labelling_topic(microphone: str, labelling: str, kind: str) -> str:

@@ -25,15 +25,9 @@ _LAYOUTS_KEPT = 256
 
 
 class MessageType:
-    """A ROS 2 message type as a file defines it.
+    """A ROS 2 message type as a file defines it; parameters as in `TypeDefinition`.
 
-    What is read of types of ours are the fields that this version has, whichever version wrote
-    them.
-
-    Parameters
-    ----------
-    name, types, growth
-        As in `TypeDefinition`.
+    Of types of ours those fields are read that this version has, whichever version wrote them.
     """
 
     def __init__(

@@ -12,15 +12,11 @@ SCHEMA_VERSION = 2  # of the messages and records that this version writes
 class Appended(NamedTuple):
     """A field that messages did not have from the beginning.
 
-    Attributes
-    ----------
-    since : int
-        The first schema version that has it.
-    default : float, str or None
-        What a message without it says; None: a number of 0, no time, an empty text or sequence.
+    Its default is what a message without it says; None stands for a number of 0, no time, an empty
+    text or sequence.
     """
 
-    since: int
+    since: int  # the first schema version that has it
     default: float | str | None = None
 
 

@@ -27,32 +27,16 @@ _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a file that is not whole, and what was lost with it.
+    """A part of a file that is not whole, and what was lost with it."""
 
-    Attributes
-    ----------
-    start, end : int
-        Bytes.
-    messages : mapping of str to int
-        Lost messages, by topic.
-    exact : bool
-        Whether these are all that are lost.
-    times : tuple of int, or None
-        Log times of the first and the last lost message, if there is a trace of them.
-    others : sequence of str
-        Names of lost metadata records and attachments.
-    cut : bool
-        Whether the file just ends here.
-    """
-
-    start: int
+    start: int  # bytes of the file
     end: int
     why: str
-    messages: Mapping[str, int] = field(default_factory=dict)
-    exact: bool = True
-    times: tuple[int, int] | None = None
-    others: tuple[str, ...] = ()
-    cut: bool = False
+    messages: Mapping[str, int] = field(default_factory=dict)  # that are lost, by topic
+    exact: bool = True  # whether these are all that are lost
+    times: tuple[int, int] | None = None  # log times of the first and last of them
+    others: tuple[str, ...] = ()  # names of lost metadata records and attachments
+    cut: bool = False  # whether the file just ends here
 
     @property
     def lossless(self) -> bool:
@@ -71,26 +55,20 @@ class Damage:
 
 
 class Index(NamedTuple):
-    """What the index of a file says, whose checksum is right.
+    """The index of a file, whose checksum is right.
 
     Attributes
     ----------
-    start : int
-        Where it begins.
-    messages : dict of int to int
-        By channel.
     chunks : np.ndarray [shape=(n, 5)], int64
         Offset, length, length of the message indexes, first and last log time of each chunk, in
         the order of the file.
-    names : dict of int to str
-        Metadata and attachments, by their offsets.
     """
 
-    start: int
+    start: int  # byte at which it begins
     definitions: list[Definition]
-    messages: dict[int, int]
+    messages: dict[int, int]  # by channel
     chunks: NDArray[np.int64]
-    names: dict[int, str]
+    names: dict[int, str]  # of metadata records and attachments, by offset
 
 
 class DamagedRange(NamedTuple):
@@ -120,10 +98,7 @@ _NOTHING = Loss({}, exact=True)
 def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     """Read the index of a finished file; None if there is none, or if it may be damaged.
 
-    Parameters
-    ----------
-    limit : int
-        Bytes; a longer index is not read.
+    An index of more bytes than the limit is not read.
     """
     end = reader.end - FOOTER_SIZE
     tail = reader.read(max(end, 0), FOOTER_SIZE)

@@ -32,25 +32,13 @@ from hearthlog.schemas.salvage.whole_records import (
 class RecordVerifier:
     """Reads whole records of a file from any byte on.
 
-    Parameters
-    ----------
-    descriptor : int
-        Of the open file.
-    end : int
-        Of what is read.
-
-    Attributes
-    ----------
-    work : int
-        Bytes that were read and decompressed.
-    inner : int
-        Records inside of chunks that were gone through.
+    `end` is where the part of the file ends that is read.
     """
 
     def __init__(self, descriptor: int, end: int) -> None:
         self.end = end
-        self.work = 0
-        self.inner = 0
+        self.work = 0  # bytes that were read and decompressed
+        self.inner = 0  # records inside of chunks that were gone through
         self._descriptor = descriptor
 
     def read(self, offset: int, length: int) -> bytes:
@@ -108,18 +96,9 @@ class RecordVerifier:
     def whole(self, offset: int, chained: int = 1) -> WholeRecord:
         """Read the record that begins here, if it is whole.
 
-        Parameters
-        ----------
-        chained : int
-            How many plausible records must follow a message outside of chunks, which has nothing
-            else to be known by.
-
-        Raises
-        ------
-        McapError
-            If it is not, or if this is no record.
-        UnicodeDecodeError
-            If a text in it is none.
+        A message outside of chunks has nothing else to be known by than the plausible records that
+        must follow it: so many as `chained`. Raise McapError, or UnicodeDecodeError, if the record
+        is not whole, or this is none.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -146,16 +125,9 @@ class RecordVerifier:
         return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
 
     def chunk(self, offset: int) -> WholeRecord:
-        """Read a chunk that should begin here, if its content is proved.
+        """Read a chunk that should begin here, if its content is proved, whatever its head says.
 
-        Whatever its head says beside that is not needed.
-
-        Raises
-        ------
-        McapError
-            If it is not.
-        UnicodeDecodeError
-            If a text in it is none.
+        Raise McapError, or UnicodeDecodeError, if it is not.
         """
         name = HEAD.size + CHUNK.size  # where that of the compression begins
         head = self.read(offset, name + 4 + UINT64.size)

@@ -74,16 +74,8 @@ def recover_log(
 def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
     """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
 
-    Returns
-    -------
-    path : Path
-        Its name: that of the damaged one, without `.active`.
-    recovery : Recovery
-
-    Raises
-    ------
-    LogError
-        As `recover_log`, or if the log is being written, or there is a file of a name needed here.
+    Return its name, without `.active`. Raise LogError as `recover_log` does, or if the log is being
+    written, or there is a file of a name needed here.
     """
     path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")

@@ -48,19 +48,11 @@ Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
 
 @dataclass
 class Unnamed:
-    """Whole messages of one channel that is nowhere defined.
-
-    Attributes
-    ----------
-    times : tuple of int
-        First and last log time, in nanoseconds.
-    place : tuple of int
-        First byte of the file, and the one behind.
-    """
+    """Whole messages of one channel that is nowhere defined."""
 
     messages: int
-    times: tuple[int, int]
-    place: tuple[int, int]
+    times: tuple[int, int]  # first and last log time, in nanoseconds
+    place: tuple[int, int]  # first byte of the file, and the one behind
 
     def add(self, messages: int, times: tuple[int, int], place: tuple[int, int]) -> None:
         """Add some more."""

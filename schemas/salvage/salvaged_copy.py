@@ -20,35 +20,21 @@ from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
 
 @dataclass
 class TopicRecovery:
-    """What was saved of a topic.
-
-    Attributes
-    ----------
-    expected : int or None
-        Messages that there should be, if the index of the log says so.
-    end : int
-        Log time of the last message, in nanoseconds.
-    """
+    """What was saved of a topic."""
 
     type: str
     messages: int = 0
-    expected: int | None = None
-    end: int = 0
+    expected: int | None = None  # messages that there should be, if the index of the log says so
+    end: int = 0  # log time of the last message, in nanoseconds
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was saved of a log, and what was lost.
-
-    Attributes
-    ----------
-    complete : bool
-        Whether the log was finished, and its index is whole.
-    """
+    """What was saved of a log, and what was lost."""
 
     topics: dict[str, TopicRecovery]
     damages: list[Damage]
-    complete: bool
+    complete: bool  # whether the log was finished, and its index is whole
 
     @property
     def messages(self) -> int:
@@ -64,21 +50,12 @@ class Recovery:
 class SalvagedCopy:
     """Copies the whole pieces of a damaged log into a new one.
 
-    Parameters
-    ----------
-    stream : BinaryIO
-        Of the new log, at its start.
-    profile : str
-        What the header of the new log says if that of the old one is lost.
-
-    Attributes
-    ----------
-    pieces : int
-        Pieces that were copied.
+    `profile` is what the header of the new log says if that of the old one is lost; `pieces` counts
+    what was copied.
     """
 
     def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
-        self.pieces = 0
+        self.pieces = 0  # pieces that were copied
         self._salvage = salvage
         self._profile = profile
         self._writer = ChunkWriter(stream)

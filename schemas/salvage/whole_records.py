@@ -37,36 +37,18 @@ class WholeAttachment(NamedTuple):
 
 
 class WholeRecord(NamedTuple):
-    """A whole record.
-
-    Attributes
-    ----------
-    offset, end : int
-        Bytes of the file.
-    record : McapRecord, WholeChunk, WholeAttachment or None
-        None for a message index, which is made anew.
-    corrected : str
-        What of its head was wrong and had to be corrected; empty if nothing was.
-    """
+    """A whole record."""
 
     offset: int
     end: int
-    record: McapRecord | WholeChunk | WholeAttachment | None
-    corrected: str = ""
+    record: McapRecord | WholeChunk | WholeAttachment | None  # None for a message index
+    corrected: str = ""  # what of its head was wrong
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
-    """Go through the records of a chunk.
+    """Go through the records of a chunk, and return where messages and definitions begin.
 
-    Returns
-    -------
-    messages, definitions : np.ndarray [shape=(n,)], int64
-        Where in the content they begin.
-
-    Raises
-    ------
-    McapError
-        If a record is damaged, or of a kind that no chunk holds.
+    Raise McapError if a record is damaged, or of a kind that no chunk holds.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size

@@ -12,21 +12,13 @@ _READ_ANYWAY = 1 << 30  # bytes; what is longer may be a hole in the file, and h
 
 
 class ByteSource:
-    """The bytes of a file, as many as it had when it was opened.
-
-    Attributes
-    ----------
-    offset : int
-        Of the next byte.
-    crc : int or None
-        Checksum of all bytes before that; None if some were not read.
-    """
+    """The bytes of a file, as many as it had when it was opened."""
 
     def __init__(self, path: Path) -> None:
         self._stream = os.fdopen(open_regular(path), "rb", buffering=_PIECE)
         self.size = os.fstat(self._stream.fileno()).st_size
-        self.offset = 0
-        self.crc: int | None = 0
+        self.offset = 0  # of the next byte
+        self.crc: int | None = 0  # checksum of all bytes before that; None if some were not read
 
     def __enter__(self) -> Self:
         return self

@@ -50,20 +50,12 @@ def name_of(opcode: int) -> str:
 
 
 class CheckedDefinitions(Definitions):
-    """The schemas and channels that were defined so far, each checked when it was added.
-
-    Attributes
-    ----------
-    ours : bool
-        Whether hearthlog made this file.
-    profile : str
-        Of the header.
-    """
+    """The schemas and channels that were defined so far, each checked when it was added."""
 
     def __init__(self, findings: Findings, *, ours: bool) -> None:
         super().__init__()
-        self.ours = ours
-        self.profile = ""
+        self.ours = ours  # whether hearthlog made this file
+        self.profile = ""  # of the header
         self._size = 0
         self._findings = findings
 

@@ -31,19 +31,11 @@ class ChunkContent(NamedTuple):
 
 
 class Chunk:
-    """A chunk, checked when the message indexes behind it are known.
-
-    Attributes
-    ----------
-    content : ChunkContent or None
-        None if the chunk is too damaged to be read.
-    whole : bool
-        Whether all of its messages are in `content`.
-    """
+    """A chunk, checked when the message indexes behind it are known."""
 
     def __init__(self, record: Record, findings: Findings, definitions: CheckedDefinitions) -> None:
-        self.content: ChunkContent | None = None
-        self.whole = False
+        self.content: ChunkContent | None = None  # None if the chunk is too damaged to be read
+        self.whole = False  # whether all of its messages are in `content`
         self.offset = record.offset
         self._length = record.length
         self._findings = findings
@@ -237,15 +229,7 @@ def check_channels(
     new: dict[int, int],
     offset: int,
 ) -> None:
-    """Say if messages come before their channels.
-
-    Parameters
-    ----------
-    new : dict of int to int
-        Channels that were defined among these messages, and where.
-    offset : int
-        Of the chunk in the file.
-    """
+    """Report messages before their channels, of which `new` are defined among them, and where."""
     numbers = content.heads["channel"]
     for channel in np.flatnonzero(np.bincount(numbers)).tolist():
         if channel not in definitions.channels:

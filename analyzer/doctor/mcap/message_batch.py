@@ -15,20 +15,11 @@ BATCH_SIZE = 4 << 20  # bytes
 
 
 class MessageBatch(NamedTuple):
-    """Some messages, still encoded.
+    """Some messages, still encoded."""
 
-    Attributes
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8
-        Holds their records, and others.
-    starts : np.ndarray [shape=(n,)], int64
-        Where in the buffer their records begin.
-    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-    """
-
-    buffer: Bytes
-    starts: Int64
-    heads: NDArray[np.void]
+    buffer: Bytes  # [shape=(b,)], uint8: holds their records, and others
+    starts: Int64  # [shape=(n,)], int64: where in the buffer their records begin
+    heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
 
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
@@ -44,13 +35,7 @@ class MessageBatch(NamedTuple):
 
 
 def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[MessageBatch]:
-    """Put chunks together: their contents, where messages begin in them, and the heads of these.
-
-    Yields
-    ------
-    MessageBatch
-        Of a few megabytes each, however large a chunk is.
-    """
+    """Yield the messages of some chunks, a few megabytes each time, however large a chunk is."""
     sizes = [len(content) for content, _, _ in parts]
     firsts = np.cumsum([0, *sizes[:-1]])
     buffer = np.frombuffer(b"".join(content for content, _, _ in parts), np.uint8)

@@ -17,21 +17,13 @@ _CUT = 2 << 20  # bytes; a longer end was not left by a writer that was killed
 
 
 class Record(NamedTuple):
-    """A record in a file.
-
-    Attributes
-    ----------
-    length : int
-        In bytes, opcode and length included.
-    crc : int or None
-        CRC-32 of the file up to here, if all of it was read.
-    """
+    """A record in a file."""
 
     opcode: int
     offset: int
-    length: int
+    length: int  # in bytes, opcode and length included
     content: bytes
-    crc: int | None
+    crc: int | None  # CRC-32 of the file up to here, if all of it was read
 
 
 class RecordWalk:
@@ -46,17 +38,12 @@ class RecordWalk:
     places : sequence of int
         Offsets of records, ascending, as the index of the file has them: here the walk goes on
         when it has lost its way.
-
-    Attributes
-    ----------
-    losses : int
-        How often something was passed over.
     """
 
     def __init__(
         self, source: ByteSource, findings: Findings, places: Sequence[int], *, finished: bool
     ) -> None:
-        self.losses = 0
+        self.losses = 0  # how often something was passed over
         self._source = source
         self._findings = findings
         self._finished = finished
