@@ -4,7 +4,7 @@ import zlib
 from array import array
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +14,16 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
 from hearthlog.schemas.mcap.records import LIMIT, parse
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
+from hearthlog.schemas.salvage.whole_records import WholeRecord
 from hearthlog.schemas.times import millisecond_text
 
 _BLOCK = 1 << 20
+_DAMAGES = 1000  # as many are told apart
 _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
 
 
@@ -52,6 +54,60 @@ class Damage:
             lost.append("perhaps more" if lost else "an unknown number of messages")
         span = "" if self.times is None else ", " + " to ".join(map(millisecond_text, self.times))
         return f"{where}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
+
+
+@dataclass
+class Unnamed:
+    """Whole messages of one channel that is nowhere defined."""
+
+    messages: int
+    times: tuple[int, int]  # first and last log time, in nanoseconds
+    place: tuple[int, int]  # first byte of the file, and the one behind
+
+    def add(self, messages: int, times: tuple[int, int], place: tuple[int, int]) -> None:
+        """Add some more."""
+        self.messages += messages
+        self.times = min(self.times[0], times[0]), max(self.times[1], times[1])
+        self.place = self.place[0], place[1]
+
+
+class DamageList:
+    """The damages of a file, and its whole messages of channels that are nowhere defined."""
+
+    def __init__(self) -> None:
+        self.unnamed: dict[int, Unnamed] = {}  # by channel
+        self._damages: list[tuple[Damage, dict[int, int]]] = []
+
+    def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
+        """Add a damage, behind all others, and its lost messages by channel."""
+        if len(self._damages) == _DAMAGES:
+            last, lost = self._damages.pop()
+            lossless = damage.lossless and last.lossless and not messages and not lost
+            damage = Damage(last.start, damage.end, "and more", exact=lossless, cut=damage.cut)
+            messages = lost
+        self._damages.append((damage, messages or {}))
+
+    def add_unnamed(
+        self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
+    ) -> None:
+        """Add messages of a channel that is not defined so far, and the record they are in."""
+        place = whole.offset, whole.end
+        self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
+
+    def resolve(self, definitions: Definitions) -> list[Damage]:
+        """List the damages by offset, then the unnamed messages, with the names of topics."""
+        damages = []
+        for damage, lost in self._damages:
+            messages: dict[str, int] = {}
+            for channel, count in lost.items():
+                topic = definitions.topic(channel)
+                messages[topic] = messages.get(topic, 0) + count
+            damages.append(replace(damage, messages=messages))
+        for channel, some in self.unnamed.items():
+            why = f"nothing that is left says what channel {channel} is"
+            messages = {definitions.topic(channel): some.messages}
+            damages.append(Damage(*some.place, why, messages, times=some.times))
+        return damages
 
 
 class Index(NamedTuple):

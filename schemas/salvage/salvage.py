@@ -11,7 +11,6 @@ the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, 
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -25,7 +24,7 @@ from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_he
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.salvage.damage import Damage, DamagedRange, loss_in, read_index
+from hearthlog.schemas.salvage.damage import Damage, DamagedRange, DamageList, loss_in, read_index
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
@@ -39,26 +38,10 @@ from hearthlog.schemas.storage.regular_file import open_regular
 _VAIN = 8
 _KEPT_LIMIT = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
 _KEPT_EACH = 256
-_DAMAGES = 1000  # as many are told apart
 _WINDOW = 1 << 20
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
 
 Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
-
-
-@dataclass
-class Unnamed:
-    """Whole messages of one channel that is nowhere defined."""
-
-    messages: int
-    times: tuple[int, int]  # first and last log time, in nanoseconds
-    place: tuple[int, int]  # first byte of the file, and the one behind
-
-    def add(self, messages: int, times: tuple[int, int], place: tuple[int, int]) -> None:
-        """Add some more."""
-        self.messages += messages
-        self.times = min(self.times[0], times[0]), max(self.times[1], times[1])
-        self.place = self.place[0], place[1]
 
 
 class Salvage:
@@ -89,7 +72,8 @@ class Salvage:
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
         self.header: records.Header | None = None
         self.definitions = Definitions()
-        self.unnamed: dict[int, Unnamed] = {}
+        self._damages = DamageList()
+        self.unnamed = self._damages.unnamed
         try:
             self._descriptor = open_regular(path)
         except OSError as error:
@@ -106,7 +90,6 @@ class Salvage:
             definitions = [*self._index.definitions, *definitions]
         for record in definitions:
             self.definitions.add(record)
-        self._damages: list[tuple[Damage, dict[int, int]]] = []
         self._next: WholeRecord | None = None  # by the last search
         self._vain = self._kept = 0
         self._cost = 0  # of what was last read in vain
@@ -127,18 +110,7 @@ class Salvage:
 
     def damages(self) -> list[Damage]:
         """List the damages met so far, by offset, and then the messages of undefined channels."""
-        damages = []
-        for damage, lost in self._damages:
-            messages: dict[str, int] = {}
-            for channel, count in lost.items():
-                topic = self.definitions.topic(channel)
-                messages[topic] = messages.get(topic, 0) + count
-            damages.append(replace(damage, messages=messages))
-        for channel, some in self.unnamed.items():
-            why = f"nothing that is left says what channel {channel} is"
-            messages = {self.definitions.topic(channel): some.messages}
-            damages.append(Damage(*some.place, why, messages, times=some.times))
-        return damages
+        return self._damages.resolve(self.definitions)
 
     def pieces(self) -> Iterator[Piece]:
         """Read whatever is whole, in the order of the file.
@@ -158,7 +130,7 @@ class Salvage:
                 self._offset = self._pass(offset, str(error))
                 continue
             if whole.corrected:
-                self._add_damage(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
+                self._damages.add(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
             self._offset = whole.end
             yield from self._take(whole)
             del whole  # before the next is read, which may be as large
@@ -245,10 +217,10 @@ class Salvage:
         elif not any(reader.read(offset, 64)):
             why = "zeros"
         if self._ended:  # it was part of the index
-            self._add_damage(Damage(offset, end, why, cut=cut))
+            self._damages.add(Damage(offset, end, why, cut=cut))
         else:
             lost = loss_in(reader, DamagedRange(offset, end, opcode, ends), self._index)
-            self._add_damage(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
+            self._damages.add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
         return end
 
     def _search(self, start: int) -> int:
@@ -288,7 +260,7 @@ class Salvage:
                 yield record
             else:
                 times = record.log_time, record.log_time
-                self._note_unnamed(record.channel_id, 1, times, whole)
+                self._damages.add_unnamed(record.channel_id, 1, times, whole)
         elif isinstance(record, records.Metadata | WholeAttachment):
             yield record
 
@@ -307,25 +279,12 @@ class Salvage:
         for number, entries in chunk.stored.entries.items():
             if not defined[number]:
                 times = np.frombuffer(entries, np.int64)[::2]
-                self._note_unnamed(number, len(times), (int(times.min()), int(times.max())), whole)
+                span = int(times.min()), int(times.max())
+                self._damages.add_unnamed(number, len(times), span, whole)
         if any(defined.values()):
             for message in chunk_messages(chunk.stored):
                 if defined[message.channel_id]:
                     yield message
-
-    def _note_unnamed(
-        self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
-    ) -> None:
-        place = whole.offset, whole.end
-        self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
-
-    def _add_damage(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
-        if len(self._damages) == _DAMAGES:
-            last, lost = self._damages.pop()
-            lossless = damage.lossless and last.lossless and not messages and not lost
-            damage = Damage(last.start, damage.end, "and more", exact=lossless, cut=damage.cut)
-            messages = lost
-        self._damages.append((damage, messages or {}))
 
 
 def _size(record: Definition) -> int:
