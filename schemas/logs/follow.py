@@ -77,8 +77,6 @@ def follow_messages(
 
     Parameters
     ----------
-    folder, topics, start, stop
-        Those of `follow`.
     damaged : callable
         Takes the error of a log that is damaged, of which no more is read then; by default it is
         raised.

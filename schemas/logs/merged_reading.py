@@ -38,16 +38,7 @@ def time_spans(
 ) -> list[tuple[int, int, Path]]:
     """Return first and last log time of each log that has messages, in the order of time.
 
-    Parameters
-    ----------
-    logs : iterable of Path
-    span_of : callable
-        Finds out those of one log, or None.
-
-    Raises
-    ------
-    LogError
-        If one is no MCAP file, or is damaged.
+    `span_of` finds out those of one log, or None. Raise LogError if a log is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
@@ -114,21 +105,11 @@ class _Query(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """What is read at once.
+    """What is read at once."""
 
-    Attributes
-    ----------
-    parts : list of (LogFile, np.ndarray)
-        Chunks by log.
-    until : int
-        No later batch has an earlier message.
-    finished : list of LogFile
-        Logs of which nothing more is to be read.
-    """
-
-    parts: list[tuple[LogFile, NDArray[np.void]]]
-    until: int
-    finished: list[LogFile]
+    parts: list[tuple[LogFile, NDArray[np.void]]]  # chunks by log
+    until: int  # no later batch has an earlier message
+    finished: list[LogFile]  # of which nothing more is to be read
 
 
 def iterate_messages(
@@ -174,15 +155,10 @@ def iterate_pieces(  # noqa: PLR0913
     *,
     every: int = 1,
 ) -> Iterator[list[Piece]]:
-    """Make something of the messages of some logs as they are read, in the threads that read.
+    """Apply a function to the messages of each span of time, in the threads that read them.
 
     Parameters and errors are those of `iterate_messages`; of `every` so many chunks of a log one
     is read, for a sample.
-
-    Yields
-    ------
-    list of Piece
-        What the function made of messages: of those of the next span of time.
     """
     return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
 

@@ -171,9 +171,7 @@ def decode_rows(
     Returns
     -------
     dict of str to np.ndarray [shape=(n, ...)]
-        By field path: numbers as they are, stamps and durations as int64 nanoseconds, strings as
-        objects (`str`), arrays of numbers or strings with one row each, or as objects where their
-        lengths differ, arrays of messages as lists of dicts.
+        By field path, as `Columns` has them.
 
     Raises
     ------
@@ -182,7 +180,10 @@ def decode_rows(
     """
     parts: list[tuple[Indices, Fields]] = []
     for size, rows in _by_size(sizes):
-        parts += _decode_same_size(kind, rows, gather(buffer, offsets[rows], size), fields)
+        payloads = gather(buffer, offsets[rows], size)
+        for layout, same in _by_layout(kind, payloads):
+            block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
+            parts.append((rows[same], _decode(layout.leaves, block, fields)))
     return _scattered(parts, len(sizes))
 
 
@@ -190,15 +191,6 @@ def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:
     if len(sizes) and (sizes == sizes[0]).all():  # most often, and quicker
         return [(int(sizes[0]), np.arange(len(sizes)))]
     return [(size, np.flatnonzero(sizes == size)) for size in np.unique(sizes).tolist()]
-
-
-def _decode_same_size(
-    kind: MessageType, rows: Indices, payloads: NDArray[np.void], fields: Collection[str] | None
-) -> Iterator[tuple[Indices, Fields]]:
-    """Decode payloads by layout; yield which rows have it, and their fields."""
-    for layout, same in _by_layout(kind, payloads):
-        block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
-        yield rows[same], _decode(layout.leaves, block, fields)
 
 
 def _by_layout(kind: MessageType, payloads: NDArray[np.void]) -> Iterator[tuple[Layout, Indices]]:

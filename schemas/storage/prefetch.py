@@ -12,19 +12,10 @@ Result = TypeVar("Result")
 def prefetch(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
-    """Apply a function to items in threads, few ahead of the consumer.
+    """Apply a function to items in threads, few ahead of the consumer; yield results in order.
 
-    Parameters
-    ----------
-    function : callable
-        Should spend its time where the interpreter is not needed: reading, decompressing, numpy.
-    workers : int
-        Threads; one item more than these is worked on, or waits for the consumer.
-
-    Yields
-    ------
-    object
-        What the function returns, in the order of the items.
+    The function should spend its time where the interpreter is not needed: reading, decompressing,
+    numpy. One item more than there are workers is worked on, or waits for the consumer.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()

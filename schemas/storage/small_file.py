@@ -14,18 +14,10 @@ _DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of 
 
 
 def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
-    """Read a regular file.
+    """Read a regular file of this machine, or a file of a store.
 
-    Parameters
-    ----------
-    path : Path
-        On this machine, or in a store.
-    what : str
-        What it should be, for the message.
-    limit : int
-        Bytes, at most.
-    error : type of HearthlogError
-        What is raised if there is no such file, or it is larger or cannot be read.
+    Raise `error` if there is none, it cannot be read, or has more bytes than the limit; `what` says
+    in the message what it should be.
     """
     try:
         if not path.exists():
@@ -45,12 +37,9 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
-    """Read a TOML file; the parameters are those of `read_whole`.
+    """Read a TOML file; parameters as of `read_whole`.
 
-    Raises
-    ------
-    HearthlogError
-        `error`, if it cannot be read, is larger than 1 MB, nested too deeply, or no TOML in UTF-8.
+    Raise `error` if it cannot be read, is larger than 1 MB, nested too deeply, or no TOML in UTF-8.
     """
     data = read_whole(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
