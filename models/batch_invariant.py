@@ -9,16 +9,16 @@ _LINE = 64  # bytes of a cache
 
 
 def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
-    """Multiply `rows @ weights` so that a row's result is the same in any company.
+    """Multiply `rows @ weights` so that a row's result does not depend on the other rows.
 
-    A BLAS picks its kernels, and its threads, by the size of the whole product, and each sums
-    in an order of its own. Stacks of one small, fixed shape leave it no choice.
+    A BLAS chooses its kernel and its threads by the size of the whole product, and each sums in
+    another order. Stacks of one small, fixed shape leave it no choice.
 
     Parameters
     ----------
     rows : np.ndarray [shape=(n, k)]
     weights : np.ndarray [shape=(k, m)]
-        At most a few thousand values, or the BLAS may still divide a stack among threads.
+        At most a few thousand values, else the BLAS may still divide a stack among threads.
 
     Returns
     -------
@@ -42,12 +42,7 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
 
 
 def aligned(weights: Float64) -> Float64:
-    """Copy weights to where a line of the cache begins: products with them take a third less time.
-
-    Parameters
-    ----------
-    weights : np.ndarray [shape=(k, m)]
-    """
+    """Copy weights to the start of a cache line: products with them take a third less time."""
     room = np.empty(weights.size * weights.itemsize + _LINE, np.uint8)
     start = -room.ctypes.data % _LINE
     copy = room[start : start + weights.size * weights.itemsize].view(np.float64)

@@ -1,4 +1,4 @@
-"""The classes of sound: the one table that says what each is called, drawn as, and lasts."""
+"""The classes of sound: one table of their names, colours and durations."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -9,7 +9,7 @@ COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing
 FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
 OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
-OTHER, UNKNOWN = "other", "unknown"  # what models and people say; no sound is labelled so
+OTHER, UNKNOWN = "other", "unknown"  # for models and people; no training sound has these labels
 
 
 class SoundClass(NamedTuple):
@@ -21,13 +21,13 @@ class SoundClass(NamedTuple):
     colour : (int, int, int)
         Red, green and blue, 0 to 255.
     seconds : float
-        How long such a sound is expected to go on.
+        Expected duration of such a sound.
     words : str
-        What people call it.
+        What people call the sound.
     several : str
-        What people call its events where they count them; empty where nobody does.
+        What people call its events where they count them; empty where they do not.
     aliases : tuple of str
-        What others call it, as `find_class` spells it: names of the same, not of a kind of it.
+        Names of the same class elsewhere, in the spelling of `find_class`; subclasses are none.
     """
 
     name: str
@@ -76,24 +76,24 @@ _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
 
 def find_class(label: str) -> SoundClass | None:
-    """Return the class that a label means; None for a class of somebody's own.
+    """Return the class that a label means; None for a class that is not in the table.
 
-    The name or an alias may be spelt with capitals, and with spaces, commas and hyphens for `_`:
-    `Crying, sobbing` is `crying_sobbing`.
+    Capitals, and spaces, commas and hyphens for `_`, make no difference: `Crying, sobbing` is
+    `crying_sobbing`.
     """
     return _BY_NAME.get(_spelt(label))
 
 
 def class_name(label: str) -> str:
-    """Return the name of the class that a label means; a class of somebody's own has its own."""
+    """Return the name of the class that a label means; the label itself if there is none."""
     row = find_class(label)
     return label if row is None else row.name
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
-    """Return which of some names a label means: itself, however it is spelt, or all of its class.
+    """Return those of some names that a label means: itself in any spelling, or all of its class.
 
-    Who lists two names of one class tells them apart, so another name of it means both.
+    Two names of one class in a list are different things there, so a third name means both.
     """
     if label in names:
         return [label]
@@ -103,7 +103,7 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
 
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
-    """Return what each of some labels is called among names; itself, if none or several mean it."""
+    """Return the name of each label among `names`; the label itself if it means none or several."""
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}
 

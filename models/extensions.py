@@ -1,4 +1,4 @@
-"""What other distributions add to hearthlog, found by name."""
+"""Extensions: objects of other distributions, by name."""
 
 from collections.abc import Sequence
 from importlib.metadata import entry_points
@@ -12,25 +12,25 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is found by."""
+        """Name in entry points and model files."""
 
 
 T = TypeVar("T", bound=Named)
 
 
 class Extensions(Generic[T]):
-    """Objects of one kind, by name: our own, and those that entry points of others name.
+    """Objects of one kind, by name: our own, and those of other distributions' entry points.
 
-    Entry points are looked at only for names that are not ours: a recorder with a model of our
-    own imports nothing of others.
+    Entry points are only looked up for names that are not ours, so that a recorder with a model
+    of ours imports nothing else.
 
     Parameters
     ----------
     group : str
-        Of entry points, such as `[project.entry-points."hearthlog.feature_sets"]`. Each is an
-        object of this kind, with the entry point's name as its `name`.
+        Group of entry points, such as "hearthlog.feature_sets". Each is an object of this kind
+        whose `name` is the name of the entry point.
     kind : type
-        Of the objects.
+        Class of the objects.
     ours : sequence of T
     """
 
@@ -46,18 +46,12 @@ class Extensions(Generic[T]):
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
     def get(self, name: str) -> T | None:
-        """Return the object of a name; None if there is none.
-
-        Raises
-        ------
-        ModelError
-            If the distribution that has it cannot be used.
-        """
+        """Return an object by its name, or None; raises ModelError if it cannot be imported."""
         if name not in self._loaded:
             for point in entry_points(group=self._group, name=name):
                 try:
                     loaded = point.load()
-                except Exception as error:  # whatever is wrong with the code of others
+                except Exception as error:  # foreign code may raise anything
                     raise ModelError(f"{point.value} cannot be imported: {error!r}") from error
                 if not isinstance(loaded, self._kind) or loaded.name != name:
                     what = f"no {self._kind.__name__} of the name {name!r}"

@@ -21,6 +21,7 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.features.feature_set import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.service import record
@@ -38,7 +39,6 @@ from hearthlog.schemas.times import NANOSECONDS
 
 SECONDS = 5.0  # of a microphone, unless it is said
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
-_FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _PATIENCE = 10.0  # seconds for a microphone to wake
 _STAMP = "header.stamp"
 _ENERGY = "energy"
@@ -214,7 +214,7 @@ def _check_sound(label: str, energies: NDArray[np.floating[Any]]) -> None:
     seconds = len(energies) * FRAME_NANOSECONDS / NANOSECONDS
     if seconds < LEAST_SECONDS:
         raise DataError(f"only {seconds:.2f} s of sound; enrol at least {LEAST_SECONDS:.0f} s")
-    if class_name(label) != SILENCE and (energies < _FLOOR).all():
+    if class_name(label) != SILENCE and (energies < SILENCE_POWER).all():
         raise DataError(
             f"all of it is below -60 dBFS: this is silence, not {label}; is the microphone muted?"
         )

@@ -1,12 +1,10 @@
 """Marks: what a reviewer says that was heard, in a layer beside the log it speaks about."""
 
-import fcntl
-import os
 import re
 import tempfile
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +25,7 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import REVIEW, Topic, check_microphone_name, labelling_topic
-from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.new_files import locked_folder, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
@@ -153,15 +151,12 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """Keep other writers of review layers out of a folder."""
-    try:
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written ({error.strerror})") from error
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked_folder(path.parent))
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written ({error.strerror})") from error
         yield
-    finally:
-        os.close(folder)
 
 
 def _marks(columns: Columns) -> Iterator[Mark]:

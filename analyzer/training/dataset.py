@@ -1,4 +1,4 @@
-"""From labelled sound to what a classifier learns from: windows of one second."""
+"""From labelled sound to the windows of one second that classifiers learn from."""
 
 import hashlib
 from collections import Counter
@@ -13,7 +13,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.models.classes import SILENCE, class_name
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.classifiers.description import Amount
+from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Float32, Float64, Indices
@@ -22,21 +23,20 @@ from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
-_FLOOR = 10 ** (-60 / 10)  # -60 dBFS
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 
 
 class Recording(NamedTuple):
-    """A stretch of sound of one label.
+    """Sound of one label.
 
     Attributes
     ----------
     label, group, collection, licence : str
-        As in a manifest: of one group, nothing is both learned from and tested on.
+        As in a manifest; a group is never both learned from and tested on.
     features : np.ndarray [shape=(n, d)], float32
-        Of successive frames.
+        Features of successive frames.
     weight : float
-        How much a segment of it counts.
+        Weight of its segments.
     """
 
     label: str
@@ -48,17 +48,8 @@ class Recording(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Amount:
-    """How much of a class there is."""
-
-    sources: int
-    segments: int
-    seconds: float
-
-
-@dataclass(frozen=True)
 class Dataset:
-    """Segments to learn from.
+    """Segments to learn from: windows of one second.
 
     Attributes
     ----------
@@ -67,18 +58,18 @@ class Dataset:
     target : np.ndarray [shape=(n,)], intp
         Index into `classes`.
     group, collection : np.ndarray [shape=(n,)], intp
-        Numbers of the source group and of the collection.
+        Number of the source group, and of the collection.
     weight : np.ndarray [shape=(n,)], float64
-        How much a segment counts.
+        Weight of the segment.
     classes : tuple of str
     seconds : dict of str to float
-        Sound of each class that was used, before it was thinned out.
+        Seconds of sound of each class, before it was thinned out.
     collection_names : tuple of str
-        The names behind `collection`.
+        Names behind `collection`.
     collections : dict of (name, licence) to int
-        How many recordings were used.
+        Number of recordings that were used.
     skipped : dict of str to int
-        Why recordings gave no segment, and how many.
+        Number of recordings that gave no segment, by the reason.
     """
 
     windows: Float32
@@ -105,7 +96,7 @@ class Dataset:
 
     @property
     def amounts(self) -> dict[str, Amount]:
-        """How much there is of each class."""
+        """Amount of each class."""
         return {
             name: Amount(
                 sources=len(np.unique(self.group[self.target == i])),
@@ -132,9 +123,8 @@ def build_dataset(
     progress : callable
         Told the share of the clips that is done.
     home : iterable of Recording
-        More to learn from.
+        Further recordings.
     features : FeatureSet
-        What is computed from the clips.
 
     Raises
     ------
@@ -158,7 +148,7 @@ def clip_recordings(
     progress: Progress,
     features: FeatureSet = DEFAULT,
 ) -> Iterator[Recording]:
-    """Listen to the clips of a scenario's labels; of others the label is all that is told.
+    """Read the features of clips; those of labels outside of the scenario get no features.
 
     Raises
     ------
@@ -179,9 +169,9 @@ def cut_recordings(
 ) -> Dataset:
     """Cut recordings into segments of a window, half a second apart.
 
-    A segment is kept if it is no more than 12 dB below its recording's mean level and above
-    -60 dBFS; of silence all are. At most 24 segments, times their weight, evenly spaced, are kept
-    for each class and source group.
+    Segments of silence are all kept, others if they are above -60 dBFS and at most 12 dB below the
+    mean level of their recording. Of each class and source group at most 24 segments, times their
+    weight, are kept, evenly spaced.
     """
     classes = tuple(scenario.classes)
     groups: dict[str, int] = {}
@@ -197,17 +187,17 @@ def cut_recordings(
         if name is None:
             skipped[f"label {item.label} is not in the scenario"] += 1
             continue
-        reason, found = _segments(item, features)
+        reason, segments = _segments(item, features)
         if reason:
             skipped[reason] += 1
             continue
         used[item.collection, item.licence] += 1
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
-        windows.append(found)
-        weights.append(np.full(len(found), item.weight))
+        windows.append(segments)
+        weights.append(np.full(len(segments), item.weight))
         group = groups.setdefault(item.group, len(groups))
         collection = collections.setdefault(item.collection, len(collections))
-        rows.append(np.tile([classes.index(name), group, collection], (len(found), 1)))
+        rows.append(np.tile([classes.index(name), group, collection], (len(segments), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
     kept = _thinned(target * len(groups) + group_of, weight)
@@ -226,13 +216,7 @@ def cut_recordings(
 
 
 def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
-    """Compute the features of a clip, shape (n, d).
-
-    Raises
-    ------
-    SourceError
-        If it cannot be read.
-    """
+    """Compute the features of a clip, shape (n, d); raises SourceError if it cannot be read."""
     extract = features.extractor()
     values = [np.empty((0, features.width), np.float32)]
     rest = np.empty(0, np.float32)
@@ -245,7 +229,7 @@ def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
 
 
 def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]:
-    """Return why there are no segments, or those that are loud enough."""
+    """Return the segments that are loud enough, and why there are none."""
     values, window = recording.features, features.window_frames
     nothing = np.empty((0, window, features.width), np.float32)
     if values.shape[1] != features.width:
@@ -258,15 +242,12 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]
         return "", windows
     power = features.power(windows).mean(axis=1, dtype=np.float64)
     level = features.power(values).mean(dtype=np.float64)
-    loud = windows[power > max(_FLOOR, level * _BELOW_CLIP)]
+    loud = windows[power > max(SILENCE_POWER, level * _BELOW_CLIP)]
     return ("" if len(loud) else "nowhere above -60 dBFS"), loud
 
 
 def _thinned(key: Indices, weight: Float64) -> Indices:
-    """Choose evenly spaced rows of each key; return their indices in order.
-
-    At most 24 are chosen, and more of what weighs more.
-    """
+    """Return the indices of evenly spaced rows of each key, at most 24 times their weight."""
     kept = [np.empty(0, np.intp)]
     for value in np.unique(key):
         rows = np.flatnonzero(key == value)

@@ -1,4 +1,4 @@
-"""A home's own sound to learn from: what was marked in its logs, and what was enrolled."""
+"""A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,22 +18,21 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.times import NANOSECONDS
 
-HOME_WEIGHT = 5.0  # of a segment of the home, where others count 1
+HOME_WEIGHT = 5.0  # of a segment of the home; others have 1
 HOME = "this home"
 
 
 def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:
-    """Read the features of everything that is marked in the logs of a folder.
+    """Read the features of all marks in the logs of a folder.
 
-    A mark shorter than a window is taken with what is around it. All marks of a day are of one
-    source.
+    A mark shorter than a window is extended to one. All marks of a day are of one source.
 
     Parameters
     ----------
     folder : Path
-        Of logs, with review layers beside them, and of enrolled sounds.
+        Folder of logs, with review layers beside them, and of enrolled sounds.
     features : FeatureSet
-        Of other features a recording has none.
+        Recordings of other sets have no features.
 
     Raises
     ------
@@ -47,27 +46,27 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
         topics = {topic(mark.microphone, "features") for mark in marks}
         columns = read_columns([log], topics, fields={"header.stamp", "frame", "values"})
         for mark in marks:
-            heard = columns.get(topic(mark.microphone, "features"))
-            if heard is not None and len(heard):
-                yield from _recordings(heard, mark, features)
+            recorded = columns.get(topic(mark.microphone, "features"))
+            if recorded is not None and len(recorded):
+                yield from _recordings(recorded, mark, features)
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
-    """Read what follows what in a home, where its marks leave no time between them.
+    """Read the sequences of classes in a home, from marks that follow each other without a gap.
 
     Parameters
     ----------
     folder : Path
-        Of logs, with review layers beside them.
+        Folder of logs, with review layers beside them.
     classes : sequence of str
 
     Returns
     -------
     list of np.ndarray [shape=(n,)], int64
-        Classes of successive frames; a mark on its own tells nothing and is left out.
+        Classes of successive frames; marks on their own are left out.
     """
     numbers = {name: number for number, name in enumerate(classes)}
-    found: list[Int64] = []
+    sequences: list[Int64] = []
     for log in find_logs(folder, enrolled=True):
         runs: list[list[Mark]] = []
         marks = read_marks(log)
@@ -84,8 +83,8 @@ def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
                 runs[-1].append(mark)
             else:
                 runs.append([mark])
-        found += [_frames_of(run, numbers) for run in runs if len(run) > 1]
-    return found
+        sequences += [_frames_of(run, numbers) for run in runs if len(run) > 1]
+    return sequences
 
 
 def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
@@ -93,13 +92,13 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
     return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
-def _recordings(heard: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
-    """Return what was heard during a mark; in pieces where there are gaps in it."""
-    window, values = features.window_frames, heard["values"]
-    names = array_names(heard.metadata, "values")
+def _recordings(recorded: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
+    """Yield the features of a mark, in pieces where there are gaps in it."""
+    window, values = features.window_frames, recorded["values"]
+    names = array_names(recorded.metadata, "values")
     if names and tuple(names) != features.feature_names:
         values = np.empty((len(values), 0), np.float32)
-    stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)
+    stamps, frames = recorded["header.stamp"], recorded["frame"].astype(np.int64)
     first, last = np.searchsorted(stamps, [mark.start, mark.end]).tolist()
     missing = max(window - (last - first), 0)
     first = max(first - missing // 2, 0)

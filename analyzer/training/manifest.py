@@ -21,12 +21,12 @@ class LabelledClip:
     Attributes
     ----------
     path : Path
-        The audio file; it existed when the manifest was read.
+        The audio file.
     label : str
     source_group : str
-        The original recording or speaker: clips of one group are never split between folds.
+        The original recording or speaker; folds never split a group.
     source, licence : str
-        Collection it came from and the licence it gives; empty where the manifest is silent.
+        Its collection and licence; empty where the manifest does not say.
     """
 
     path: Path
@@ -44,8 +44,7 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     path : Path
         CSV, UTF-8; the paths in it are relative to its folder. Other columns are ignored.
     labels : collection of str
-        Labels that mean something, as do other names of the same sounds (see
-        `hearthlog.models.classes`); any other is an error.
+        Allowed labels; other names of the same sounds (`hearthlog.models.classes`) are allowed too.
 
     Raises
     ------
@@ -92,8 +91,8 @@ def _clip(
         if not TEXT.fullmatch(value[name]):
             raise DataError(f"{where}: {name} must be one line of at most 300 characters")
     if not meant_by(value["label"], labels):
-        known = ", ".join(sorted(labels))
-        raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {known}")
+        names = ", ".join(sorted(labels))
+        raise DataError(f"{where}: unknown label {value['label'][:64]!r}; known are {names}")
     audio = folder / value["path"]
     if not _is_file(audio):
         raise DataError(f"{where}: no such file: {value['path'][:256]!r}")

@@ -1,4 +1,4 @@
-"""Ways to learn: how a classifier is made from segments, and tried on those it has not seen."""
+"""Methods: how a classifier is learned from segments, and tested on segments it has not seen."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,12 +22,12 @@ from hearthlog.schemas.progress import Progress
 
 _SEED = 20_261_121
 
-Fold = tuple[Indices, Indices]  # segments that are seen, and those that are not
+Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
 NO_HOME: Indices = np.empty(0, np.intp)
 
 
 class Examples(NamedTuple):
-    """The inputs of segments, of each as it is and as other microphones might have heard it.
+    """The inputs of segments, unchanged and augmented.
 
     Attributes
     ----------
@@ -42,42 +42,43 @@ class Examples(NamedTuple):
 
 
 class Learned(Protocol):
-    """What was learned from segments."""
+    """A classifier that was learned from segments."""
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Decide as the kind of classifier does with the arrays.
+        """Return decision values, as `Machine.decide` of the kind gives them.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
         classes : int
+            C.
 
         Returns
         -------
-        np.ndarray [shape=(n, classes)], float64
+        np.ndarray [shape=(n, C)], float64
             -inf for a class that was not learned.
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a model of this kind, of which all classes were learned."""
+        """Return the arrays of a model file; all classes were learned."""
 
     def parameters(self) -> dict[str, Any]:
-        """Return what the description of such a model has as its parameters."""
+        """Return the field `parameters` of the model's description."""
 
 
 @dataclass(frozen=True)
 class Method(ABC):
-    """A way to learn.
+    """How a classifier is learned.
 
     Attributes
     ----------
     name : str
     feature_set, inputs : str
-        What the classifier looks at.
+        Feature set of the classifier, and which of its inputs.
     kind : str
-        Of classifier.
+        Kind of classifier.
     copies : int
-        How often each segment is learned from as another microphone might have heard it.
+        Number of augmented copies of each segment.
     """
 
     name: str
@@ -93,12 +94,12 @@ class Method(ABC):
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions are part of what comes out."""
+        """Distributions whose versions influence the result."""
         return ()
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What can be chosen, and is searched for."""
+        """Parameters that can be chosen and searched for."""
         return {}
 
     @abstractmethod
@@ -111,40 +112,34 @@ class Method(ABC):
         ----------
         examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
-            Those that are learned from.
+            Segments to learn from; all by default.
         home : np.ndarray [shape=(h,)], intp
-            Of these, the ones of a home to which the classifier is to be adapted.
+            Those among them that belong to the home to which the classifier is adapted.
         """
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """Return this method with other parameters.
-
-        Raises
-        ------
-        DataError
-            If it has no such parameter.
-        """
+        """Return this method with other parameters; raises DataError for unknown ones."""
         if values:
             raise DataError(f"method {self.name} has no {min(values)} to choose")
         return self
 
     def variations(self) -> list[Self]:
-        """Return methods to search among, this one with them."""
+        """Return the methods of a search, this one among them."""
         return [self]
 
-    def as_of(self, about: Description) -> Self:
-        """Return the method with the parameters that a model was learned with."""
-        del about
+    def as_of(self, description: Description) -> Self:
+        """Return the method with the parameters of a model."""
+        del description
         return self
 
 
 def prepare(method: Method, data: Dataset) -> Examples:
-    """Make the examples of a method from segments; the same segments give the same ones.
+    """Compute the inputs of segments for a method; the same segments give the same inputs.
 
     Raises
     ------
     DataError
-        If its feature set cannot tell what another microphone would have heard.
+        If the method wants augmented copies and its feature set has none.
     """
     features, rng = method.features, np.random.default_rng(_SEED)
     if method.copies and features.augmented is None:
@@ -164,23 +159,23 @@ def cross_validate(
     folds: Iterable[Fold],
     progress: Progress,
 ) -> Float64:
-    """Decide about segments with classifiers that have not seen them.
+    """Classify segments by classifiers that have not seen them.
 
     Parameters
     ----------
     methods : sequence of Method
-        With the inputs and copies that the examples were made with.
+        All of the inputs and the number of copies of the examples.
     examples : Examples
     classes : int
-    folds : iterable of (seen, unseen)
+        C.
+    folds : iterable of Fold
     progress : callable
         Told the share of the fits that is done.
 
     Returns
     -------
-    np.ndarray [shape=(methods, n, classes)]
-        Decision values; -inf for a class that was not among the seen, NaN for segments that are
-        unseen in no fold.
+    np.ndarray [shape=(methods, n, C)]
+        Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
     """
     folds = list(folds)
     decisions = np.full((len(methods), len(examples.target), classes), np.nan)
@@ -196,13 +191,18 @@ def cross_validate(
 
 
 def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
-    """Decide about what is unseen; each array is an argument, which joblib sends once."""
+    """Classify the test segments of a fold; joblib sends each array, an argument, once."""
     examples, (seen, unseen) = Examples(*arrays), fold
     return method.fit(examples, seen).decide(examples.inputs[0, unseen], classes)
 
 
 def inverse_temperature(decisions: Float64, target: Indices) -> float:
-    """Find what to multiply decisions with, so that their softmax is as sure as it is right.
+    """Calibrate decision values: find the factor that minimises the log loss of their softmax.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)]
+    target : np.ndarray [shape=(n,)]
 
     References
     ----------
@@ -213,11 +213,11 @@ def inverse_temperature(decisions: Float64, target: Indices) -> float:
         probabilities = softmax(np.exp(logarithm) * decisions)[np.arange(len(target)), target]
         return float(-np.log(np.maximum(probabilities, 1e-300)).mean())
 
-    found = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
-    return float(np.exp(found.x))
+    result = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
+    return float(np.exp(result.x))
 
 
 def softmax(values: Float64) -> Float64:
-    """Turn rows into probabilities; -inf has none."""
+    """Turn rows of decision values into probabilities; -inf becomes 0."""
     grown = np.exp(values - values.max(axis=1, keepdims=True))
     return grown / grown.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The ways to learn that are installed."""
+"""The methods that are installed."""
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.method import Method
@@ -10,7 +10,7 @@ METHODS = Extensions("hearthlog.methods", Method, [BANDS, PAPER])  # type: ignor
 
 
 def method_named(name: str) -> Method:
-    """Return a way to learn by its name.
+    """Return a method by its name.
 
     Raises
     ------

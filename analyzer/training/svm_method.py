@@ -29,9 +29,9 @@ class SvmMethod(Method):
     Attributes
     ----------
     cost : float
-        Of a segment on the wrong side.
+        Cost of a segment on the wrong side of the margin.
     gamma : float
-        Of the kernel, times the number of inputs.
+        Gamma of the kernel, times the number of inputs.
     """
 
     cost: float
@@ -39,7 +39,7 @@ class SvmMethod(Method):
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """Distributions whose versions are part of what comes out."""
+        """Distributions whose versions influence the result."""
         return ("scikit-learn",)
 
     @property
@@ -80,11 +80,11 @@ class SvmMethod(Method):
             for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
         ]
 
-    def as_of(self, about: Description) -> Self:
-        """Return the method with the parameters that a model was learned with."""
-        width = self.features.inputs[about.inputs].width
-        cost, gamma = about.parameters["cost"], about.parameters["gamma"]
-        return replace(self, cost=cost, gamma=gamma * width, copies=about.copies)
+    def as_of(self, description: Description) -> Self:
+        """Return the method with the parameters of a model."""
+        width = self.features.inputs[description.inputs].width
+        cost, gamma = description.parameters["cost"], description.parameters["gamma"]
+        return replace(self, cost=cost, gamma=gamma * width, copies=description.copies)
 
 
 class LearnedSvm:
@@ -116,16 +116,16 @@ class LearnedSvm:
 
     def _votes(self, inputs: Float32, classes: int) -> Float64:
         scaler, svc = self.machine
-        gamma, here = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
+        gamma, scaled = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
         home = scaler.transform(self._home.astype(np.float64))
-        near = rbf_kernel(here, home, gamma=gamma)
-        others = rbf_kernel(here, svc.support_vectors_, gamma=gamma).sum(axis=1, keepdims=True)
+        near = rbf_kernel(scaled, home, gamma=gamma)
+        others = rbf_kernel(scaled, svc.support_vectors_, gamma=gamma).sum(axis=1, keepdims=True)
         return home_votes(near @ np.eye(classes)[self._home_target], others)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of `hearthlog.models.classifiers.svm_rbf.SvmKind`."""
         scaler, svc = self.machine
-        # scikit-learn turns the sign of two classes round; in the file all pairs are alike.
+        # scikit-learn inverts the sign if there are two classes only; the file does not.
         sign = -1.0 if len(svc.classes_) == 2 else 1.0
         # The file keeps support vectors as they were before scaling, in float32.
         support = svc.support_vectors_ * scaler.scale_ + scaler.mean_
@@ -143,7 +143,7 @@ class LearnedSvm:
         return arrays
 
     def parameters(self) -> dict[str, Any]:
-        """Return cost and gamma, that of the kernel itself."""
+        """Return cost, and gamma of the kernel itself."""
         svc = self.machine[-1]
         return {"cost": float(svc.C), "gamma": float(svc.gamma)}
 

@@ -1,8 +1,9 @@
-"""Learn a model from segments, and measure it on sources that it has not heard."""
+"""Training: a model is learned from segments, and measured on sources it has not learned from."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
@@ -12,6 +13,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import (
     Fold,
+    Learned,
     Method,
     cross_validate,
     inverse_temperature,
@@ -29,7 +31,6 @@ from hearthlog.analyzer.training.transitions import (
 )
 from hearthlog.models.classifiers.description import (
     FORMAT,
-    Amount,
     ClassMetrics,
     Collection,
     Description,
@@ -53,18 +54,18 @@ def train_model(
     method: Method = DEFAULT,
     smoothing: str = "hmm",
 ) -> Model:
-    """Learn from segments; calibrate and measure on folds that never split a source group.
+    """Learn a model; calibrate and measure it on folds that never split a source group.
 
     Parameters
     ----------
     data : Dataset
     scenario : Scenario
-        The one the data was built for.
+        Of the data.
     progress : callable
         Told the share of the fits that is done.
     method : Method
     smoothing : str
-        How labels become segments: see `hearthlog.models.modelfile.modelfile.Smoothing`.
+        Field `method` of `Smoothing`.
 
     Raises
     ------
@@ -82,32 +83,18 @@ def train_model(
     inverse = inverse_temperature(decisions, data.target)
     learned = method.fit(examples)
     progress(1.0)
-    features, hidden = method.features, smoothing == "hmm"
-    about = Description(
-        format=FORMAT,
-        kind=method.kind,
-        parameters=learned.parameters(),
-        method=method.name,
-        classes=list(data.classes),
-        feature_set=features.name,
-        feature_set_version=features.version,
-        feature_names=list(features.feature_names),
-        inputs=method.inputs,
-        window_seconds=features.window_seconds,
-        scenario_name=scenario.name,
-        scenario={name: list(labels) for name, labels in scenario.classes.items()},
-        copies=method.copies,
-        calibration="temperature",
-        inverse_temperature=inverse,
-        smoothing=Smoothing(
-            method="hmm" if hidden else "merge", lag_seconds=LAG_SECONDS if hidden else 0.0
-        ),
-        training_data=_training_data(data),
-        metrics=_metrics(data, decisions, inverse, len(folds)),
-        versions={name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
-    )
+    hidden = smoothing == "hmm"
     return Model(
-        about,
+        Description(
+            **_method_fields(method, learned),
+            **_scenario_fields(scenario, data),
+            calibration="temperature",
+            inverse_temperature=inverse,
+            smoothing=Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
+            if hidden
+            else Smoothing(method="merge"),
+            metrics=_metrics(data, decisions, inverse, len(folds)),
+        ),
         learned.arrays(),
         transitions=default_transitions(data.classes) if hidden else np.empty((0, 0)),
         training_windows=data.windows,
@@ -117,31 +104,30 @@ def train_model(
 
 
 def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> Model:
-    """Learn once more what a model has learned, and a home's own segments with it.
+    """Learn a model again, from its own segments and those of a home.
 
     Parameters
     ----------
     base : Model
-        With its training windows.
+        A model with its training windows.
     home : Dataset
-        Of the same classes; it need not have segments of all of them.
+        Of the same classes, some of which may have no segments.
     sequences : sequence of np.ndarray [shape=(n,)], int64
-        Classes of successive frames in the home, from which the transitions of its sounds are
-        learned.
+        Classes of successive frames in the home, to estimate transitions from.
 
     Returns
     -------
     Model
-        With the parameters, calibration and metrics of `base`, which are those of other homes; it
-        keeps the windows of `base` alone, so that it can be adapted again to more of the home.
+        With the parameters, calibration and metrics of `base`, which are those of other homes. It
+        keeps the windows of `base` only, so that it can be adapted again to more of the home.
 
     Raises
     ------
     DataError
-        If the base model has not kept what it was learned from, the home has no segments, or the
-        way in which the base model was learned is not installed.
+        If the base model has no training windows, the home has no segments, or the method of the
+        base model is not installed.
     """
-    about = base.description
+    description = base.description
     if not len(base.training_windows):
         raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
     if not len(home):
@@ -156,13 +142,14 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
         group=np.concatenate([base.training_group, home.group]),
         weight=np.concatenate([np.ones(len(base.training_windows)), home.weight]),
     )
-    method = method_named(about.method).as_of(about)
+    method = method_named(description.method).as_of(description)
     examples = prepare(method, joined)
     learned = method.fit(examples, home=np.arange(len(base.training_windows), len(joined)))
-    found = {name: Amount(**asdict(amount)) for name, amount in home.amounts.items()}
-    training = about.training_data.model_copy(update={"home": found, "base_sha256": base.sha256})
+    training = description.training_data.model_copy(
+        update={"home": home.amounts, "base_sha256": base.sha256}
+    )
     return Model(
-        about.model_copy(update={"training_data": training}),
+        description.model_copy(update={"training_data": training}),
         learned.arrays(),
         transitions=(
             transitions_from_sequences(sequences, expected_durations(base.classes))
@@ -176,7 +163,7 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
 
 
 def check_varied(data: Dataset) -> None:
-    """Raise DataError if there is nothing to tell the segments apart by."""
+    """Raise DataError if all segments are alike."""
     if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
         raise DataError("all segments are alike: their features never change; is this sound?")
 
@@ -184,10 +171,7 @@ def check_varied(data: Dataset) -> None:
 def group_folds(data: Dataset) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
-    Returns
-    -------
-    list of (seen, unseen)
-        Indices; every class is among the seen of every fold.
+    Every fold learns from segments of every class.
 
     Raises
     ------
@@ -235,10 +219,36 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
     )
 
 
+def _method_fields(method: Method, learned: Learned) -> dict[str, Any]:
+    features = method.features
+    return {
+        "format": FORMAT,
+        "kind": method.kind,
+        "parameters": learned.parameters(),
+        "method": method.name,
+        "feature_set": features.name,
+        "feature_set_version": features.version,
+        "feature_names": list(features.feature_names),
+        "inputs": method.inputs,
+        "window_seconds": features.window_seconds,
+        "copies": method.copies,
+        "versions": {name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
+    }
+
+
+def _scenario_fields(scenario: Scenario, data: Dataset) -> dict[str, Any]:
+    return {
+        "classes": list(data.classes),
+        "scenario_name": scenario.name,
+        "scenario": {name: list(labels) for name, labels in scenario.classes.items()},
+        "training_data": _training_data(data),
+    }
+
+
 def _training_data(data: Dataset) -> TrainingData:
     return TrainingData(
         sha256=data.digest,
-        classes={name: Amount(**asdict(amount)) for name, amount in data.amounts.items()},
+        classes=data.amounts,
         collections=[
             Collection(name=name, licence=licence, clips=clips)
             for (name, licence), clips in sorted(data.collections.items())

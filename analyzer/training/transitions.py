@@ -8,36 +8,26 @@ from hearthlog.models.classes import find_class
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
-LAG_SECONDS = 2.0  # gave the path of the whole sound in 90 minutes of real clips, 1 s did not
+LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real clips; 1 s does not
 
-_SECONDS = 5.0  # of a sound of somebody's own class
+_SECONDS = 5.0  # expected duration of a class that is not in the table of classes
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
-    """Return the transitions of classes by how long their sounds are expected to go on.
-
-    Parameters
-    ----------
-    classes : sequence of str
-
-    Returns
-    -------
-    np.ndarray [shape=(C, C)], float64
-        A frame, from row to column.
-    """
+    """Return the transition probabilities of classes, shape (C, C), by their expected durations."""
     return transitions_from_durations(expected_durations(classes), FRAME_SECONDS)
 
 
 def expected_durations(classes: Sequence[str]) -> Float64:
-    """Return how many seconds the sounds of classes are expected to go on, shape (C,)."""
+    """Return the expected durations of classes in seconds, shape (C,)."""
     rows = map(find_class, classes)
     return np.array([_SECONDS if row is None else row.seconds for row in rows])
 
 
 def transitions_from_durations(durations: Float64, frame_seconds: float) -> Float64:
-    """Return the transitions of classes whose sounds have some mean durations.
+    """Return the transition probabilities of classes with these mean durations.
 
-    What follows a sound may be any other, one as likely as the other.
+    All other classes are equally likely to follow a sound.
 
     Parameters
     ----------
@@ -48,6 +38,7 @@ def transitions_from_durations(durations: Float64, frame_seconds: float) -> Floa
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
+        Probability that a frame of the row's class is followed by one of the column's class.
     """
     leave = 1.0 / np.maximum(durations / frame_seconds, 1.0)
     count = len(durations)
@@ -63,9 +54,9 @@ def transitions_from_sequences(
     durations: Float64,
     frame_seconds: float = FRAME_SECONDS,
 ) -> Float64:
-    """Learn transitions from labelled sequences, starting from expected durations.
+    """Estimate transition probabilities from labelled sequences, with expected durations as prior.
 
-    The durations count as one visit to each class; a class that is in no sequence keeps them.
+    The prior counts as one visit to each class; a class that is in no sequence keeps its duration.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Probabilities of a model's classes, whatever kind of classifier it is."""
+"""Probabilities of a model's classes, for any kind of classifier."""
 
 import numpy as np
 
@@ -15,13 +15,7 @@ _ROWS_AT_ONCE = 256
 
 
 def classifier_kind(name: str) -> ClassifierKind:
-    """Return a kind of classifier by its name.
-
-    Raises
-    ------
-    ModelError
-        If there is none of this name, or it cannot be imported.
-    """
+    """Return a kind of classifier by its name; raises ModelError if it cannot be used."""
     kind = CLASSIFIERS.get(name)
     if kind is None:
         installed = ", ".join(CLASSIFIERS.names())
@@ -40,28 +34,28 @@ class Classifier:
         Names behind the columns of the probabilities.
     feature_set : FeatureSet
     inputs : Inputs
-        Of that set: what `classify` takes.
+        Inputs of the feature set that `classify` takes.
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
-        How probabilities become segments.
+        Those of the model.
     """
 
     def __init__(self, model: Model) -> None:
-        about = model.description
+        description = model.description
         self.classes = model.classes
-        self.feature_set = feature_set(about.feature_set)
-        self.inputs = self.feature_set.inputs[about.inputs]
-        self.smoothing = about.smoothing
+        self.feature_set = feature_set(description.feature_set)
+        self.inputs = self.feature_set.inputs[description.inputs]
+        self.smoothing = description.smoothing
         self.transitions = model.transitions
-        self._inverse_temperature = about.inverse_temperature
-        self._machine = classifier_kind(about.kind).machine(model)
+        self._inverse_temperature = description.inverse_temperature
+        self._machine = classifier_kind(description.kind).machine(model)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute the probability of each class; the first of what `classify` returns."""
+        """Compute the probability of each class, shape (n, C); see `classify`."""
         return self.classify(inputs)[0]
 
     def classify(self, inputs: Float32) -> tuple[Float32, Float32]:
-        """Compute the probability of each class, and how unlike anything learned a window is.
+        """Compute the probability of each class, and the novelty of each window.
 
         Parameters
         ----------
@@ -73,7 +67,7 @@ class Classifier:
         probabilities : np.ndarray [shape=(n, C)], float32
             In the order of the model's classes; every row sums to 1.
         novelty : np.ndarray [shape=(n,)], float32
-            From 0 to 1; NaN where the kind of classifier does not know it.
+            From 0 to 1, where 1 is unlike anything learned; NaN if the kind of classifier has none.
         """
         result = np.empty((len(inputs), len(self.classes)), np.float32)
         novelty = np.empty(len(inputs), np.float32)

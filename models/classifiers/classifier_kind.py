@@ -15,7 +15,7 @@ class Machine(Protocol):
     """Inference of one model."""
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Decide about some hundreds of windows at most.
+        """Return decision values and novelty of some hundreds of windows at most.
 
         A row's result must not depend on the rows that are computed together with it, nor on
         threads; see `hearthlog.models.batch_invariant`.
@@ -28,24 +28,24 @@ class Machine(Protocol):
         Returns
         -------
         decisions : np.ndarray [shape=(n, C)], float64
-            Which, times the inverse temperature, are the logarithms of probabilities, but for a
-            constant. They may be changed by the caller.
+            Times the inverse temperature, they are the logarithms of probabilities plus a constant.
+            The caller may change them.
         novelty : np.ndarray [shape=(n,)], float64
-            How unlike anything learned a window is, from 0 to 1; NaN where that is not known.
+            From 0 to 1, where 1 is unlike anything learned; NaN if there is none.
         """
 
 
 class ClassifierKind(ABC):
-    """What a model file of one kind consists of, and how it decides.
+    """The arrays of the models of one kind, their checks, and inference.
 
     Attributes
     ----------
     name : str
-        In the field `kind` of a description.
+        The field `kind` of a description.
     parameters : type of BaseModel
-        What a description must say besides, as its field `parameters`.
+        The field `parameters` of a description.
     arrays, optional : mapping of str to np.dtype
-        What a model must, and may, consist of. None of them is larger than 1e9.
+        Arrays that a model must have, and may have. No value is larger than 1e9.
     """
 
     name: str
@@ -57,32 +57,29 @@ class ClassifierKind(ABC):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that arrays must have.
+        """Return the shapes that arrays must have; those given may be of any type and shape.
 
         Parameters
         ----------
-        classes : int
-            C.
-        width : int
-            Of the inputs.
+        classes, width : int
+            Number of classes, and of inputs.
         arrays : mapping of str to np.ndarray
-            Of types that may be anything, and of any shape.
         """
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Say what contradicts itself in arrays of the right types and shapes, all finite."""
+        """Return what is wrong with arrays of the right types and shapes, all finite; or None."""
         del classes, arrays
         return None
 
     @abstractmethod
     def machine(self, model: Model) -> Machine:
-        """Make what decides."""
+        """Prepare a model for inference."""
 
     @abstractmethod
     def summary(self, model: Model) -> str:
-        """Say in a few words how large a model is."""
+        """Return the size of a model in a few words."""
 
     def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return inputs of windows that it has learned from, if they are among its arrays."""
+        """Return inputs of training windows, if they are among the arrays."""
         del model
         return ()

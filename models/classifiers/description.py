@@ -1,4 +1,4 @@
-"""What a model file says of its model besides arrays, checked when it is read."""
+"""The description in a model file, checked when it is read."""
 
 import json
 import re
@@ -10,10 +10,10 @@ from hearthlog.models.errors import ModelError
 from hearthlog.schemas.text import printable
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
-TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # any other string of a description
+TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 FORMAT: Final = 3
-SIMULATED = "hearthlog simulated home"  # the collection of what `hearthlog.tools.home` makes up
+SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
 
 _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$")]
@@ -30,7 +30,7 @@ class _Record(BaseModel):
 
 
 class Amount(_Record):
-    """How much of something was learned from; a source is a source group of the manifest."""
+    """An amount of training data; a source is a source group of the manifest."""
 
     sources: _Count
     segments: _Count
@@ -38,7 +38,7 @@ class Amount(_Record):
 
 
 class Collection(_Record):
-    """A public collection the audio came from: to be named wherever the model goes."""
+    """A public collection that audio came from; attribution is due wherever the model goes."""
 
     name: _Text
     licence: _Text
@@ -46,14 +46,14 @@ class Collection(_Record):
 
 
 class TrainingData(_Record):
-    """What the model learned from; the digest is of its segments, not of files.
+    """The training data; the digest is that of its segments, not of files.
 
     Attributes
     ----------
     home : dict of str to Amount
-        What a home of its own added, by class, if it was adapted.
+        What a home added, by class, if the model was adapted.
     base_sha256 : str
-        Of the model file that was adapted, or empty.
+        SHA-256 of the model file that was adapted, or empty.
     """
 
     sha256: _Digest
@@ -64,13 +64,13 @@ class TrainingData(_Record):
 
     @property
     def simulated(self) -> bool:
-        """Whether all of it was made up: the model has never learned from a real sound."""
+        """Whether all of it was simulated: the model has never learned from a real sound."""
         names = {item.name for item in self.collections}
         return names == {SIMULATED} and not any(amount.segments for amount in self.home.values())
 
 
 class ClassMetrics(_Record):
-    """Of the segments of one class, cross-validated."""
+    """Scores of one class, cross-validated."""
 
     precision: _Share
     recall: _Share
@@ -78,10 +78,7 @@ class ClassMetrics(_Record):
 
 
 class Metrics(_Record):
-    """Cross-validated by source group, with the model's own parameters.
-
-    The confusion matrix has a row for each true class and a column for each predicted one.
-    """
+    """Scores, cross-validated by source group; true classes are rows of the confusion matrix."""
 
     folds: _Count
     macro_f1: _Share
@@ -106,22 +103,22 @@ class Smoothing(_Record):
 
 
 class Description(_Record):
-    """Everything about a model that is no array.
+    """Everything about a model but its arrays.
 
     Attributes
     ----------
     kind : str
-        Of classifier.
+        Kind of classifier.
     parameters : dict
-        Of that kind.
+        Parameters of that kind.
     feature_set, feature_set_version, inputs : str, int, str
-        What the classifier looks at.
+        Feature set of the classifier, and which of its inputs.
     method : str
-        By which it was learned, and is adapted.
+        Method by which it was learned, and is adapted.
     copies : int
-        How often each segment was learned from as another microphone would hear it.
+        Number of augmented copies of each segment.
     inverse_temperature : float
-        Calibrates: it multiplies the decision values before the softmax.
+        Factor of the decision values before the softmax, from calibration.
     """
 
     format: Literal[3]
@@ -151,7 +148,7 @@ def read_description(text: str) -> Description:
     Raises
     ------
     ModelError
-        If it is of a newer format, or says what cannot be.
+        If it is of a newer format, or invalid.
     """
     try:
         content = json.loads(text)
@@ -171,13 +168,7 @@ class _WithMetrics(BaseModel):
 
 
 def class_metrics(text: bytes) -> dict[str, ClassMetrics]:
-    """Read the figures of each class from a description in a log, which may be of any format.
-
-    Returns
-    -------
-    dict of str to ClassMetrics
-        Empty where it has none that can be understood.
-    """
+    """Read the scores of each class from a description of any format; empty if it has none."""
     try:
         return _WithMetrics.model_validate_json(text).metrics.classes
     except ValidationError:
@@ -204,12 +195,12 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def first_problem(error: ValidationError) -> str:
-    """Say in one line what the first thing wrong with a description is."""
+    """Return the first problem of a description, on one line."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
     return f"{one_line(where)}: {one_line(first['msg'])}"
 
 
 def one_line(text: object) -> str:
-    """Return a text that can be part of a message, whatever a file put into it."""
+    """Return a text of any file as part of a message: printable, and not too long."""
     return printable(text)[:200]

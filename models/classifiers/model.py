@@ -1,4 +1,4 @@
-"""A model: what decides, and what it says of itself."""
+"""A model: its description and its arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,23 +15,24 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What decides, and what it says of itself.
+    """A model.
 
     Attributes
     ----------
     description : Description
     arrays : mapping of str to np.ndarray
-        Of its kind of classifier.
+        Those of its kind of classifier.
     transitions : np.ndarray [shape=(C, C)], float64
-        Of the hidden Markov model, from row to column, a frame; empty where segments are merged.
+        Probability that a frame of the row's class is followed by one of the column's class; empty
+        where segments are merged.
     training_windows : np.ndarray [shape=(m, window_frames, d)], float32
-        Features that it was learned from, to learn from them again; empty if they are not kept.
+        Features that it was learned from, kept for adaptation; empty if they are not kept.
     training_target, training_group : np.ndarray [shape=(m,)], int64
-        Their classes, and the numbers of their sources.
+        Classes of the training windows, and numbers of their source groups.
     name : str
-        Stem of the file it was loaded from.
+        Stem of the model file.
     sha256 : str
-        Of that file.
+        SHA-256 of the model file.
     """
 
     description: Description

@@ -13,18 +13,18 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.schemas.arrays import Float32, Float64
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
-HOME_SHARE = 100.0  # of one vector of the home, where a support vector has 1
+HOME_SHARE = 100.0  # weight of a home vector; a support vector has 1
 HOME_SHARPNESS = 10.0
 _TINY = 1e-200
 _SUPPORT_AT_ONCE = 256  # a product this small no BLAS divides among threads
 _SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
 
-_Part = tuple[int, slice, Float64]  # a class, its columns, their coefficients
+_Part = tuple[int, slice, Float64]  # a class, its columns, and their coefficients
 _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class SvmParameters(BaseModel):
-    """Of a support vector machine; gamma is of the kernel exp(-gamma |x - s|^2)."""
+    """Cost, and gamma of the kernel exp(-gamma |x - s|^2)."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -33,22 +33,22 @@ class SvmParameters(BaseModel):
 
 
 class SvmKind(ClassifierKind):
-    """Its arrays, for C classes.
+    """Support vector machines; the arrays for C classes.
 
     scaler_mean, scaler_scale : [shape=(width,)], float64
-        Of the inputs.
+        Mean and standard deviation of the inputs.
     support_vectors : [shape=(n, width)], float32
         Inputs, not scaled, class after class.
     support_counts : [shape=(C,)], int64
-        Support vectors of each class.
+        Number of support vectors of each class.
     dual_coefficients : [shape=(C - 1, n)], float64
         As in libsvm: row j of a vector of class i is against class j if j < i, else j + 1.
     intercepts : [shape=(C (C - 1) / 2,)], float64
-        Of the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
+        For the pairs (0, 1), (0, 2) … (1, 2) …; a positive decision is for the first of a pair.
     home_vectors : [shape=(h, width)], float32, optional
-        Inputs that a home has corrected, which draw what is like them to their class.
+        Inputs that a home has corrected, which draw similar inputs to their class.
     home_target : [shape=(h,)], int64, optional
-        Their classes.
+        Classes of the home vectors.
     """
 
     name = "svm-rbf"
@@ -87,7 +87,7 @@ class SvmKind(ClassifierKind):
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Say what contradicts itself."""
+        """Return what is wrong with arrays, or None."""
         if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
             return "scaler_scale has values that are not positive"
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
@@ -99,15 +99,15 @@ class SvmKind(ClassifierKind):
         return None
 
     def machine(self, model: Model) -> "SvmMachine":
-        """Make what decides."""
+        """Prepare a model for inference."""
         return SvmMachine(model)
 
     def summary(self, model: Model) -> str:
-        """Say how many support vectors there are."""
+        """Return the number of support vectors, in words."""
         return f"{len(model.arrays['support_vectors'])} support vectors"
 
     def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return the vectors, which are inputs of windows that were learned from."""
+        """Return the support vectors, which are inputs of training windows."""
         names = ("support_vectors", "home_vectors")
         return [model.arrays[name] for name in names if name in model.arrays]
 
@@ -118,8 +118,7 @@ SVM_RBF = SvmKind()
 class SvmMachine:
     """Inference of one model; its pairs of classes decide as scikit-learn's `SVC` within 1e-5.
 
-    A class is as sure as the weakest of its pairs. Where a home has vectors of its own, it is the
-    surer, the more of what is near is the home's, and of that class.
+    The decision value of a class is that of the weakest of its pairs, plus `home_votes`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -132,10 +131,7 @@ class SvmMachine:
         self._first, self._second = np.triu_indices(self._count, 1)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Decide for each class; novelty is one minus the kernel of the nearest support vector.
-
-        It is 0 where that is the same as the window, towards 1 where nothing is near.
-        """
+        """Return decision values; novelty is one minus the kernel of the nearest support vector."""
         extended = self._extended(inputs)
         pairs, others, nearest = self._pairs(extended)
         decision = weakest_pairs(pairs, self._count)
@@ -144,21 +140,21 @@ class SvmMachine:
         return decision, -np.expm1(np.minimum(nearest, 0.0))
 
     def _extended(self, inputs: Float32) -> Float64:
-        """Scaled inputs x as (x, |x|^2, 1), shape (n, width + 2)."""
+        """Return scaled inputs x as (x, |x|^2, 1), shape (n, width + 2)."""
         scaled = (inputs - self._mean) / self._scale
         square = np.vecdot(scaled, scaled)[:, np.newaxis]
         return np.concatenate([scaled, square, np.ones_like(square)], axis=1)
 
     def _pairs(self, extended: Float64) -> tuple[Float64, Float64, Float64]:
-        """Decide for every pair of classes, by the kernels of the support vectors.
+        """Return the decision values of every pair of classes.
 
         Returns
         -------
         decisions : np.ndarray [shape=(n, C (C - 1) / 2)]
         others : np.ndarray [shape=(n, 1)]
-            Sums of the sharp kernels; zeros, where no home has vectors to be compared with.
+            Sums of the sharp kernels of the support vectors; zeros without home vectors.
         nearest : np.ndarray [shape=(n,)]
-            Logarithm of the largest kernel.
+            Logarithm of the kernel of the nearest support vector.
         """
         nearest = np.full(len(extended), -np.inf)
         against = np.zeros((self._count, len(extended), self._count - 1))
@@ -181,7 +177,7 @@ class SvmMachine:
         return decision.T + self._intercepts, others, nearest
 
     def _home(self, extended: Float64) -> Float64:
-        """Sum the sharp kernels of the home's vectors by class, shape (n, C)."""
+        """Return the sums of the sharp kernels of the home vectors by class, shape (n, C)."""
         home = np.zeros((len(extended), self._count))
         for weights, one_hot in self._home_blocks:
             home += rowwise_matmul(np.exp(HOME_SHARPNESS * _distance(extended, weights)), one_hot)
@@ -189,14 +185,14 @@ class SvmMachine:
 
 
 def weakest_pairs(pairs: Float64, classes: int) -> Float64:
-    """Decide for each class as the weakest of its pairs does.
+    """Return the decision value of each class: that of the weakest of its pairs.
 
-    Unlike the number of pairs that a class wins, this can be calibrated.
+    Unlike the number of pairs that a class wins, it can be calibrated.
 
     Parameters
     ----------
     pairs : np.ndarray [shape=(n, C (C - 1) / 2)]
-        Decisions for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
+        Decision values for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
     classes : int
         C.
 
@@ -212,31 +208,31 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
 
 
 def home_votes(home: Float64, others: Float64) -> Float64:
-    """Let what a home has corrected draw to its class what is nearer to it than to all else.
+    """Return what is added to decision values for inputs near to vectors of a home.
 
-    With a few segments among thousands a support vector machine is content to get these right;
-    the share that they have of what is near makes them count for others as well, and leaves alone
-    what is near to nothing of the home.
+    A support vector machine learns a few segments of a home among thousands, but not what is
+    similar to them. A vote is the share of a class of the home among all vectors nearby, so that
+    inputs far from all home vectors stay as they are.
 
     Parameters
     ----------
     home : np.ndarray [shape=(n, C)]
-        Kernels, `HOME_SHARPNESS` times as sharp as the machine's, summed over the home's vectors.
+        Sums over the home vectors of kernels with gamma times `HOME_SHARPNESS`, by class.
     others : np.ndarray [shape=(n, 1)]
-        The same, summed over the support vectors.
+        The same sums over the support vectors.
     """
     home = HOME_SHARE * home
     return HOME_VOTE * home / (home.sum(axis=1, keepdims=True) + others + _TINY)
 
 
 def _distance(extended: Float64, weights: Float64) -> Float64:
-    """Return -gamma |x - s|^2, which rounding must not make positive."""
+    """Return -gamma |x - s|^2, with positive values from rounding set to 0."""
     distance = rowwise_matmul(extended, weights)
     return np.minimum(distance, 0.0, out=distance)
 
 
 def _blocks(model: Model) -> list[tuple[Float64, list[_Part]]]:
-    """Divide the support vectors into blocks of weights, and these by class."""
+    """Divide the support vectors into blocks of weights, each with its parts by class."""
     weights = _weights(model, model.arrays["support_vectors"])
     ends = np.cumsum(model.arrays["support_counts"]).tolist()
     blocks = []
@@ -253,20 +249,20 @@ def _blocks(model: Model) -> list[tuple[Float64, list[_Part]]]:
 
 
 def _home_blocks(model: Model) -> list[tuple[Float64, Float64]]:
-    """Vectors of the home, as (weights, which class each is of)."""
+    """Return blocks of the home vectors: weights, and one-hot classes."""
     if "home_vectors" not in model.arrays:
         return []
     weights = _weights(model, model.arrays["home_vectors"])
     one_hot = np.eye(len(model.classes))[model.arrays["home_target"]]
     cuts = range(_SUPPORT_AT_ONCE, len(weights), _SUPPORT_AT_ONCE)
     return [
-        (aligned(part.T), of)
-        for part, of in zip(np.split(weights, cuts), np.split(one_hot, cuts), strict=True)
+        (aligned(part.T), classes)
+        for part, classes in zip(np.split(weights, cuts), np.split(one_hot, cuts), strict=True)
     ]
 
 
 def _weights(model: Model, vectors: Float32) -> Float64:
-    """Rows that, times (x, |x|^2, 1), give -gamma |x - s|^2 of every vector s."""
+    """Return rows whose product with (x, |x|^2, 1) is -gamma |x - s|^2, for every vector s."""
     gamma = model.description.parameters["gamma"]
     scaled = (vectors - model.arrays["scaler_mean"]) / model.arrays["scaler_scale"]
     square = np.vecdot(scaled, scaled)[:, np.newaxis]

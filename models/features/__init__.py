@@ -1,1 +1,1 @@
-"""Feature sets: what is computed from each frame of sound, and what classifiers look at."""
+"""Feature sets: the values of each frame of sound, and the inputs of classifiers."""

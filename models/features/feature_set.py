@@ -1,4 +1,4 @@
-"""A feature set: what is computed from each frame, and all that depends on what it is."""
+"""A feature set: the values computed from each frame, and all that depends on them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from hearthlog.models.features.window_inputs import Inputs
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SECONDS
+
+SILENCE_POWER = 10 ** (-60 / 10)  # mean square, -60 dBFS: below it no event is learned from
 
 
 class Extractor(Protocol):
@@ -24,8 +26,7 @@ class Extractor(Protocol):
         Parameters
         ----------
         frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            Samples in full scale, -1 to 1, at `SAMPLE_RATE` (of `hearthlog.schemas.frames`).
-            Samples that are not finite, or far beyond full scale, may be among them.
+            Samples at 16 kHz in full scale, -1 to 1; some may be beyond it, or not finite.
 
         Returns
         -------
@@ -39,28 +40,27 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """What is computed from each frame, and all that depends on what it is.
+    """The values computed from each frame, and all that depends on them.
 
     Attributes
     ----------
     name : str
     version : int
-        Another one if the same sound gives other values.
+        Increased when the same sound gives other values.
     feature_names, units : tuple of str
-        Of the d values of a frame.
+        Names and units of the d values of a frame.
     window_frames : int
-        Frames that statistics are made of, and that labels speak of.
+        Length of the window of the statistics and of a label.
     extractor : callable
         Makes an `Extractor`.
     inputs : mapping of str to Inputs
-        What classifiers may look at, by name.
+        Inputs of classifiers, by name.
     power : callable
-        Tells the mean square of the samples of frames, full scale being 1, from their features,
-        shape (..., d); gives shape (...).
+        Maps features, shape (..., d), to the mean square of the samples, shape (...); full scale
+        is 1.
     augmented : callable or None
-        Changes windows of features, shape (n, window_frames, d), as another microphone in another
-        room would have; takes a `np.random.Generator` besides. None if that cannot be told from
-        the features.
+        Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to what
+        another microphone in another room would give. None if features cannot be changed so.
     """
 
     name: str
@@ -75,10 +75,10 @@ class FeatureSet:
 
     @property
     def width(self) -> int:
-        """How many values a frame has."""
+        """Number of values of a frame."""
         return len(self.feature_names)
 
     @property
     def window_seconds(self) -> float:
-        """Span of the statistics and of a label."""
+        """Length of the window."""
         return FRAME_SECONDS * self.window_frames

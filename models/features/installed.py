@@ -10,13 +10,7 @@ FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, [AUROS21])
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
-    """Return a feature set by its name.
-
-    Raises
-    ------
-    ModelError
-        If there is none of this name, or it cannot be imported.
-    """
+    """Return a feature set by its name; raises ModelError if it cannot be used."""
     features = FEATURE_SETS.get(name)
     if features is None:
         installed = ", ".join(FEATURE_SETS.names())

@@ -1,4 +1,4 @@
-"""What a classifier looks at: one row of numbers for every window of frames."""
+"""The inputs of classifiers: one row of numbers for every window of frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,23 +34,17 @@ class InputStream(Protocol):
 
 
 class Inputs(Protocol):
-    """One way to look at windows of features.
-
-    Attributes
-    ----------
-    width : int
-        How many inputs there are.
-    """
+    """Maps windows of features to inputs."""
 
     @property
     def width(self) -> int:
-        """How many inputs there are."""
+        """Number of inputs."""
 
     def stream(self) -> InputStream:
         """Begin a stream."""
 
     def of_windows(self, windows: Float32) -> Float32:
-        """Compute the inputs of windows that do not follow each other.
+        """Compute the inputs of single windows.
 
         Parameters
         ----------
@@ -66,18 +60,17 @@ class Inputs(Protocol):
 
 @dataclass(frozen=True)
 class WindowStatistics:
-    """Mean and standard deviation of a window, of its features or of what is made of them.
+    """Mean and standard deviation of a window, of its features or of values made of them.
 
     Attributes
     ----------
     window_frames : int
     values : callable
-        Makes d' values of each frame, shape (n, d'), from its features, shape (n, d).
+        Maps features, shape (n, d), to the values of each frame, shape (n, d').
     values_width : int
         d'.
     changes : bool
-        Besides, how much a value changes from frame to frame: the mean of its absolute
-        differences.
+        Whether the mean absolute difference from frame to frame is an input too.
     """
 
     window_frames: int
@@ -87,7 +80,7 @@ class WindowStatistics:
 
     @property
     def width(self) -> int:
-        """How many inputs there are."""
+        """Number of inputs."""
         return (3 if self.changes else 2) * self.values_width
 
     def stream(self) -> "StatisticsStream":
@@ -95,17 +88,7 @@ class WindowStatistics:
         return StatisticsStream(self)
 
     def of_windows(self, windows: Float32) -> Float32:
-        """Compute the inputs of windows that do not follow each other.
-
-        Parameters
-        ----------
-        windows : np.ndarray [shape=(n, window_frames, d)], float32
-            Features.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, width)], float32
-        """
+        """Compute the inputs of single windows; see `Inputs`."""
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
             part = windows[start : start + _FRAMES_AT_ONCE]
@@ -118,14 +101,14 @@ class WindowStatistics:
     def reduce(
         self, frames: Sequence[NDArray[Any]], changes: Sequence[NDArray[Any]], out: Float32
     ) -> None:
-        """Put the statistics of windows into rows.
+        """Write the statistics of windows into rows.
 
         Parameters
         ----------
         frames : sequence of np.ndarray [shape=(n, d')]
-            The first frames of all windows, the second ones, and so on.
+            As of `successive`.
         changes : sequence of np.ndarray [shape=(n, d')]
-            The same of their differences.
+            The same of the absolute differences.
         out : np.ndarray [shape=(n, width)], float32
         """
         parts = [*mean_and_std(frames)]
@@ -163,26 +146,32 @@ class StatisticsStream:
 
 
 def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
-    """Return the first rows of all windows of so many successive rows, the second ones, and so on.
+    """View windows of successive rows as one array per place in the window.
 
     Parameters
     ----------
     values : np.ndarray [shape=(n, d)]
     length : int
+        Rows of a window.
+
+    Returns
+    -------
+    list of np.ndarray [shape=(n - length + 1, d)]
+        The first rows of all windows, the second rows, and so on.
     """
     count = len(values) - length + 1
     return [values[place : place + count] for place in range(length)]
 
 
 def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
-    """Reduce windows to mean and standard deviation, in float64.
+    """Compute mean and standard deviation of windows, shape (n, d), in float64.
 
-    Frame after frame for many windows at once: what is summed stays in the cache.
+    It sums frame after frame for many windows at once, so that the sums stay in the cache.
 
     Parameters
     ----------
     frames : sequence of np.ndarray [shape=(n, d)]
-        The first frames of all windows, the second ones, and so on.
+        As of `successive`.
     """
     mean = _sum(frames) / len(frames)
     square = np.zeros_like(mean)

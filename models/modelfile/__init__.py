@@ -1,1 +1,1 @@
-"""The model file, its card, and the folder of models that a recorder takes its own from."""
+"""The model file, its card, and the folder of models of a recorder."""

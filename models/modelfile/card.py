@@ -1,4 +1,4 @@
-"""What a log says of the model behind its labels: a card for people, a description for programs."""
+"""Attachments about a model in a log: a card for people, a description for programs."""
 
 import json
 
@@ -11,9 +11,9 @@ DESCRIPTION = "model.json"
 
 
 def model_attachments(model: Model) -> list[Attachment]:
-    """Return what goes into a log with the labels of a model."""
-    about = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
-    text = json.dumps(about, ensure_ascii=False)
+    """Return the attachments of a log with labels of a model."""
+    description = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
+    text = json.dumps(description, ensure_ascii=False)
     return [
         Attachment(CARD, "text/markdown", model_card(model).encode()),
         Attachment(DESCRIPTION, "application/json", text.encode()),
@@ -21,53 +21,50 @@ def model_attachments(model: Model) -> list[Attachment]:
 
 
 def model_card(model: Model) -> str:
-    """Describe a model, as Markdown.
-
-    Programs read its description instead.
-    """
-    about, metrics = model.description, model.description.metrics
-    amounts = about.training_data.classes
+    """Describe a model for people, as Markdown."""
+    description, metrics = model.description, model.description.metrics
+    amounts = description.training_data.classes
     purpose = (
-        f"Tells apart {len(about.classes)} classes of sound in windows of "
-        f"{about.window_seconds:g} s, from feature set {about.feature_set} "
-        f"({about.kind}, {classifier_kind(about.kind).summary(model)})."
+        f"Tells apart {len(description.classes)} classes of sound in windows of "
+        f"{description.window_seconds:g} s, from feature set {description.feature_set} "
+        f"({description.kind}, {classifier_kind(description.kind).summary(model)})."
     )
     lines = [
-        f"# Model {model.name or about.scenario_name}",
+        f"# Model {model.name or description.scenario_name}",
         "",
         purpose,
         "",
         f"- sha256: {model.sha256 or 'not saved'}",
-        f"- scenario: {about.scenario_name}",
+        f"- scenario: {description.scenario_name}",
         f"- macro F1: {metrics.macro_f1:.3f} ({metrics.folds} folds, no source in two of them)",
         f"- expected calibration error: {metrics.expected_calibration_error:.3f}",
-        f"- training data sha256: {about.training_data.sha256}",
-        f"- made with: {', '.join(f'{k} {v}' for k, v in sorted(about.versions.items()))}",
+        f"- training data sha256: {description.training_data.sha256}",
+        f"- made with: {', '.join(f'{k} {v}' for k, v in sorted(description.versions.items()))}",
         "",
         "| class | labels | sources | seconds | precision | recall | F1 |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name in about.classes:
+    for name in description.classes:
         amount, result = amounts[name], metrics.classes[name]
         lines.append(
-            f"| {name} | {', '.join(about.scenario[name])} | {amount.sources} | "
+            f"| {name} | {', '.join(description.scenario[name])} | {amount.sources} | "
             f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
             f"{result.f1:.3f} |"
         )
-    if about.training_data.home:
+    if description.training_data.home:
         lines += [
             "",
             "Adapted to a home (the figures above are those before); learned besides:",
         ]
         lines += [""] + [
             f"- {name}: {amount.segments} segments from {amount.sources} sources"
-            for name, amount in about.training_data.home.items()
+            for name, amount in description.training_data.home.items()
         ]
-    if about.training_data.simulated:
+    if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += ["", "Learned from recordings of:", ""]
     lines += [
         f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
-        for item in about.training_data.collections
+        for item in description.training_data.collections
     ]
     return "\n".join(lines) + "\n"

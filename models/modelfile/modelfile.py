@@ -1,4 +1,4 @@
-"""The model file: one `.safetensors` file, arrays and a JSON description, checked when loaded."""
+"""The model file: arrays and a JSON description as `.safetensors`, checked when loaded."""
 
 import hashlib
 import json
@@ -29,11 +29,11 @@ from hearthlog.schemas.storage.small_file import read_whole
 
 SUFFIX = ".safetensors"
 _KEY = "hearthlog"
-_SIZE_LIMIT = 64 << 20  # a hundred times what a home needs
-_HEADER_LIMIT = 4 << 20  # parsed, it takes many times its size
+_SIZE_LIMIT = 64 << 20  # a hundred times the usual size
+_HEADER_LIMIT = 4 << 20  # its parsed form takes many times as much
 _LARGEST = 1e9  # no product of finite inputs overflows
 _ROUNDING = 1e-9
-_COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; none of them must be there
+_COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are optional
     "transitions": np.dtype(np.float64),
     "training_windows": np.dtype(np.float32),
     "training_target": np.dtype(np.int64),
@@ -102,11 +102,11 @@ def load_model(path: Path) -> Model:
 
 
 def _pointed_to(path: Path) -> Path:
-    """Follow a link such as `champion`: its name does not say which model it is."""
+    """Follow a link such as `champion` to the file that has the name of the model."""
     try:
         return Path(os.path.realpath(path)) if path.is_symlink() else path
     except OSError:
-        return path  # why, reading it will say
+        return path  # reading it will raise the error
 
 
 def _check_header(path: Path, data: bytes) -> None:
@@ -125,39 +125,40 @@ def _description(path: Path, data: bytes) -> Description:
         raise ModelError(f"{path}: {error}") from error
 
 
-def _check(path: Path, about: Description, arrays: Mapping[str, Array]) -> None:
+def _check(path: Path, description: Description, arrays: Mapping[str, Array]) -> None:
     try:
-        problem = _problem(about) or _problem_of(about, arrays)
+        problem = _problem(description) or _problem_of(description, arrays)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
     if problem:
         raise ModelError(f"{path}: {problem}")
 
 
-def _problem(about: Description) -> str | None:
-    """Say what in a description contradicts the rest of it, or what is installed here."""
-    features = feature_set(about.feature_set)
-    if about.feature_set_version != features.version:
+def _problem(description: Description) -> str | None:
+    """Return what in a description contradicts the rest of it, or what is installed here."""
+    features = feature_set(description.feature_set)
+    if description.feature_set_version != features.version:
         return (
-            f"is for version {about.feature_set_version} of feature set {features.name}; "
+            f"is for version {description.feature_set_version} of feature set {features.name}; "
             f"here is version {features.version}: train it anew"
         )
-    if len(about.feature_names) != features.width:
-        return f"names {len(about.feature_names)} features, which {about.feature_set} has not"
-    if about.inputs not in features.inputs:
-        return f"inputs: {features.name} has no {one_line(about.inputs)[:64]!r}"
+    if len(description.feature_names) != features.width:
+        count = len(description.feature_names)
+        return f"names {count} features, which {description.feature_set} has not"
+    if description.inputs not in features.inputs:
+        return f"inputs: {features.name} has no {one_line(description.inputs)[:64]!r}"
     try:
-        classifier_kind(about.kind).parameters.model_validate(about.parameters)
+        classifier_kind(description.kind).parameters.model_validate(description.parameters)
     except ValidationError as error:
         return first_problem(error)
-    return _problem_of_classes(about)
+    return _problem_of_classes(description)
 
 
-def _problem_of_classes(about: Description) -> str | None:
-    classes = set(about.classes)
-    tables = (about.scenario, about.training_data.classes, about.metrics.classes)
-    confusion = about.metrics.confusion
-    if len(classes) != len(about.classes):
+def _problem_of_classes(description: Description) -> str | None:
+    classes = set(description.classes)
+    tables = (description.scenario, description.training_data.classes, description.metrics.classes)
+    confusion = description.metrics.confusion
+    if len(classes) != len(description.classes):
         return "names a class twice"
     if any(table.keys() != classes for table in tables):
         return "its scenario, training data and metrics are not all of its classes"
@@ -166,13 +167,13 @@ def _problem_of_classes(about: Description) -> str | None:
     return None
 
 
-def _problem_of(about: Description, arrays: Mapping[str, Array]) -> str | None:
-    """Say what is wrong with the arrays of a model."""
-    kind, classes = classifier_kind(about.kind), len(about.classes)
+def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | None:
+    """Return what is wrong with the arrays of a model."""
+    kind, classes = classifier_kind(description.kind), len(description.classes)
     dtypes = {**kind.arrays, **kind.optional, **_COMMON}
     if not kind.arrays.keys() <= arrays.keys() <= dtypes.keys():
         return f"has other arrays than a model of kind {kind.name}"
-    shapes = _shapes(about, arrays)
+    shapes = _shapes(description, arrays)
     if shapes.keys() != arrays.keys():
         name = min(shapes.keys() ^ arrays.keys())
         return f"{name} {'is missing' if name in shapes else 'is out of place'}"
@@ -202,12 +203,12 @@ def _problem_of_array(
     return None
 
 
-def _shapes(about: Description, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
+def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
     """Return the shape that each array must have."""
-    features, classes = feature_set(about.feature_set), len(about.classes)
-    width = features.inputs[about.inputs].width
-    shapes = classifier_kind(about.kind).shapes(classes, width, arrays)
-    if about.smoothing.method == "hmm":
+    features, classes = feature_set(description.feature_set), len(description.classes)
+    width = features.inputs[description.inputs].width
+    shapes = classifier_kind(description.kind).shapes(classes, width, arrays)
+    if description.smoothing.method == "hmm":
         shapes["transitions"] = (classes, classes)
     kept = arrays.get("training_windows", np.empty(0))
     if kept.ndim and len(kept):

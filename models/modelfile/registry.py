@@ -1,12 +1,11 @@
-"""A folder of model files, of which one is the champion: the one that speaks.
+"""A folder of model files, one of which is the champion: the one that labels.
 
-`champion` and `candidate` are symbolic links in the folder, so that any program can open them; a
-link is replaced in one step, so that there is a champion at every moment. Earlier champions are
-lines of the plain file `history`, the last one at the end. It is written before the link: killed
-between the two, it ends with the champion that still is, which is passed over.
+`champion` and `candidate` are symbolic links in the folder, so that any program can open them. A
+link is replaced in one step, so that there always is a champion. The file `history` lists earlier
+champions, the last one at the end. It is written before the link: if a command is killed between
+the two, it ends with the current champion, which is skipped.
 """
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,7 +15,7 @@ from pathlib import Path
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
-from hearthlog.schemas.storage.new_files import sync_folder
+from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
 _HISTORY = "history"
@@ -25,17 +24,17 @@ _KEPT = 100  # earlier champions
 
 @dataclass(frozen=True, eq=False)
 class ModelEntry:
-    """One file of the folder.
+    """One model file of the folder.
 
     Attributes
     ----------
     name : str
     aliases : tuple of str
-        Those that point to it.
+        Aliases that point to it.
     size : int
         Bytes.
     model : Model or None
-        None if it cannot be used.
+        None if the file cannot be used.
     problem : str
         Why not.
     """
@@ -48,7 +47,7 @@ class ModelEntry:
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
-    """Load every model of a folder, in the order of their names; aliases that lead nowhere too.
+    """Load every model of a folder, in the order of names; targets of broken aliases are included.
 
     Raises
     ------
@@ -71,7 +70,7 @@ def target(folder: Path, alias: str) -> str | None:
     Raises
     ------
     ModelError
-        If its name is taken by something else than a link to a file of the folder.
+        If a file of this name is not a link to a file of the folder.
     """
     link = _path(folder, alias)
     if not os.path.lexists(link):
@@ -91,14 +90,14 @@ def resolve(folder: Path, name: str) -> str:
     Raises
     ------
     ModelError
-        If it is an alias that is not there, or no name of a file of the folder.
+        If the alias does not exist, or the name is not one of the folder.
     """
     name = name.removesuffix(SUFFIX)
     if name in ALIASES:
-        found = target(folder, name)
-        if found is None:
+        model = target(folder, name)
+        if model is None:
             raise ModelError(f"{folder}: there is no {name}; name a model, or promote one")
-        return found
+        return model
     if Path(name).name != name:
         raise ModelError(f"{name!a}: name a model of {folder}, without its folder")
     return name
@@ -117,7 +116,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
     ----------
     folder : Path
     name : str
-        Of the model, or another alias.
+        A model, or another alias.
     alias : str
         `champion` or `candidate`.
 
@@ -125,7 +124,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
     -------
     model : Model
     before : str or None
-        What the alias pointed to: the same name if nothing had to be done.
+        What the alias pointed to; the same name if nothing had to be done.
 
     Raises
     ------
@@ -143,7 +142,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 
 
 def rollback(folder: Path) -> tuple[Model, str]:
-    """Make the champion before, or the last one that can still be used, the champion again.
+    """Make the last earlier champion that can still be used the champion again.
 
     Returns
     -------
@@ -192,15 +191,11 @@ def _check_folder(folder: Path) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep others from changing the aliases of a folder at the same time."""
+    """Keep other processes from changing the aliases of a folder at the same time."""
     _check_folder(folder)
     try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        with locked_folder(folder):
             yield
-        finally:
-            os.close(descriptor)
     except OSError as error:
         raise ModelError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
@@ -216,7 +211,7 @@ def _point(folder: Path, alias: str, name: str) -> None:
 
 
 def _earlier(folder: Path) -> list[str]:
-    """Read the earlier champions, without the one that still is."""
+    """Read the earlier champions, without the current one."""
     path = folder / _HISTORY
     names = path.read_text(errors="replace").splitlines() if path.is_file() else []
     champion = target(folder, CHAMPION)

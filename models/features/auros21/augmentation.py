@@ -1,7 +1,7 @@
-"""The same sound through another microphone, in another room: features changed as that would.
+"""Augmentation: the features of the same sound through another microphone, in another room.
 
-Gain, tilt and bumps of the spectrum, and the noise of a microphone, all act on the mel bands that
-the cepstra stand for, so the sound itself is not needed.
+Gain, tilt and bumps of the spectrum, and the noise of a microphone, act on the mel bands that the
+cepstra represent, so the sound itself is not needed.
 """
 
 import numpy as np
@@ -11,18 +11,18 @@ from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
 from hearthlog.models.features.auros21.names import CEPSTRA, ENERGY
 from hearthlog.schemas.arrays import Float32, Float64
 
-_SHARE = 0.6  # of the segments, of each of gain, tilt and every bump
-_GAIN = 12.0  # dB, and how far it may be from none
+_SHARE = 0.6  # of the segments get each of gain, tilt and bump
+_GAIN = 12.0  # dB, at most
 _TILT = 3.0  # dB an octave
 _BUMPS, _BUMP = 3, 6.0  # dB
-_BUMP_OCTAVES = (0.3, 1.0)  # how wide
+_BUMP_OCTAVES = (0.3, 1.0)  # width
 _NOISE_SHARE = 0.5
 _NOISE = (-95.0, -55.0)  # dB in each band
-_NEPER = 10.0 / np.log(10.0)  # dB of a power e times as large
+_NEPER = 10.0 / np.log(10.0)  # dB of a factor e in power
 
 
 def augmented(windows: Float32, rng: np.random.Generator) -> Float32:
-    """Change each window as another microphone might have.
+    """Return each window as another microphone might have captured it.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def augmented(windows: Float32, rng: np.random.Generator) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, 20, 21)], float32
-        Energy and cepstra are changed; what else a spectrum tells, hardly depends on these.
+        Energy and cepstra are changed; the other features hardly depend on a microphone.
     """
     gain, curve = _curves(len(windows), rng)
     cepstra = windows[:, :, CEPSTRA]

@@ -23,12 +23,12 @@ _RUNNING_SUM = np.triu(np.ones((_ROLLOFF_BANDS, _ROLLOFF_BANDS)))
 _TINY = np.finfo(np.float64).eps
 _SANE_SAMPLE = 1e3  # full scale is 1
 _SANE_ENERGY = _SANE_SAMPLE**2
-_POWER_FLOOR = 1e-7  # about -70 dBFS: below it a spectrum tells of the codec, not of the sound
+_POWER_FLOOR = 1e-7  # about -70 dBFS: below it a spectrum is that of the codec
 _FRAMES_AT_ONCE = 384  # more would leave a core's cache, fewer cost more in calls
 
 
 class FeatureExtractor:
-    """Features of one stream of frames; remembers only the last spectrum, which the flux needs."""
+    """Features of one stream of frames; the state is the last spectrum, for the flux."""
 
     def __init__(self) -> None:
         self._last_magnitude: Float64 | None = None
@@ -47,8 +47,8 @@ class FeatureExtractor:
         Parameters
         ----------
         frames : np.ndarray [shape=(n, 800)], float32
-            Samples in full scale, -1 to 1, at 16 kHz. What is not finite counts as 0, what is
-            beyond +-1000 as that.
+            Samples in full scale, -1 to 1, at 16 kHz. Those that are not finite count as 0, those
+            beyond +-1000 are clipped.
 
         Returns
         -------
@@ -98,18 +98,18 @@ class FeatureExtractor:
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
-    """Sign changes per step from sample to sample, 0 to 1 (a step to or from 0 counts half)."""
+    """Return sign changes per step from sample to sample (a step to or from 0 counts half)."""
     sign = (frames > 0).view(np.int8) - (frames < 0).view(np.int8)
     steps = sign[:, 1:] - sign[:, :-1]
     return np.abs(steps, out=steps).sum(axis=1, dtype=np.int16) / (2.0 * (FRAME_SAMPLES - 1))
 
 
 def mel_bank() -> Float64:
-    """Triangular filters of peak 1 on the Slaney mel scale, 0 to 8 kHz.
+    """Return triangular filters of peak 1 on the Slaney mel scale, 0 to 8 kHz.
 
     Returns
     -------
-    np.ndarray [shape=(400, 40)], float64
+    np.ndarray [shape=(400, 32)], float64
         Weight of each spectral bin in each band; as `librosa.filters.mel(norm=None)`.
     """
     frequency = np.arange(_BINS) * (SAMPLE_RATE / FRAME_SAMPLES)
@@ -122,7 +122,7 @@ def mel_bank() -> Float64:
 
 
 def mel_centres() -> Float64:
-    """Frequencies, in hertz, at which the filters of `mel_bank` peak; shape (32,)."""
+    """Return the frequencies in hertz at which the filters of `mel_bank` peak, shape (32,)."""
     return _mel_corners()[1:-1]
 
 
@@ -153,7 +153,7 @@ def _moment_weights() -> Float64:
 
 @cache
 def _mel_weights() -> Float64:
-    """Mel bank for squared DFT magnitudes: a full-scale sine has power 1 (0 dB)."""
+    """Return the mel bank for squared DFT magnitudes: a full-scale sine has power 1 (0 dB)."""
     return mel_bank() / _BINS**2
 
 
@@ -172,7 +172,7 @@ def _entropy_of_shares(parts: Float64, total: Float64) -> Float64:
 
 
 def _flux(magnitude: Float64, total: Float64, power: Float64) -> Float64:
-    """Squared distance of successive normalised spectra, as |a|^2 + |b|^2 - 2ab."""
+    """Return the squared distance of successive normalised spectra, as |a|^2 + |b|^2 - 2ab."""
     length = power / total**2
     common = np.vecdot(magnitude[1:], magnitude[:-1]) / (total[1:] * total[:-1])
     return np.maximum(length[1:] + length[:-1] - 2.0 * common, 0.0)

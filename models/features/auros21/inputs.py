@@ -1,8 +1,8 @@
-"""What classifiers look at in `auros21`: the features themselves, or better use of them.
+"""Inputs of classifiers from the features of `auros21`.
 
-`statistics` are the paper's (section 3.2): mean and standard deviation of the features. `bands`
-uses the same features better: energy and flux as logarithms, besides the cepstra the smooth mel
-bands they stand for, and besides mean and deviation how much a value changes from frame to frame.
+`statistics` are those of the paper (section 3.2): mean and standard deviation of the features.
+`bands` makes more of the same features: logarithms of energy and flux, the smooth mel bands that
+the cepstra represent, and the mean change of all values from frame to frame.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ def features_themselves(features: Float32) -> Float32:
 
 
 def band_values(features: Float32) -> Float64:
-    """Make better values of the features of each frame.
+    """Compute the values behind the inputs `bands` from the features of each frame.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ def band_values(features: Float32) -> Float64:
     Returns
     -------
     np.ndarray [shape=(n, 53)], float64
-        The features before the cepstra, of them energy in dB and the natural logarithm of the
-        flux, then 32 mel bands in dB, then the cepstra.
+        The features before the cepstra, with energy in dB and the natural logarithm of the flux,
+        then 32 mel bands in dB, then the cepstra.
     """
     cepstra = features[:, CEPSTRA]
     values = np.empty((len(features), _WIDTH + MEL_BANDS))
@@ -48,13 +48,13 @@ def band_values(features: Float32) -> Float64:
 
 
 def bands_of(cepstra: Float32) -> Float64:
-    """Turn mel cepstra back into bands in dB, smoothed by the cepstra that are not there."""
+    """Turn mel cepstra, shape (n, 13), back into smoothed mel bands in dB, shape (n, 32)."""
     return rowwise_matmul(cepstra.astype(np.float64), dct_weights().T)
 
 
 @cache
 def dct_weights() -> Float64:
-    """Orthonormal DCT-II of the mel bands, its first coefficients (the first is the level)."""
+    """Return the weights of the first 13 coefficients of an orthonormal DCT-II of the mel bands."""
     band = np.arange(MEL_BANDS)[:, np.newaxis]
     order = np.arange(_WIDTH - _SCALARS)
     weights = np.sqrt(2.0 / MEL_BANDS) * np.cos(np.pi / MEL_BANDS * (band + 0.5) * order)
