@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from html import escape
+from typing import Any, NamedTuple
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.report import class_words, interrai
@@ -15,7 +15,7 @@ from hearthlog.analyzer.report.class_words import (
     times_in_words,
 )
 from hearthlog.analyzer.report.daily_metrics import Day
-from hearthlog.analyzer.report.html import box, figure, heading, page, paragraph, swatch, table
+from hearthlog.analyzer.report.html import Cell, Row, Table, fill_page
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
 from hearthlog.analyzer.report.summary_text import (
@@ -29,117 +29,88 @@ from hearthlog.analyzer.report.summary_text import (
 )
 from hearthlog.analyzer.report.values import Count, Minutes, Value
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
-from hearthlog.schemas.messages.topics import LIVE
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
-_DAY_CAPTION = (
-    "Each line is a kind of sound, from midnight to midnight: the taller the mark, the more of it "
-    "in those three minutes. Shaded: night. Hatched: not heard. The bars show minutes with sound "
-    "in each hour; the short dark lines show what is usual."
-)
-_WEEK_CAPTION = (
-    "Each block is a kind of sound, with a line for each day, from midnight to midnight: the "
-    "taller the mark, the more of it in those ten minutes. Shaded: night. Hatched: not heard."
-)
-_HOW_TO_READ = (
-    "A computer listens for kinds of sound; this report needs no recording. It can be wrong. "
-    "“About 5 (4 to 6)”: it is not equally sure of every sound it marked. 5 is the likeliest "
-    "number by its own sureness, and nine times in ten the right one should be from 4 to 6. Sounds "
-    "that it missed are in no number. Sounds of one kind with at most ten seconds between them "
-    "count once. What a person has listened to and corrected counts as certain."
-)
-_RIGHT_IN_TESTS = (
-    "“Right in tests”: how many of ten sounds of this name were right when the model was tested on "
-    "recordings that it had not learned from. At home it may be better or worse."
-)
+
+
+class Part(NamedTuple):
+    """A section of the page: its table, and what is remarked on it."""
+
+    section: Section
+    table: Table
+    remarks: Sequence[str] = ()
 
 
 def day_page(account: Account, picture: bytes) -> str:
     """Write the page of a day."""
     day = account.days[0]
-    title = class_words.day_in_words(day.day)
-    body = [
-        *_top(account, title, list(gist_of_day(account, day))),
-        figure(picture, f"Timeline of {title}", _DAY_CAPTION),
-        heading("What was heard"),
-        *_sounds(account, day),
-        paragraph(_about_usual(account), "note"),
-    ]
-    for section in sections(account.classes):
-        body += [heading(section.title), *_section(account, section, day)]
-    body += [*_interrai(account), *_foot(account)]
-    return page(f"{account.home}, {title}", body)
+    names = [name for name in account.classes if name != SILENCE]
+    return _page(
+        account,
+        picture,
+        title=class_words.day_in_words(day.day),
+        gist=list(gist_of_day(account, day)),
+        overview=[("What was heard", _sounds(account, day))],
+        absent=[name for name in names if not _was_heard(account, name)],
+        parts=[_part(account, section, day) for section in sections(account.classes)],
+    )
 
 
 def week_page(account: Account, picture: bytes) -> str:
     """Write the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{class_words.date_in_words(first)} to {class_words.date_in_words(last)}"
-    title = f"Week {first.isocalendar().week}, {spoken}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
-    absent = [in_words(name).lower() for name in account.classes if name not in (*names, SILENCE)]
-    body = [
-        *_top(account, title, list(gist_of_week(account))),
-        figure(picture, f"Timeline of {title}", _WEEK_CAPTION),
-        heading("How long it was heard"),
-        _week(account, [minutes_of(name) for name in names]),
-        heading("How often it was heard"),
-        _week(account, [events_of(name) for name in names]),
-        paragraph(f"Not heard: {listed(absent)}." if absent else ""),
-        paragraph(_about_usual(account), "note"),
-    ]
-    for section in sections(account.classes):
-        body.append(heading(section.title))
-        if section.missing:
-            body.append(paragraph(section.missing))
-        else:
-            body += [_week(account, section.figures), paragraph(section.note, "note")]
-    body += [*_interrai(account), *_foot(account)]
-    return page(f"{account.home}, {title}", body)
-
-
-def _top(account: Account, title: str, gist: Sequence[str]) -> Iterator[str]:
-    microphones = listed([plain(name) for name in account.microphones])
-    many = "s" if len(account.microphones) > 1 else ""
-    who = f"Home: {account.home}, microphone{many}: {microphones}."
-    line = f"{who} Times are those of {account.zone}."
-    yield f"<header>\n<h1>{escape(title)}</h1>\n{paragraph(line)}\n</header>"
-    yield box("gist", [paragraph(line) for line in gist])
-    alerts = [*not_heard(account), *not_well(account)]
-    yield box("alert", [paragraph(line, "" if not i else "more") for i, line in enumerate(alerts)])
-
-
-def _about_usual(account: Account) -> str:
-    if not account.comparable:
-        return account.too_few
-    return (
-        f"Usually: the middle of {len(account.earlier)} of the {DAYS} days before, with their "
-        "lowest and highest. Only days that were heard for the most part are used. A word such as "
-        "“longer” is there where this is outside of all of them, whatever the uncertainty. One or "
-        "two such words on a page are nothing to worry about."
+    return _page(
+        account,
+        picture,
+        title=f"Week {first.isocalendar().week}, {spoken}",
+        gist=list(gist_of_week(account)),
+        overview=[
+            ("How long it was heard", _week(account, [minutes_of(name) for name in names])),
+            ("How often it was heard", _week(account, [events_of(name) for name in names])),
+        ],
+        absent=[name for name in account.classes if name not in (*names, SILENCE)],
+        parts=[
+            Part(section, _week(account, section.figures)) for section in sections(account.classes)
+        ],
     )
 
 
-def _sounds(account: Account, day: Day) -> Iterator[str]:
-    """Tell minutes and events of each class; what was not heard at all is only named."""
+def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: Any) -> str:
+    days = [day for day in (*account.before, *account.days) if day.coverage.length]
+    return fill_page(
+        picture,
+        account=account,
+        week=len(account.days) > 1,
+        microphones=listed([plain(name) for name in account.microphones]),
+        alerts=[*not_heard(account), *not_well(account)],
+        absent=listed([in_words(name).lower() for name in absent]),
+        days_before=DAYS,
+        interrai=_interrai(account, days),
+        interrai_days=interrai.DAYS,
+        interrai_heard=len(days),
+        **parts,
+    )
+
+
+def _sounds(account: Account, day: Day) -> Table:
+    """Tell minutes and events of each class but those that were not heard at all."""
     tested = any(name in account.precisions for name in account.classes)
     usually = ["Usually"] * account.comparable
     heads = ["Sound", "How long", *usually, "How often", *usually, *["Right in tests"] * tested]
-    names = [name for name in account.classes if name != SILENCE]
-    absent = [name for name in names if not _was_heard(account, name)]
+    names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     rows = []
     for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
-        if name in absent:
-            continue
-        often = events_of(name)
-        row = [swatch(*colour(name)) + escape(in_words(name))]
-        row += _cells(account, minutes_of(name), day)
-        row += [""] * (1 + account.comparable) if name == SILENCE else _cells(account, often, day)
-        rows.append(row + [_tenths(account.precisions.get(name))] * tested)
-    yield table(heads, rows)
-    if absent:
-        yield paragraph(f"Not heard: {listed([in_words(name).lower() for name in absent])}.")
+        cells = [Cell(in_words(name), colour=colour(name))]
+        cells += _cells(account, minutes_of(name), day)
+        if name == SILENCE:
+            cells += [Cell("")] * (1 + account.comparable)
+        else:
+            cells += _cells(account, events_of(name), day)
+        rows.append(Row(cells + [Cell(_tenths(account.precisions.get(name)))] * tested))
+    return Table(heads, rows)
 
 
 def _was_heard(account: Account, name: str) -> bool:
@@ -150,13 +121,11 @@ def _was_heard(account: Account, name: str) -> bool:
     return missing or any(v and v.marked for v in values) or bool(baseline and baseline[0].highest)
 
 
-def _cells(account: Account, figure: Figure, day: Day) -> list[str]:
+def _cells(account: Account, figure: Figure, day: Day) -> list[Cell]:
     """Return a figure, and what is usual if anything is compared."""
-    cells = [f'<span class="unit">{escape(_text(figure.value(day)))}</span>']
+    cells = [Cell(_text(figure.value(day)), whole=True)]
     if account.comparable:
-        change = account.change(figure, day)
-        mark = f' <span class="differs">{change}</span>' if change else ""
-        cells.append(escape(account.usually(figure)) + mark)
+        cells.append(Cell(account.usually(figure), account.change(figure, day)))
     return cells
 
 
@@ -164,25 +133,25 @@ def _text(value: Value | None) -> str:
     return "not known" if value is None else value.text
 
 
-def _section(account: Account, section: Section, day: Day) -> Iterator[str]:
-    if section.missing:
-        yield paragraph(section.missing)
-        return
+def _part(account: Account, section: Section, day: Day) -> Part:
     heads = ["", "This day", *["Usually"] * account.comparable]
-    yield table(heads, [[escape(f.title), *_cells(account, f, day)] for f in section.figures])
+    rows = [Row([Cell(f.title), *_cells(account, f, day)]) for f in section.figures]
+    return Part(section, Table(heads, rows), list(_remarks(section, day)))
+
+
+def _remarks(section: Section, day: Day) -> Iterator[str]:
     share = _share(section.figures, day)
     if share < _PARTLY * day.share:
-        yield paragraph(f"These sounds could be heard for {percent(share)} of the day only.")
+        yield f"These sounds could be heard for {percent(share)} of the day only."
     if section.title == "Bathroom":
         for name in (FLUSHING_WATER, SHOWER):
             starts = day.events(name).starts
-            times = f"{several_in_words(name)} at {times_in_words(starts, day.zone)}."
-            yield paragraph(times if len(starts) else "")
+            if len(starts):
+                yield f"{several_in_words(name)} at {times_in_words(starts, day.zone)}."
     elif section.title == "Night":
-        yield paragraph(_coughing(day))
+        yield _coughing(day)
     else:
-        yield paragraph(longest_quiet(day))
-    yield paragraph(section.note, "note")
+        yield longest_quiet(day)
 
 
 def _coughing(day: Day) -> str:
@@ -196,22 +165,24 @@ def _coughing(day: Day) -> str:
     return f"Coughing as marked: {', '.join(each)}. About {rate:.1f} an hour."
 
 
-def _week(account: Account, figures: Sequence[Figure]) -> str:
+def _week(account: Account, figures: Sequence[Figure]) -> Table:
     """Tell figures of seven days, their total, and what is usual on a day."""
     rows = []
     for day in account.days:
         share = _share(figures, day)
         heard = percent(share) if share else "not heard"
         values = [figure.value(day) if day.coverage.length else None for figure in figures]
-        cells = [escape(_short(value)) for value in values]
-        rows.append([escape(class_words.short_day(day.day)), heard, *cells])
-    rows.append(["All days", "", *(escape(_total(account.days, figure)) for figure in figures)])
-    kinds = ["sum"]
+        rows.append(_row(class_words.short_day(day.day), heard, *map(_short, values)))
+    totals = (_total(account.days, figure) for figure in figures)
+    rows.append(_row("All days", "", *totals, kind="sum"))
     if account.comparable:
         usually = (_dense(account.usually(figure)) for figure in figures)
-        rows.append(["Usual day", "", *map(escape, usually)])
-        kinds.append("usual")
-    return table(["Day", "Heard", *(figure.short for figure in figures)], rows, kinds, "wide")
+        rows.append(_row("Usual day", "", *usually, kind="usual"))
+    return Table(["Day", "Heard", *(figure.short for figure in figures)], rows, "wide")
+
+
+def _row(*texts: str, kind: str = "") -> Row:
+    return Row([Cell(text) for text in texts], kind)
 
 
 def _share(figures: Sequence[Figure], day: Day) -> float:
@@ -242,36 +213,15 @@ def _sum(values: Sequence[Value]) -> Count | Minutes | None:
     return sum(counts, Count()) if counts else sum(minutes, Minutes())
 
 
-def _interrai(account: Account) -> Iterator[str]:
+def _interrai(account: Account, days: Sequence[Day]) -> Table:
     """Tell what sound can say to an assessment."""
-    days = [day for day in (*account.before, *account.days) if day.coverage.length]
-    over = "this week" if len(account.days) > 1 else f"{interrai.DAYS} days, up to this one"
-    heard = "" if len(account.days) > 1 else f" ({len(days)} of them heard)"
-    yield heading("For the interRAI Home Care assessment")
-    yield paragraph(
-        f"Counts over {over}{heard}, to help with questions that are mostly about the last "
-        f"{interrai.DAYS} days. They are no scores and no diagnosis, and do not replace asking and "
-        "seeing the person.",
-        "note",
-    )
     rows = []
     for item in interrai.ITEMS:
         audible = not item.needs or item.needs in account.classes
         values = [value for day in days if (value := item.value(day)) is not None]
         text = _text(_sum(values)) if audible else "this model does not know the sound"
-        rows.append([escape(cell) for cell in (item.topic, item.heard, text, item.limits)])
-    yield table(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
-
-
-def _foot(account: Account) -> Iterator[str]:
-    live = account.labelling == LIVE
-    source = "what the recorder heard at the time" if live else f"the labels of {account.labelling}"
-    yield "<footer>"
-    yield heading("How to read this")
-    yield paragraph(_HOW_TO_READ, "note")
-    yield paragraph(_RIGHT_IN_TESTS if account.precisions else "", "note")
-    yield paragraph(f"Made from {source}, and from corrections, if there are any.", "note")
-    yield "</footer>"
+        rows.append(_row(item.topic, item.heard, text, item.limits))
+    return Table(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
 
 
 def _tenths(share: float | None) -> str:
