@@ -36,7 +36,7 @@ from hearthlog.schemas.messages.message_types import (
 )
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.cli.times import parse_time
+from hearthlog.tools.cli.options import parse_time
 
 
 @pytest.fixture

@@ -50,7 +50,6 @@ from hearthlog.schemas.messages.message_types import (
 )
 from hearthlog.schemas.messages.topics import Topic, topics_of
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.cli.replay import Source
 from hearthlog.tools.cli.replay import replay as verb
 
 SECOND = 1_000_000_000
@@ -687,7 +686,7 @@ def test_a_damaged_log_is_replayed_up_to_the_damage(folder, model_file, hearthlo
         ({"start_offset": -1.0}, 2),
         ({"start_offset": 1e6}, 1),
         ({"playback_duration": 0.0}, 2),
-        ({"source": Source.clips}, 1),
+        ({"source": "clips"}, 1),
         ({"model": "{full}/there.rrd"}, 1),
     ],
 )

@@ -155,7 +155,6 @@ def test_what_a_search_found_can_be_trained_with(clips, tmp_path, hearthlog):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("evaluate search --data d --scenario bathroom --folds x", "choose one of segment"),
         ("evaluate method wires --data d --scenario bathroom", "method 'wires' is not installed"),
         ("train -o m.safetensors --data d --scenario bathroom --cost 0", "--cost 0: it must"),
         ("train -o m.safetensors --data d --scenario bathroom --gamma nan", "--gamma nan: it must"),

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.analyzer.marks.formats.table import PATTERNS, find_format
-from hearthlog.tools.cli.options import Microphone
-from hearthlog.tools.cli.reviewer import reviewer_name
+from hearthlog.tools.cli.options import Microphone, reviewer_name
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import number, tell, wrong_use
 

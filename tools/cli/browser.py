@@ -1,8 +1,17 @@
-"""Opening a page of this machine in a browser."""
+"""How what was drawn is looked at: a recording in Rerun, a page in a browser."""
 
+import shlex
 import webbrowser
+from pathlib import Path
 
 from hearthlog.tools.cli.text import tell
+
+
+def print_recording(path: Path) -> None:
+    """Print the name of a Rerun recording, and how to look at it."""
+    print(path)
+    # Otherwise the viewer listens to the whole network.
+    print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(path))}")
 
 
 def show_page(address: str) -> None:

@@ -1,33 +1,23 @@
 """`hearthlog cat`: the messages of logs as text."""
 
 import sys
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.options import End, Logs, Start, Topics
+from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
-from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.selection import Selection
-
-
-class Format(StrEnum):
-    """What messages are printed as."""
-
-    text = "text"
-    ndjson = "ndjson"
-    csv = "csv"
 
 
 def cat(
     logs: Logs,
     *,
     output_format: Annotated[
-        Format, typer.Option("--format", help="csv is for one topic.")
-    ] = Format.text,
+        Literal["text", "ndjson", "csv"], typer.Option("--format", help="csv is for one topic.")
+    ] = "text",
     topics: Topics = None,
     start: Start = None,
     end: End = None,
@@ -36,26 +26,21 @@ def cat(
 
     Exit status 3: a log is unfinished.
     """
-    from hearthlog.analyzer.logs.selection import select
-
-    selection = select(logs, topics or [], *parse_span(start, end))
-    if output_format is Format.csv and len(selection.channels) > 1:
-        names = ", ".join(sorted(selection.channels))
-        wrong_use(f"csv is for one topic: choose one with --topics ({names})")
-    if output_format is Format.csv:
-        _print_table(selection)
-    else:
-        _print_lines(selection, output_format)
-    end_with_warnings(unfinished_lines(selection.unfinished))
-
-
-def _print_lines(selection: "Selection", output_format: Format) -> None:
     from hearthlog.analyzer.export.text import in_order, json_lines, text_lines
+    from hearthlog.analyzer.logs.selection import select
     from hearthlog.analyzer.logs.typed_columns import decode_all
 
-    lines = json_lines if output_format is Format.ndjson else text_lines
-    for batch in selection.messages():
-        sys.stdout.write("\n".join([*in_order(decode_all(batch), lines), ""]))
+    selection = select(logs, topics or [], *parse_span(start, end))
+    if output_format == "csv" and len(selection.channels) > 1:
+        names = ", ".join(sorted(selection.channels))
+        wrong_use(f"csv is for one topic: choose one with --topics ({names})")
+    if output_format == "csv":
+        _print_table(selection)
+    else:
+        lines = json_lines if output_format == "ndjson" else text_lines
+        for batch in selection.messages():
+            sys.stdout.write("\n".join([*in_order(decode_all(batch), lines), ""]))
+    end_with_warnings(unfinished_lines(selection.unfinished))
 
 
 def _print_table(selection: "Selection") -> None:

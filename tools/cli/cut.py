@@ -1,8 +1,7 @@
 """`hearthlog cut`: a part of some logs as a log of its own."""
 
-from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_log_name
+from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_output, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines
-from hearthlog.tools.cli.times import parse_span
 
 
 def cut(
@@ -22,7 +21,7 @@ def cut(
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
-    check_log_name(output)
+    check_output("--output", output, ".mcap", "a log")
     selection = select(logs, topics or [], *parse_span(start, end))
     with share_done("cutting") as progress:
         merge_logs(selection, output, progress, latched=True)

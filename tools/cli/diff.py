@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from hearthlog.tools.cli.diff_tables import print_difference, print_queue
-from hearthlog.tools.cli.options import End, Json, Log, Microphone, Start
+from hearthlog.tools.cli.options import End, Json, Log, Microphone, Start, check_output, parse_span
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.text import end_with_warnings, tell, unfinished_lines, wrong_use
-from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.labellings import Labellings, NamedLabelling
@@ -51,11 +50,12 @@ def diff(
     Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
     """
     from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.review.queue.review_list import write_list
     from hearthlog.schemas.messages.topics import labelling_topic
 
     if b is None and not queue:
         wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
-    _check_list(output)
+    check_output("--list", output, ".csv", "a list of spans")
     limits = parse_span(start, end)
     sources = find_labellings(log)
     name = sources.microphone(microphone)
@@ -69,7 +69,9 @@ def diff(
     else:
         result = _difference(name, sides, spans or _SHOWN)
     if output is not None:
-        _write_list(output, result.spans())
+        listed = result.spans()
+        write_list(output, listed)
+        tell(f"{len(listed)} spans are listed in {output}")
     if as_json:
         spans_as_text = [span.as_text() for span in result.spans()]
         print(json.dumps({**result.figures, "spans": spans_as_text}, allow_nan=False))
@@ -128,20 +130,3 @@ def _queue(
     figures = {"microphone": microphone, "labelling": names[0], "candidates": ranked.candidates}
     spans = partial(queued, ranked, microphone, *names)
     return _Result(figures, spans, partial(print_queue, ranked))
-
-
-def _write_list(path: Path, spans: "list[ReviewSpan]") -> None:
-    from hearthlog.analyzer.review.queue.review_list import write_list
-
-    write_list(path, spans)
-    tell(f"{len(spans)} spans are listed in {path}")
-
-
-def _check_list(path: Path | None) -> None:
-    from hearthlog.schemas.storage.new_files import check_new
-
-    if path is None:
-        return
-    if path.suffix != ".csv":
-        wrong_use(f"--list {path}: a list of spans is named *.csv")
-    check_new(path)

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from hearthlog.tools.cli.options import parse_span
 from hearthlog.tools.cli.text import tell, wrong_use
-from hearthlog.tools.cli.times import parse_span
 
 
 def enrol(

@@ -1,27 +1,37 @@
 """`hearthlog evaluate`: how good a model is, the labels of a log, or a way to learn."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
-from hearthlog.tools.cli.method import chosen_method
-from hearthlog.tools.cli.options import METHODS, Clips, Json, Scheduler, manifest_path
+from hearthlog.tools.cli.options import (
+    METHODS,
+    Clips,
+    Json,
+    Scheduler,
+    check_output,
+    chosen_method,
+    manifest_path,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
 from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.evaluate_method import Kind
-    from hearthlog.analyzer.training import method as learning
+    from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
+    from hearthlog.analyzer.evaluation.evaluate_model import Evaluation
     from hearthlog.analyzer.training.dataset import Dataset
+    from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
+    from hearthlog.schemas.progress import Progress
 
 _MOVED = {  # options of one verb that is several now
     "--adaptation": "adaptation",
@@ -46,16 +56,16 @@ class _Group(TyperGroup):
 
 
 evaluate = typer.Typer(
-    cls=_Group,
-    no_args_is_help=True,
-    help="Score the labels of a log, a model, or a way to learn.",
+    cls=_Group, no_args_is_help=True, help="Score the labels of a log, a model, or a method."
 )
 
 _Method = Annotated[str, typer.Argument(help=METHODS)]
 _Scenario = Annotated[
     str, typer.Option(help="What is told apart: bathroom, general, or a TOML file.")
 ]
-_Folds = Annotated[str, typer.Option(help="What is never split: segment, source or collection.")]
+_Folds = Annotated[
+    Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
+]
 _Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
 
 
@@ -80,7 +90,7 @@ def evaluate_log(
     from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
     from hearthlog.analyzer.logs.labelling import read_labelling
 
-    _check_plot(plot)
+    check_output("--plot", plot, ".png", "a picture")
     labelled = read_labelling(log, topic)
     true = read_reference(reference, log, labelled.microphone)
     result = compare(true, labelled.labelling, labelled.classes)
@@ -136,7 +146,7 @@ def evaluate_model(
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.modelfile.modelfile import load_model
 
-    _check_plot(plot)
+    check_output("--plot", plot, ".png", "a picture")
     loaded = load_model(model)
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)
@@ -149,9 +159,8 @@ def evaluate_model(
         _print_json(
             {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
             | asdict(scores)
+            | _calibration(result)
             | {
-                "expected_calibration_error": result.expected_calibration_error,
-                "reliability": [asdict(one) for one in result.reliability],
                 "evaluated_seconds": result.evaluated_seconds,
                 "skipped": dict(result.skipped),
                 "learned_from": result.learned_from,
@@ -186,25 +195,18 @@ def evaluate_method(
 ) -> None:
     """Cross-validate a way to learn: learn from a part of the clips, and try it on the rest."""
     from hearthlog.analyzer.evaluation.evaluate_method import evaluate_method as cross_validate
-    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    _check_plot(plot)
-    by, chosen = _kind(folds), chosen_method(method)
-    with joblib_on(scheduler):
-        segments = _segments(data, scenario, chosen)
-        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-            result = cross_validate(segments, chosen, by, report)
+    check_output("--plot", plot, ".png", "a picture")
+    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
+        result = cross_validate(segments, chosen, folds, progress)
     title = f"{method} on {data} ({scenario}), by {folds}"
     _save_plot(plot, title, result.scores, result.reliability)
     if as_json:
         _print_json(
             {"scenario": scenario, "method": method, "by": folds, "folds": result.folds}
             | asdict(result.scores)
-            | {
-                "expected_calibration_error": result.expected_calibration_error,
-                "reliability": [asdict(one) for one in result.reliability],
-                "skipped": dict(segments.skipped),
-            }
+            | _calibration(result)
+            | {"skipped": dict(segments.skipped)}
         )
         return
     print(
@@ -228,13 +230,9 @@ def search(
 ) -> None:
     """Cross-validate a way to learn with other costs and gammas, and list the best first."""
     from hearthlog.analyzer.evaluation import grid_search
-    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    by, chosen = _kind(folds), chosen_method(method)
-    with joblib_on(scheduler):
-        segments = _segments(data, scenario, chosen)
-        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-            tried = grid_search.search(segments, chosen.variations(), by, report)
+    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
+        tried = grid_search.search(segments, chosen.variations(), folds, progress)
     if as_json:
         rows = [one.method.parameters | asdict(one.scores) for one in tried]
         _print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
@@ -263,13 +261,9 @@ def adaptation(
     Each collection of the clips stands for a home once, and the others are learned from.
     """
     from hearthlog.analyzer.evaluation.adaptation_curve import adaptation_curve
-    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    chosen = chosen_method(method)
-    with joblib_on(scheduler):
-        segments = _segments(data, scenario, chosen)
-        with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-            curve = adaptation_curve(segments, chosen, report)
+    with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
+        curve = adaptation_curve(segments, chosen, progress)
     if as_json:
         _print_json({"scenario": scenario, "method": method} | curve._asdict())
         return
@@ -282,24 +276,31 @@ def adaptation(
     )
 
 
-def _kind(folds: str) -> "Kind":
-    from hearthlog.analyzer.evaluation.evaluate_method import KINDS
-
-    kinds = [kind for kind in KINDS if kind == folds]
-    if not kinds:
-        wrong_use(f"--folds {folds}: choose one of {', '.join(KINDS)}")
-    return kinds[0]
-
-
-def _segments(data: Path, scenario: str, method: "learning.Method") -> "Dataset":
+@contextmanager
+def _learning(
+    name: str, data: Path, scenario: str, scheduler: str | None
+) -> "Iterator[tuple[Method, Dataset, Progress]]":
+    """Cut the clips into segments; what learns from them in the block runs on the cluster."""
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
+    from hearthlog.analyzer.workers.parallel import joblib_on
 
-    classes = load_scenario(scenario)
-    clips = read_manifest(manifest_path(data), classes.labels)
-    with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        return build_dataset(clips, classes, report, features=method.features)
+    method = chosen_method(name)
+    with joblib_on(scheduler):
+        classes = load_scenario(scenario)
+        clips = read_manifest(manifest_path(data), classes.labels)
+        with share_done(f"listening to {len(clips)} clips", announce=True) as progress:
+            segments = build_dataset(clips, classes, progress, features=method.features)
+        with share_done(f"learning from {len(segments)} segments", announce=True) as progress:
+            yield method, segments, progress
+
+
+def _calibration(result: "CrossValidation | Evaluation") -> dict[str, Any]:
+    return {
+        "expected_calibration_error": result.expected_calibration_error,
+        "reliability": [asdict(one) for one in result.reliability],
+    }
 
 
 def _unknown_text(seconds_of: Any) -> str:
@@ -312,16 +313,6 @@ def _unknown_text(seconds_of: Any) -> str:
 
 def _print_json(result: dict[str, Any]) -> None:
     print(json.dumps(result, allow_nan=False))
-
-
-def _check_plot(path: Path | None) -> None:
-    from hearthlog.schemas.storage.new_files import check_new
-
-    if path is None:
-        return
-    if path.suffix != ".png":
-        wrong_use(f"--plot {path}: a picture is named *.png")
-    check_new(path)
 
 
 def _save_plot(path: Path | None, title: str, scores: "Scores", bins: "Sequence[Bin]" = ()) -> None:

@@ -7,9 +7,8 @@ import typer
 
 from hearthlog.analyzer.export.formats import FORMATS
 from hearthlog.schemas.text import listed
-from hearthlog.tools.cli.options import End, Logs, Start, Topics
+from hearthlog.tools.cli.options import End, Logs, Start, Topics, parse_span
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines, wrong_use
-from hearthlog.tools.cli.times import parse_span
 
 _FILES = [each.pattern for each in FORMATS.values() if not each.is_folder]
 _BY_TOPIC = [each.name for each in FORMATS.values() if each.by_topic]

@@ -44,27 +44,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (
-    record,
-    devices,
-    info,
-    catalog,
-    cat,
-    export,
-    merge,
-    cut,
-    doctor,
-    recover,
-    train,
-    enrol,
-    diff,
-    review,
-    watch,
-    report,
-    replay,
-    relabel,
-    demo,
-):
+_ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover)
+for verb in (*_ON_LOGS, train, enrol, diff, review, watch, report, replay, relabel, demo):
     app.command()(verb)
 app.add_typer(annotate, name="annotate")
 app.add_typer(evaluate, name="evaluate")

@@ -1,6 +1,6 @@
 """`hearthlog merge`: several logs in one."""
 
-from hearthlog.tools.cli.options import Logs, NewLog, check_log_name
+from hearthlog.tools.cli.options import Logs, NewLog, check_output
 from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines
 
 
@@ -13,7 +13,7 @@ def merge(logs: Logs, *, output: NewLog) -> None:
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
-    check_log_name(output)
+    check_output("--output", output, ".mcap", "a log")
     selection = select(logs)
     with share_done("merging") as progress:
         merge_logs(selection, output, progress)

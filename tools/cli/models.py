@@ -2,9 +2,8 @@
 
 import json
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -26,13 +25,6 @@ models = typer.Typer(
 
 
 _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "size")
-
-
-class Alias(StrEnum):
-    """What a model may be promoted to."""
-
-    champion = "champion"
-    candidate = "candidate"
 
 
 _Folder = Annotated[
@@ -127,13 +119,15 @@ def compare(
 def promote(
     name: Annotated[str, typer.Argument(help="A model, or an alias.")] = "candidate",
     folder: _Folder = None,
-    to: Annotated[Alias, typer.Option(help="What it becomes.")] = Alias.champion,
+    to: Annotated[
+        Literal["champion", "candidate"], typer.Option(help="What it becomes.")
+    ] = "champion",
 ) -> None:
     """Check a model, and make it the champion in one step; a recorder that runs takes it over."""
     from hearthlog.models.modelfile.registry import promote as promote_model
 
     place = _folder(folder)
-    model, before = promote_model(place, name, to.value)
+    model, before = promote_model(place, name, to)
     if model.name == before:
         print(f"{model.name} is the {to} already")
     else:

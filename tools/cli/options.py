@@ -1,11 +1,17 @@
-"""Options and arguments that several verbs have."""
+"""Options and arguments that several verbs have, and how they are read."""
 
+import getpass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hearthlog.tools.cli.text import wrong_use
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.training.method import Method
+
+_LAST = (1 << 63) - 1  # log time
 
 METHODS = "How to learn: bands, or paper (42 statistics)."
 
@@ -64,7 +70,67 @@ def manifest_path(path: Path) -> Path:
     return path / "manifest.csv" if path.is_dir() else path
 
 
-def check_log_name(path: Path) -> None:
-    """End with the exit status of wrong use unless logs may have this name."""
-    if path.suffix != ".mcap":
-        wrong_use(f"--output {path}: a log is named *.mcap")
+def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:
+    """End with the exit status of wrong use unless a new file may have this name.
+
+    Raises
+    ------
+    LogError
+        If it exists.
+    """
+    from hearthlog.schemas.storage.new_files import check_new
+
+    if path is not None and path.suffix != suffix:
+        wrong_use(f"{option} {path}: {what} is named *{suffix}")
+    if path is not None:
+        check_new(path)
+
+
+def parse_time(text: str, option: str) -> int:
+    """Read a time, in nanoseconds of UTC."""
+    from hearthlog.schemas.times import read_time
+
+    try:
+        return read_time(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"{option} {text}: not a time such as 2026-03-01T07:00") from error
+
+
+def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | None]:
+    """Read the options --start and --end."""
+    first = None if start is None else min(max(parse_time(start, "--start"), 0), _LAST)
+    last = None if end is None else min(max(parse_time(end, "--end"), 0), _LAST)
+    if first is not None and last is not None and first >= last:
+        raise typer.BadParameter(f"--end {end} is not after --start {start}")
+    return first, last
+
+
+def chosen_method(name: str, **parameters: float | None) -> "Method":
+    """Return a way to learn, with other parameters where they are given."""
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.training.methods import method_named
+
+    chosen = {key: value for key, value in parameters.items() if value is not None}
+    for key, value in chosen.items():
+        if not 0 < value < float("inf"):
+            wrong_use(f"--{key} {value:g}: it must be more than 0")
+    try:
+        return method_named(name).with_parameters(chosen)
+    except DataError as error:
+        wrong_use(str(error))
+
+
+def reviewer_name(option: str | None) -> str:
+    """Name the reviewer; empty if nobody is named, and the login has no name."""
+    from hearthlog.analyzer.marks.marks import PERSON_NAME
+
+    if option is not None:
+        name = option.strip()
+        if not name or not PERSON_NAME.fullmatch(name):
+            wrong_use(f"--reviewer {option[:64]!r}: a name has 1 to 200 characters, in one line")
+        return name
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):
+        return ""
+    return name if PERSON_NAME.fullmatch(name) else ""

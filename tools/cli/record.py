@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.tools.cli.options import parse_time
 from hearthlog.tools.cli.text import number, tell
-from hearthlog.tools.cli.times import parse_time
 
 if TYPE_CHECKING:
     from hearthlog.recorder.service import RecordingSummary

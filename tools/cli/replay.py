@@ -2,20 +2,19 @@
 
 import json
 import math
-import shlex
 import signal
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
 from threading import Event as Flag
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from hearthlog.tools.cli.browser import print_recording
 from hearthlog.tools.cli.options import Json
 from hearthlog.tools.cli.text import tell, wrong_use
 
@@ -26,13 +25,6 @@ if TYPE_CHECKING:
     from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
-
-
-class Source(StrEnum):
-    """What the sound is taken from."""
-
-    features = "features"
-    clips = "clips"
 
 
 def replay(
@@ -56,8 +48,9 @@ def replay(
         ),
     ] = None,
     source: Annotated[
-        Source, typer.Option("--from", help="Replay the features, or the clips of sound.")
-    ] = Source.features,
+        Literal["features", "clips"],
+        typer.Option("--from", help="Replay the features, or the clips of sound."),
+    ] = "features",
     rate: Annotated[
         str, typer.Option("--rate", "-r", help="Multiple of real time, or max.")
     ] = _MAX_RATE,
@@ -83,7 +76,7 @@ def replay(
     if loop and output is not None:
         wrong_use("--loop writes no log: it would be written again and again; leave out --output")
     options = ReplayOptions(
-        kind="audio" if source is Source.clips else "features",
+        kind="audio" if source == "clips" else "features",
         output=output,
         start_offset=start_offset,
         duration=playback_duration,
@@ -105,7 +98,10 @@ def replay(
     elif output is None:
         print(*_figures(result, took), sep="\n")
     else:
-        _print_output(result, output)
+        if output.suffix == ".rrd":
+            print_recording(output)
+        else:
+            print(*result.logs, sep="\n")
         for line in _figures(result, took):
             tell(line)
     warnings = _warnings(result)
@@ -220,26 +216,17 @@ def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
     return replace(result, logs=[])
 
 
-def _print_output(result: "Replay", output: Path) -> None:
-    if output.suffix != ".rrd":
-        print(*result.logs, sep="\n")
-        return
-    print(output)
-    # Otherwise the viewer listens to the whole network.
-    print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(output))}")
-
-
 def _figures(result: "Replay", took: float) -> list[str]:
-    compared = result.compared
+    same = result.compared
     speed = result.seconds / max(took, 1e-9)
     lines = [f"{result.seconds:.1f} s of sound in {took:.1f} s ({speed:.0f} times real time)"]
     if result.labels:
-        same = compared.same_labels, compared.identical_labels, compared.labels
-        lines.append(f"{result.labels} labels, {_agreement(*same)}")
+        agreement = _agreement(same.same_labels, same.identical_labels, same.labels)
+        lines.append(f"{result.labels} labels, {agreement}")
     if result.segments:
-        identical = compared.identical_segments
-        same = identical, identical, compared.segments
-        lines.append(f"{result.segments} segments, {_agreement(*same)}")
+        identical = same.identical_segments
+        agreement = _agreement(identical, identical, same.segments)
+        lines.append(f"{result.segments} segments, {agreement}")
     if result.gaps:
         lines.append(f"{result.gaps} gaps")
     return lines

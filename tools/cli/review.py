@@ -1,6 +1,5 @@
 """`hearthlog review`: logs on one time axis, and marks made where they are seen."""
 
-import shlex
 import signal
 from contextlib import suppress
 from datetime import date, datetime, timedelta
@@ -11,13 +10,11 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.browser import show_page
+from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
-from hearthlog.tools.cli.options import Microphone, Timezone
+from hearthlog.tools.cli.options import Microphone, Timezone, parse_span, reviewer_name
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.reviewer import reviewer_name
 from hearthlog.tools.cli.text import end_with_warnings, wrong_use
-from hearthlog.tools.cli.times import parse_span
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.review.session.marking import Marking
@@ -71,14 +68,25 @@ def review(
         wrong_use("--save makes a file: --web, --queue and --port go without it")
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
+    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
+
     limits = parse_span(start, end) if day is None else _day(logs, day, timezone)
+
+    def read() -> "Timeline":
+        with share_done("reading logs") as progress:
+            return read_timeline(logs, *limits, zone=timezone, progress=progress)
+
     if save is not None:
-        timeline = _save(logs, limits, timezone, save)
+        check_output(save)
+        timeline = read()
+        save_timeline(timeline, save)
+        print_recording(save)
     else:
         for number in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, _end)  # or the viewer would stay, and listen
         with _open(web=web, port=port) as viewer:
-            timeline = _read(logs, limits, timezone)
+            timeline = read()
             chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
             _show(viewer, timeline, logs, chosen)
     end_with_warnings(timeline.losses)
@@ -100,32 +108,6 @@ def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None,
         return day_span(near.get(text) or date.fromisoformat(text), zone)
     except (ValueError, OverflowError):
         wrong_use(f"--day {text}: not a day such as 2026-03-01, today or yesterday")
-
-
-def _read(
-    logs: list[Path], limits: tuple[int | None, int | None], timezone: str | None
-) -> "Timeline":
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-
-    with share_done("reading logs") as progress:
-        return read_timeline(logs, *limits, zone=timezone, progress=progress)
-
-
-def _save(
-    logs: list[Path],
-    limits: tuple[int | None, int | None],
-    timezone: str | None,
-    output: Path,
-) -> "Timeline":
-    from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
-
-    check_output(output)
-    timeline = _read(logs, limits, timezone)
-    save_timeline(timeline, output)
-    print(output)
-    # Otherwise the viewer listens to the whole network.
-    print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(output))}")
-    return timeline
 
 
 def _open(*, web: bool, port: int | None) -> "Viewer":

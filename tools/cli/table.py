@@ -12,16 +12,9 @@ _GAP = 2
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
-    """Print rows of text below their heads; nothing without rows.
+    """Print rows of text, if there are any, below their heads, if there are any.
 
-    Parameters
-    ----------
-    head : sequence of str
-        Empty for a table without heads.
-    rows : iterable of sequence of str
-    words : int
-        How many columns, from the left, are words. The others are figures: aligned to the right,
-        and not broken into two lines before the words are.
+    The first columns are `words`, the others figures, which stand to the right and stay whole.
     """
     from rich.console import Console
     from rich.table import Table

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.method import chosen_method
-from hearthlog.tools.cli.options import METHODS, Json, Scheduler, manifest_path
+from hearthlog.tools.cli.options import METHODS, Json, Scheduler, chosen_method, manifest_path
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
 from hearthlog.tools.cli.table import print_table
