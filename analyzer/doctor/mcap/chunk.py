@@ -43,7 +43,7 @@ class Chunk:
         self._head: ChunkHead | None = None
         self._records = b""
         self._indexes: dict[int, bytes] = {}
-        self._places: list[tuple[int, int]] = []  # channel, and offset of its message index
+        self._index_offsets: list[tuple[int, int]] = []  # channel, and offset of its message index
         self._index_length = 0
         try:
             self._head = chunk_head(record.content)
@@ -74,7 +74,7 @@ class Chunk:
             entries = record.content[formats.MESSAGE_INDEX.size : formats.MESSAGE_INDEX.size + size]
             self._indexes[channel] = entries
             if entries:
-                self._places.append((channel, record.offset))
+                self._index_offsets.append((channel, record.offset))
 
     def check(self, *, cut: bool) -> None:
         """Check what is in it; `cut`: its message indexes may not all be there."""
@@ -96,7 +96,7 @@ class Chunk:
         if self._head is None:
             return None
         head = self._head
-        places = b"".join(formats.INDEX_OFFSET.pack(*place) for place in self._places)
+        places = b"".join(formats.INDEX_OFFSET.pack(*pair) for pair in self._index_offsets)
         first = formats.CHUNK_INDEX.pack(
             head.start, head.end, self.offset, self._length, len(places)
         )
@@ -113,8 +113,10 @@ class Chunk:
             self._error("chunk-records", "the last record of a chunk is longer than the chunk")
             self.whole = False
         new: dict[int, int] = {}
-        for opcode, start, last in others:
-            new |= self._other(opcode, start, records[start + HEAD.size : last])
+        for start in others.tolist():
+            opcode, length = HEAD.unpack_from(records, start)
+            first = start + HEAD.size
+            new |= self._other(opcode, start, records[first : first + length])
         self.content = ChunkContent(records, starts, gather_heads(records, starts))
         check_channels(self._findings, self._definitions, self.content, new, self.offset)
 
@@ -172,7 +174,7 @@ class Chunk:
         self._findings.error(rule, what, advice, offset=self.offset)
 
 
-def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, int]], int]:
+def _split(records: bytes, hints: Int64) -> tuple[Int64, Int64, int]:
     """Find the records of a chunk.
 
     Parameters
@@ -182,10 +184,8 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
 
     Returns
     -------
-    starts : np.ndarray [shape=(m,)], int64
-        Where messages begin.
-    others : list of tuple of int
-        Opcode, start and end of the other records, and of messages that are too short.
+    starts, others : np.ndarray [shape=(m,)], int64
+        Where messages begin, and other records, and messages that are too short.
     end : int
         Of the last record; not the length of the chunk if that is damaged.
     """
@@ -197,29 +197,28 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, list[tuple[int, int, in
         if ((firsts <= lasts) & (lasts <= len(records))).all() and (
             (heads["opcode"] == Opcode.MESSAGE) & (lengths >= formats.MESSAGE_FIXED)
         ).all():
-            others: list[tuple[int, int, int]] = []
+            others = [np.empty(0, np.int64)]
             for place in np.flatnonzero(firsts < lasts).tolist():
                 starts, between, end = _walk(records, int(firsts[place]), int(lasts[place]))
                 if len(starts) or end != lasts[place]:
                     break  # a message that the index does not know, or no whole records
-                others += between
+                others.append(between)
             else:
-                return hints, others, len(records)
+                return hints, np.concatenate(others), len(records)
     return _walk(records, 0, len(records))
 
 
-def _walk(content: bytes, start: int, end: int) -> tuple[Int64, list[tuple[int, int, int]], int]:
+def _walk(content: bytes, start: int, end: int) -> tuple[Int64, Int64, int]:
     """Go from record to record; return what `_split` does."""
-    messages = array("q")
-    others: list[tuple[int, int, int]] = []
+    messages, others = array("q"), array("q")
     with suppress(McapError):
         for opcode, first, last in iterate_records(content, start, end):
             if opcode == Opcode.MESSAGE and last - first >= formats.MESSAGE_HEAD.itemsize:
                 messages.append(first)
             else:
-                others.append((opcode, first, last))
+                others.append(first)
             start = last
-    return np.frombuffer(messages, np.int64), others, start
+    return np.frombuffer(messages, np.int64), np.frombuffer(others, np.int64), start
 
 
 def check_channels(

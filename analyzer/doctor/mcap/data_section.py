@@ -58,7 +58,7 @@ class DataSection:
         Messages by channel.
     span : tuple of int, or None
         First and last log time.
-    places : dict of int to dict of int to bytes
+    expected_indexes : dict of int to dict of int to bytes
         By the opcode of the index, and by offset: what the index should say of a chunk, an
         attachment or a metadata record.
     whole : bool
@@ -76,7 +76,7 @@ class DataSection:
         self.attachments: dict[str, list[bytes]] = {}
         self.counts: Counter[int] = Counter()
         self.span: tuple[int, int] | None = None
-        self.places: dict[int, dict[int, bytes]] = {
+        self.expected_indexes: dict[int, dict[int, bytes]] = {
             Opcode.CHUNK_INDEX: {},
             Opcode.ATTACHMENT_INDEX: {},
             Opcode.METADATA_INDEX: {},
@@ -188,7 +188,7 @@ class DataSection:
     def _expect_index(self, opcode: int, offset: int, index: bytes) -> None:
         """Keep the index record that there should be, unless it is too long to be compared."""
         content = index[HEAD.size :]
-        self.places[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
+        self.expected_indexes[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
 
     def _keep(self, kept: dict[str, list[Any]], name: str, content: Any, record: Record) -> None:
         if name in self._names and record.length <= _KEPT_SIZE and len(kept.get(name, ())) < 2:
@@ -209,7 +209,7 @@ class DataSection:
         self.whole &= chunk.whole
         index = chunk.index_content()
         if index is not None:
-            self.places[Opcode.CHUNK_INDEX][chunk.offset] = index
+            self.expected_indexes[Opcode.CHUNK_INDEX][chunk.offset] = index
         if chunk.content is not None:
             self._add_messages(chunk.content)
         if not chunk.whole:

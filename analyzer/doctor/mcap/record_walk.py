@@ -35,19 +35,19 @@ class RecordWalk:
         Behind the magic.
     finished : bool
         Whether the file has an end.
-    places : sequence of int
-        Offsets of records, ascending, as the index of the file has them: here the walk goes on
+    offsets : sequence of int
+        Of records, ascending, as the index of the file has them: here the walk goes on
         when it has lost its way.
     """
 
     def __init__(
-        self, source: ByteSource, findings: Findings, places: Sequence[int], *, finished: bool
+        self, source: ByteSource, findings: Findings, offsets: Sequence[int], *, finished: bool
     ) -> None:
         self.losses = 0  # how often something was passed over
         self._source = source
         self._findings = findings
         self._finished = finished
-        self._places = places
+        self._offsets = offsets
 
     @property
     def damaged(self) -> bool:
@@ -77,7 +77,7 @@ class RecordWalk:
 
     def _lost(self, offset: int, rest: int) -> bool:
         """Say that here is no record; tell whether there is a place to go on from."""
-        following = next(iter(self._places[bisect.bisect_right(self._places, offset) :]), None)
+        following = next(iter(self._offsets[bisect.bisect_right(self._offsets, offset) :]), None)
         if following is None:
             following = self._search(offset + 1)
         if following is None and not self._finished and rest < _CUT:

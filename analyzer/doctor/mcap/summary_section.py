@@ -56,7 +56,7 @@ class SummarySection:
         self._last = 0
         self._offsets: list[tuple[int, SummaryOffset]] = []
         self._copies: dict[type, dict[int, McapRecord]] = {Schema: {}, Channel: {}}
-        self._unseen = {opcode: dict(places) for opcode, places in data.places.items()}
+        self._unseen = {opcode: dict(places) for opcode, places in data.expected_indexes.items()}
         self._indexed: set[int] = set()  # channels of which the chunk indexes speak
         self._statistics: list[tuple[int, Statistics]] = []
         self._crc = 0
@@ -154,7 +154,7 @@ class SummarySection:
         expected = self._unseen[record.opcode].pop(offset, None)
         if expected is None:
             thing = _THINGS[Opcode(record.opcode)]
-            if offset in self._data.places[record.opcode]:
+            if offset in self._data.expected_indexes[record.opcode]:
                 what = f"a second {name_of(record.opcode)} for the {thing} at byte {offset}"
                 self._error("index-twice", what, record.offset)
             elif self._whole:
@@ -211,9 +211,9 @@ class SummarySection:
             "message_count": sum(data.counts.values()),
             "schema_count": len(schemas),
             "channel_count": len(channels),
-            "attachment_count": len(data.places[Opcode.ATTACHMENT_INDEX]),
-            "metadata_count": len(data.places[Opcode.METADATA_INDEX]),
-            "chunk_count": len(data.places[Opcode.CHUNK_INDEX]),
+            "attachment_count": len(data.expected_indexes[Opcode.ATTACHMENT_INDEX]),
+            "metadata_count": len(data.expected_indexes[Opcode.METADATA_INDEX]),
+            "chunk_count": len(data.expected_indexes[Opcode.CHUNK_INDEX]),
             "message_start_time": start,
             "message_end_time": end,
         }
