@@ -91,7 +91,7 @@ def as_columns_between(path: Path, _folder: Path) -> None:
 
 
 def summarised(path: Path, _folder: Path) -> None:
-    from hearthlog.analyzer.logs.summary import summarise  # noqa: PLC0415
+    from hearthlog.analyzer.logs.summarise import summarise  # noqa: PLC0415
 
     summarise([path])
 
