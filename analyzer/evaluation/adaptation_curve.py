@@ -26,17 +26,10 @@ _SHUFFLES = 3
 
 
 class Curve(NamedTuple):
-    """Macro F1 against the number of corrected segments.
-
-    Attributes
-    ----------
-    corrected : tuple of int
-    collections : dict of str to list of float
-        Of each collection that was left out, over the classes that it has.
-    mean : list of float
-    """
+    """Macro F1 against the number of corrected segments."""
 
     corrected: tuple[int, ...]
+    # of each collection that was left out, over the classes that it has
     collections: dict[str, list[float]]
     mean: list[float]
 

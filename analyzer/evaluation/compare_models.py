@@ -26,47 +26,25 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Judged:
-    """One of the models.
-
-    Attributes
-    ----------
-    name, sha256 : str
-    scores : Scores
-    expected_calibration_error : float
-    sources_learned : int
-        Sources of the data that it has learned from.
-    """
+    """One of the models."""
 
     name: str
     sha256: str
     scores: Scores
     expected_calibration_error: float
-    sources_learned: int
+    sources_learned: int  # sources of the data that it has learned from
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of it.
-
-    Attributes
-    ----------
-    a, b : Judged
-    difference : F1Difference
-        Macro F1 of b minus that of a.
-    sources_left_out : int
-        One of the models has learned from these.
-    held_out : bool
-        False if there are no others, and all were used.
-    skipped : dict of str to int
-        Why recordings gave no segment, and how many.
-    """
+    """What came of it."""
 
     a: Judged
     b: Judged
-    difference: F1Difference
-    sources_left_out: int
-    held_out: bool
-    skipped: Mapping[str, int]
+    difference: F1Difference  # macro F1 of b minus that of a
+    sources_left_out: int  # one of the models has learned from these
+    held_out: bool  # false if there are no others, and all were used
+    skipped: Mapping[str, int]  # why recordings gave no segment, and how many
 
     @property
     def clear(self) -> bool:

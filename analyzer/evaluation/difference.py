@@ -20,18 +20,11 @@ _MINUTE = 60 * NANOSECONDS
 
 
 class Runs(NamedTuple):
-    """Time in which both labels stay what they are.
+    """Time in which both labels stay what they are."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-    a, b : np.ndarray [shape=(n,)], int64
-        Indices of classes.
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,)
     ends: Int64
-    a: Int64
+    a: Int64  # shape (n,), indices of classes
     b: Int64
 
     def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Runs":
@@ -41,77 +34,40 @@ class Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassAmounts:
-    """How much of a class each side has in the time that both label.
-
-    Attributes
-    ----------
-    minutes_a, minutes_b, minutes_both : float
-        The last: where both sides say so.
-    events_a, events_b : int
-        Segments.
-    """
+    """How much of a class each side has in the time that both label."""
 
     minutes_a: float
     minutes_b: float
-    minutes_both: float
-    events_a: int
+    minutes_both: float  # where both sides have it
+    events_a: int  # segments
     events_b: int
 
 
 @dataclass(frozen=True)
 class Amounts:
-    """Agreement in some time that both label.
-
-    Attributes
-    ----------
-    minutes : float
-    agreement : float
-        Share of it in which both say the same.
-    kappa : float or None
-        Cohen's; None where both say the same single class throughout.
-    per_class : dict of str to ClassAmounts
-        Of the classes that occur.
-    """
+    """Agreement in some time that both label."""
 
     minutes: float
-    agreement: float
-    kappa: float | None
-    per_class: dict[str, ClassAmounts]
+    agreement: float  # share of it in which both say the same
+    kappa: float | None  # Cohen's; None where both say the same single class throughout
+    per_class: dict[str, ClassAmounts]  # of the classes that occur
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Two labellings compared.
+    """Two labellings compared."""
 
-    Attributes
-    ----------
-    a, b : str
-        Their names.
-    minutes_a, minutes_b : float
-        What each labels.
-    only_a, only_b : list of str
-        Classes that the other does not know.
-    classes : list of str
-    total : Amounts
-    confusion : list of list of float
-        Minutes; the classes of a in rows, those of b in columns.
-    days : dict of str to Amounts
-        By UTC day; an event belongs to the day it begins in.
-    disagreements : Runs
-        Where they differ, longest first.
-    """
-
-    a: str
+    a: str  # name of the first labelling
     b: str
-    minutes_a: float
+    minutes_a: float  # what the first labels
     minutes_b: float
-    only_a: list[str]
+    only_a: list[str]  # classes that the other does not know
     only_b: list[str]
     classes: list[str]
     total: Amounts
-    confusion: list[list[float]]
-    days: dict[str, Amounts]
-    disagreements: Runs
+    confusion: list[list[float]]  # minutes; the classes of a in rows, those of b in columns
+    days: dict[str, Amounts]  # by UTC day; an event belongs to the day it begins in
+    disagreements: Runs  # where they differ, longest first
 
 
 def compare_sides(a: NamedLabelling, b: NamedLabelling) -> Difference:

@@ -34,29 +34,17 @@ _LATEST = 1 << 62  # nanoseconds
 
 @dataclass(frozen=True)
 class Comparison:
-    """How a labelled log fits a reference.
+    """How a labelled log fits a reference."""
 
-    Attributes
-    ----------
-    scores : Scores
-        Of frames of 50 ms; the groups are blocks of five minutes, or more in long references.
-    detections : Detections
-    reference_seconds : float
-        What the reference labels.
-    evaluated_seconds : float
-        What of it the log has labelled too.
-    ambiguous_seconds : float
-        What of that has two labels in the reference; no part of the scores of frames.
-    unknown_labels : dict of str to float
-        Labels of the reference that the log does not know, and for how many evaluated seconds; no
-        part of the scores of frames. Whatever is predicted there is a false alarm.
-    """
-
+    # of frames of 50 ms; the groups are blocks of five minutes, or more in long references
     scores: Scores
     detections: Detections
-    reference_seconds: float
-    evaluated_seconds: float
+    reference_seconds: float  # what the reference labels
+    evaluated_seconds: float  # what of it the log has labelled too
+    # what of that has two labels in the reference; no part of the scores of frames
     ambiguous_seconds: float
+    # labels of the reference that the log does not know, and for how many evaluated seconds; no
+    # part of the scores of frames; whatever is predicted there is a false alarm
     unknown_labels: Mapping[str, float]
 
 

@@ -25,15 +25,7 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """How good a way to learn is.
-
-    Attributes
-    ----------
-    folds : int
-    scores : Scores
-    expected_calibration_error : float
-    reliability : list of Bin
-    """
+    """How good a way to learn is."""
 
     folds: int
     scores: Scores

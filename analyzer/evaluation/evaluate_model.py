@@ -22,32 +22,17 @@ from hearthlog.schemas.times import NANOSECONDS
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good a model is on labelled clips.
+    """How good a model is on labelled clips."""
 
-    Attributes
-    ----------
-    scores : Scores
-        Of segments of a second; the groups are the source groups.
-    expected_calibration_error : float
-    reliability : list of Bin
-    detections : Detections
-        Each clip is a recording with one event, its label from the first frame that the model
-        labels to the last.
-    evaluated_seconds : float
-        Of what the detections are about.
-    skipped : dict of str to int
-        Why clips gave no segment, and how many.
-    learned_from : bool
-        Whether the model learned from just these segments.
-    """
-
-    scores: Scores
+    scores: Scores  # of segments of a second; the groups are the source groups
     expected_calibration_error: float
     reliability: list[Bin]
+    # each clip is a recording with one event, its label from the first frame that the model
+    # labels to the last
     detections: Detections
-    evaluated_seconds: float
-    skipped: Mapping[str, int]
-    learned_from: bool
+    evaluated_seconds: float  # of what the detections are about
+    skipped: Mapping[str, int]  # why clips gave no segment, and how many
+    learned_from: bool  # whether the model learned from just these segments
 
 
 def evaluate_model(

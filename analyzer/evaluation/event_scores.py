@@ -29,19 +29,11 @@ _MOST_PAIRS = 20_000_000
 
 @dataclass(frozen=True)
 class Events:
-    """Labelled spans; those of different labels may overlap.
+    """Labelled spans; those of different labels may overlap."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        Nanoseconds; every end is after its start.
-    labels : np.ndarray [shape=(n,)], int64
-        Indices of classes.
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,), nanoseconds; every end is after its start
     ends: Int64
-    labels: Int64
+    labels: Int64  # shape (n,), indices of classes
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -64,55 +56,33 @@ def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
 
 @dataclass(frozen=True)
 class Detection:
-    """How well something was detected; None where it has no meaning.
-
-    Attributes
-    ----------
-    precision, recall, f1 : float or None
-    reference, found : int
-        How many seconds, or events, there are in the reference and in the prediction.
-    """
+    """How well something was detected; None where it has no meaning."""
 
     precision: float | None
     recall: float | None
     f1: float | None
-    reference: int
-    found: int
+    reference: int  # seconds, or events, of the reference
+    found: int  # those of the prediction
 
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """How well the classes were detected.
+    """How well the classes were detected."""
 
-    Attributes
-    ----------
-    f1, precision, recall : float or None
-        Of all classes counted together.
-    macro_f1 : float or None
-        Mean over the classes of the reference.
-    per_class : dict of str to Detection
-    """
-
-    f1: float | None
+    f1: float | None  # of all classes counted together
     precision: float | None
     recall: float | None
-    macro_f1: float | None
+    macro_f1: float | None  # mean over the classes of the reference
     per_class: dict[str, Detection]
 
 
 @dataclass(frozen=True)
 class Detections:
-    """How well events were detected in some time.
-
-    Attributes
-    ----------
-    segment_based, event_based : DetectionScores
-    false_alarms_per_day : dict of str to float
-        Events of a class that overlap none of that class in the reference, for 24 hours.
-    """
+    """How well events were detected in some time."""
 
     segment_based: DetectionScores
     event_based: DetectionScores
+    # events of a class that overlap none of that class in the reference, for 24 hours
     false_alarms_per_day: dict[str, float]
 
 

@@ -22,17 +22,10 @@ _TAIL = 60 * NANOSECONDS
 
 @dataclass(frozen=True)
 class Coverage:
-    """When a microphone was recording, by its frames.
+    """When a microphone was recording, by its frames."""
 
-    Attributes
-    ----------
-    logs : list of Path
-        In the order of time.
-    starts, ends : list of int
-        Of the frames of each, in nanoseconds of UTC; they ascend, and do not overlap.
-    """
-
-    logs: Sequence[Path]
+    logs: Sequence[Path]  # in the order of time
+    # of the frames of each, in nanoseconds of UTC; they ascend, and do not overlap
     starts: Sequence[int]
     ends: Sequence[int]
 

@@ -20,38 +20,21 @@ _TAIL = 60 * NANOSECONDS  # of a day that may be missing from a whole one
 
 
 class HomeLog(NamedTuple):
-    """A log or a layer.
-
-    Attributes
-    ----------
-    path : Path
-    node : str
-    layer : str
-        Empty for a log, else `review` or `relabel-<model>`.
-    start, end : int
-        What it says is of this span (ns of UTC); what ends later may have begun in it.
-    """
+    """A log or a layer."""
 
     path: Path
     node: str
-    layer: str
-    start: int
+    layer: str  # empty for a log, else `review` or `relabel-<model>`
+    start: int  # what it says is of this span (ns of UTC); what ends later may have begun in it
     end: int
 
 
 @dataclass(frozen=True)
 class HomeLogs:
-    """The logs of a home with their layers, in the order of time.
-
-    Attributes
-    ----------
-    entries : list of HomeLog
-    losses : list of str
-        What cannot be read, and why.
-    """
+    """The logs of a home with their layers, in the order of time."""
 
     entries: Sequence[HomeLog]
-    losses: Sequence[str]
+    losses: Sequence[str]  # what cannot be read, and why
 
     def between(self, start: int, end: int, layer: str = "") -> list[HomeLog]:
         """List the logs, or the layers of one name, that may speak of a span of time."""

@@ -24,18 +24,11 @@ MOST_CLASSES = 100
 
 @dataclass(frozen=True)
 class Labelling:
-    """Spans of time and their labels.
+    """Spans of time and their labels."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        Nanoseconds of UTC; every end is after its start.
-    labels : np.ndarray [shape=(n,)] of str
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,), nanoseconds of UTC; every end is after its start
     ends: Int64
-    labels: NDArray[np.object_]
+    labels: NDArray[np.object_]  # shape (n,)
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -48,22 +41,12 @@ class Labelling:
 
 @dataclass(frozen=True)
 class TopicLabelling:
-    """The labelling that some logs have on a topic of segments.
-
-    Attributes
-    ----------
-    topic : str
-    classes : tuple of str
-        The labels there may be.
-    labelling : Labelling
-    unfinished : tuple of Path
-        Logs that were not completed.
-    """
+    """The labelling that some logs have on a topic of segments."""
 
     topic: str
-    classes: tuple[str, ...]
+    classes: tuple[str, ...]  # the labels there may be
     labelling: Labelling
-    unfinished: tuple[Path, ...]
+    unfinished: tuple[Path, ...]  # logs that were not completed
 
     @property
     def microphone(self) -> str:

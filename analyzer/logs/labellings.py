@@ -39,44 +39,22 @@ _EVER = 1 << 62  # nanoseconds
 
 
 class LabelledLog(NamedTuple):
-    """A log or a layer, and what labels it has.
-
-    Attributes
-    ----------
-    path : Path
-    first, last : int
-        LabelledLog times in nanoseconds.
-    complete : bool
-    segments : frozenset of str
-        Topics of segments.
-    classes : dict of str to list of str
-        By topic of labels: the names of their probabilities.
-    """
+    """A log or a layer, and what labels it has."""
 
     path: Path
-    first: int
+    first: int  # log times in nanoseconds
     last: int
     complete: bool
-    segments: frozenset[str]
-    classes: Mapping[str, Sequence[str]]
+    segments: frozenset[str]  # topics of segments
+    classes: Mapping[str, Sequence[str]]  # by topic of labels: the names of their probabilities
 
 
 class NamedLabelling(NamedTuple):
-    """One labelling of one microphone.
+    """One labelling of one microphone."""
 
-    Attributes
-    ----------
-    name : str
-        `live`, `review`, or `relabel/<model>`.
-    classes : tuple of str
-        The labels that there may be.
-    labelling : Labelling
-        In the order of time, one label at a time.
-    """
-
-    name: str
-    classes: tuple[str, ...]
-    labelling: Labelling
+    name: str  # `live`, `review`, or `relabel/<model>`
+    classes: tuple[str, ...]  # the labels that there may be
+    labelling: Labelling  # in the order of time, one label at a time
 
     def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
         """Give classes that are among some by another name the name that they have there."""
@@ -87,18 +65,10 @@ class NamedLabelling(NamedTuple):
 
 @dataclass
 class Labellings:
-    """The labellings of a log, or of a folder of logs.
+    """The labellings of a log, or of a folder of logs."""
 
-    Attributes
-    ----------
-    logs : list of LabelledLog
-        With their layers, in the order of time.
-    losses : list of str
-        What could not be used, and why.
-    """
-
-    logs: Sequence[LabelledLog]
-    losses: list[str] = field(default_factory=list)
+    logs: Sequence[LabelledLog]  # with their layers, in the order of time
+    losses: list[str] = field(default_factory=list)  # what could not be used, and why
 
     def microphone(self, name: str | None) -> str:
         """Return the only microphone, or the named one if there is one of this name."""

@@ -19,39 +19,20 @@ _DAYS = "[0-9]*/[0-9]*/[0-9]*/*"
 
 
 class TimedFile(NamedTuple):
-    """A log or a layer that has messages.
-
-    Attributes
-    ----------
-    path : Path
-    first, last : int
-        Log times in nanoseconds.
-    size : int
-        Bytes, as stored.
-    layer : str
-        As `LogName.layer`.
-    """
+    """A log or a layer that has messages."""
 
     path: Path
-    first: int
+    first: int  # log times in nanoseconds
     last: int
-    size: int
-    layer: str
+    size: int  # bytes, as stored
+    layer: str  # as `LogName.layer`
 
 
 class Chain(NamedTuple):
-    """The logs of a node of a home.
+    """The logs of a node of a home."""
 
-    Attributes
-    ----------
-    logs : list of Path
-        In the order of time; the last may still be being written.
-    asked : dict of int to Path
-        Those that were asked for, by their places.
-    """
-
-    logs: Sequence[Path]
-    asked: Mapping[int, Path]
+    logs: Sequence[Path]  # in the order of time; the last may still be being written
+    asked: Mapping[int, Path]  # those that were asked for, by their places
 
 
 def with_layers(path: Path) -> list[Path]:

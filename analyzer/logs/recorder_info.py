@@ -47,36 +47,21 @@ class Configuration(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class RecorderInfo:
-    """What a log says of the recorder that wrote it.
-
-    Attributes
-    ----------
-    path : Path
-    complete : bool
-        Whether the log is finished.
-    node, microphone : str
-    device, feature_set, model, model_sha256 : str
-        As in `AudioStreamInfo`; empty where the log does not say.
-    configuration : Configuration
-    metadata : mapping of str to str
-        The `hearthlog` record.
-    attachments : sequence of Attachment
-    first_frame : (int, int) or None
-        Number and time of the first frame of its features; None if they are not wanted, or it has
-        none.
-    """
+    """What a log says of the recorder that wrote it."""
 
     path: Path
-    complete: bool
+    complete: bool  # whether the log is finished
     node: str
     microphone: str
-    device: str
+    device: str  # as in `AudioStreamInfo`; empty where the log does not say
     feature_set: str
     model: str
     model_sha256: str
     configuration: Configuration
-    metadata: Mapping[str, str]
+    metadata: Mapping[str, str]  # the `hearthlog` record
     attachments: Sequence[Attachment]
+    # number and time of the first frame of its features; None if they are not wanted, or it has
+    # none
     first_frame: tuple[int, int] | None
 
 

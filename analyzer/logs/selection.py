@@ -29,37 +29,18 @@ Described = tuple[Channel, Schema | None]
 
 @dataclass(frozen=True)
 class Selection:
-    """Topics and a span of time of some logs.
+    """Topics and a span of time of some logs."""
 
-    Attributes
-    ----------
-    logs : list of Path
-        Those with messages in the span.
-    earlier : list of Path
-        Those with messages before it, the last first.
-    unfinished : list of Path
-        Those of `logs` that were not completed.
-    channels : dict of str to list of (Channel, Schema or None)
-        By topic, equal ones once.
-    metadata : list of dict of str to str
-        The `hearthlog` records of the logs; equal ones are there once.
-    topics : frozenset of str or None
-        None for all.
-    start, end : int or None
-        Log times in nanoseconds: from `start` on, before `end`.
-    span : (int, int)
-        In which the messages are.
-    """
-
-    logs: Sequence[Path]
-    earlier: Sequence[Path]
-    unfinished: Sequence[Path]
-    channels: Mapping[str, Sequence[Described]]
+    logs: Sequence[Path]  # those with messages in the span
+    earlier: Sequence[Path]  # those with messages before it, the last first
+    unfinished: Sequence[Path]  # those of `logs` that were not completed
+    channels: Mapping[str, Sequence[Described]]  # by topic, equal ones once
+    # the `hearthlog` records of the logs; equal ones are there once
     metadata: Sequence[Mapping[str, str]]
-    topics: frozenset[str] | None
-    start: int | None
+    topics: frozenset[str] | None  # None: all
+    start: int | None  # log times in nanoseconds: from `start` on, before `end`
     end: int | None
-    span: tuple[int, int]
+    span: tuple[int, int]  # log times of the first and the last message
 
     def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
         """Read the messages as `iterate_messages` does, and report the share that is done."""

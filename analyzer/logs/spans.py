@@ -12,14 +12,9 @@ Rows = NDArray[np.intp]
 
 
 class Spans(NamedTuple):
-    """Spans of time in nanoseconds of UTC; they ascend and do not overlap.
+    """Spans of time in nanoseconds of UTC; they ascend and do not overlap."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,)
     ends: Int64
 
     @property
@@ -41,17 +36,12 @@ class Timed(Protocol):
 
 
 class Overlay(NamedTuple):
-    """Time in which nothing begins or ends.
+    """Time in which nothing begins or ends."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-    rows : np.ndarray [shape=(m, n)], int64
-        For each of what was laid over each other the row of its span; -1 where it has none.
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,)
     ends: Int64
+    # shape (m, n), for each of what was laid over each other the row of its span; -1 where it has
+    # none
     rows: Int64
 
     def in_all(self) -> "Overlay":

@@ -13,25 +13,14 @@ Span = tuple[int, int]
 
 @dataclass
 class TopicSummary:
-    """One topic.
+    """One topic."""
 
-    Attributes
-    ----------
-    type : str
-        Empty if there is no schema.
-    encoding : str
-        Of its messages.
-    messages : int
-    bytes : int or None
-        Of their payloads before compression; None if the messages were counted by an index.
-    span : (int, int) or None
-        First and last log time; by an index, those of the chunks that hold it.
-    """
-
-    type: str
-    encoding: str
+    type: str  # empty if there is no schema
+    encoding: str  # of its messages
     messages: int = 0
+    # of payloads before compression; None if the messages were counted by an index
     bytes: int | None = 0
+    # first and last log time; by an index, those of the chunks that hold it
     span: Span | None = None
 
     @property
@@ -60,57 +49,30 @@ class GapSummary:
 
 @dataclass
 class Summary:
-    """What was found in some logs.
+    """What is in some logs."""
 
-    Attributes
-    ----------
-    files : list of Path
-        Those that could be read.
-    unfinished : list of Path
-        Those of them that are still being written, or were cut short.
-    layers : list of Path
-        Those of them that speak about another log.
-    damaged : dict of Path to str
-        What is wrong with the others.
-    size : int
-        Bytes on disk.
-    chunks, chunk_bytes, raw_bytes : int
-        Number of chunks, their bytes on disk and before compression.
-    profiles, libraries, attachments, metadata : set of str
-        Names that occur in the files.
-    schema_versions : set of str
-        As their `hearthlog` records say.
-    topics : dict of str to TopicSummary
-    label_seconds : dict of str to dict of str to float
-        By microphone and label. The labels of a layer are under the name of its topic.
-    segments : dict of str to dict of str to int
-        Their number, likewise.
-    gaps : list of GapSummary
-    streams : list of dict
-        What the files say of themselves: microphone, device, feature set, model.
-    health : Status or None
-        The worst that was said, and of that the last.
-    """
-
-    files: list[Path] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)  # those that could be read
+    # those that are still being written, or were cut short
     unfinished: list[Path] = field(default_factory=list)
-    layers: list[Path] = field(default_factory=list)
-    damaged: dict[Path, str] = field(default_factory=dict)
-    size: int = 0
+    layers: list[Path] = field(default_factory=list)  # those that speak of another log
+    damaged: dict[Path, str] = field(default_factory=dict)  # what is wrong with the others
+    size: int = 0  # bytes on disk
     chunks: int = 0
-    chunk_bytes: int = 0
-    raw_bytes: int = 0
-    profiles: set[str] = field(default_factory=set)
+    chunk_bytes: int = 0  # on disk
+    raw_bytes: int = 0  # before compression
+    profiles: set[str] = field(default_factory=set)  # names that occur in the files
     libraries: set[str] = field(default_factory=set)
     attachments: set[str] = field(default_factory=set)
     metadata: set[str] = field(default_factory=set)
-    schema_versions: set[str] = field(default_factory=set)
+    schema_versions: set[str] = field(default_factory=set)  # as their `hearthlog` records say
     topics: dict[str, TopicSummary] = field(default_factory=dict)
+    # by microphone and label; those of a layer are under the name of its topic
     label_seconds: dict[str, Counter[str]] = field(default_factory=dict)
-    segments: dict[str, Counter[str]] = field(default_factory=dict)
+    segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number, likewise
     gaps: list[GapSummary] = field(default_factory=list)
+    # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
-    health: Status | None = None
+    health: Status | None = None  # the worst that was said, and of that the last
 
     @property
     def span(self) -> Span | None:

@@ -38,18 +38,10 @@ _BIN, _BUSY = 10 * _MINUTE, _MINUTE
 
 
 class Events(NamedTuple):
-    """What happened, by when it began.
+    """What happened, by when it began."""
 
-    Attributes
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC; they ascend.
-    chances : np.ndarray [shape=(n,)], float64
-        That it happened.
-    """
-
-    starts: Int64
-    chances: NDArray[np.float64]
+    starts: Int64  # shape (n,), in nanoseconds of UTC; they ascend
+    chances: NDArray[np.float64]  # shape (n,), of each that it happened
 
     def between(self, spans: Spans) -> "Events":
         """Leave those that began in some spans of time."""
@@ -68,29 +60,15 @@ class Events(NamedTuple):
 
 @dataclass(frozen=True)
 class Home:
-    """What was heard in a home, by all its microphones together.
-
-    Attributes
-    ----------
-    classes : list of str
-    coverage : Spans
-        When at least one of them heard.
-    listened : dict of str to Spans
-        By class: when at least one of them heard whose model knows it.
-    sound : Spans
-        When at least one of them heard something else than silence.
-    spans : dict of str to Spans
-        By class: when at least one of them heard it.
-    events : dict of str to Events
-        By class, but silence. Spans with no more than ten seconds between them are one event,
-        and so are those of two microphones at one time.
-    """
+    """What was heard in a home, by all its microphones together."""
 
     classes: list[str]
-    coverage: Spans
-    listened: dict[str, Spans]
-    sound: Spans
-    spans: dict[str, Spans]
+    coverage: Spans  # when at least one of them heard
+    listened: dict[str, Spans]  # by class: when at least one of them heard whose model knows it
+    sound: Spans  # when at least one of them heard something else than silence
+    spans: dict[str, Spans]  # by class: when at least one of them heard it
+    # by class, but silence; spans with no more than ten seconds between them are one event, and
+    # so are those of two microphones at one time
     events: dict[str, Events]
 
     def between(self, start: int, end: int) -> "Home":
@@ -142,25 +120,14 @@ def _events(starts: Int64, ends: Int64, chances: NDArray[np.float64]) -> Events:
 
 @dataclass(frozen=True)
 class Day:
-    """The figures of one day, and of the night that ends on it.
-
-    Attributes
-    ----------
-    day : date
-    home : Home
-    zone : tzinfo
-    span, night : Spans
-        One span each, in nanoseconds of UTC.
-    coverage : Spans
-        What of the day was heard.
-    """
+    """The figures of one day, and of the night that ends on it."""
 
     day: date
     home: Home
     zone: tzinfo
-    span: Spans
+    span: Spans  # a single span, as the night is
     night: Spans
-    coverage: Spans
+    coverage: Spans  # what of the day was heard
 
     @property
     def share(self) -> float:

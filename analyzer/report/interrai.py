@@ -24,27 +24,13 @@ DAYS = 3
 
 
 class Item(NamedTuple):
-    """One question.
+    """One question."""
 
-    Attributes
-    ----------
-    topic : str
-        What the assessment asks about.
-    heard : str
-        What is counted.
-    needs : str
-        The class that must be known; empty if any sound will do.
-    value : callable
-        Counts it on one day.
-    limits : str
-        What sound cannot tell.
-    """
-
-    topic: str
-    heard: str
-    needs: str
-    value: Callable[[Day], Count | Minutes | None]
-    limits: str
+    topic: str  # what the assessment asks about
+    heard: str  # what is counted
+    needs: str  # the class that must be known; empty if any sound will do
+    value: Callable[[Day], Count | Minutes | None]  # counts it on one day
+    limits: str  # what sound cannot tell
 
 
 def _several(name: str) -> str:

@@ -42,30 +42,18 @@ Source = tuple[str, str]  # node, microphone
 
 @dataclass
 class HomeData:
-    """What the logs of a home say.
+    """What the logs of a home say."""
 
-    Attributes
-    ----------
-    segments : dict of (str, str) to Segments
-        By node and microphone.
-    classes : dict of (str, str) to list of str
-        By node and microphone: the classes that there may be.
-    gaps, troubles : list of Trouble
-        In the part of time that was to be looked at closely.
-    precisions : dict of str to float
-        How often the model was right with a class, by its own figures.
-    nodes : list of str
-    losses : list of str
-        What could not be read, and why.
-    """
-
-    segments: dict[Source, Segments] = field(default_factory=dict)
+    segments: dict[Source, Segments] = field(default_factory=dict)  # by node and microphone
+    # by node and microphone: the classes that there may be
     classes: dict[Source, list[str]] = field(default_factory=dict)
+    # in the part of time that was to be looked at closely
     gaps: list[Trouble] = field(default_factory=list)
     troubles: list[Trouble] = field(default_factory=list)
+    # how often the model was right with a class, by its own figures
     precisions: dict[str, float] = field(default_factory=dict)
     nodes: list[str] = field(default_factory=list)
-    losses: list[str] = field(default_factory=list)
+    losses: list[str] = field(default_factory=list)  # what could not be read, and why
 
     def lose(self, line: str) -> None:
         """Note what could not be read."""

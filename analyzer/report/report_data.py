@@ -23,40 +23,20 @@ _CHANGES = {
 
 @dataclass(frozen=True)
 class Account:
-    """What a page tells.
-
-    Attributes
-    ----------
-    nodes, microphones : list of str
-    labelling : str
-        `live`, or the name of a model.
-    zone : tzinfo
-    days : list of Day
-        One, or seven.
-    before : list of Day
-        The days before them that belong to what is asked about three days.
-    earlier : list of Day
-        Those that they are compared with.
-    unheard : dict of str to float
-        By microphone: hours in which it heard nothing.
-    gaps, troubles : list of Trouble
-    precisions : mapping of str to float
-    unread : int
-        How many logs could not be read, or only in part.
-    """
+    """What a page tells."""
 
     nodes: Sequence[str]
     microphones: Sequence[str]
-    labelling: str
+    labelling: str  # `live`, or the name of a model
     zone: tzinfo
-    days: Sequence[Day]
-    before: Sequence[Day]
-    earlier: Sequence[Day]
-    unheard: Mapping[str, float]
+    days: Sequence[Day]  # one, or seven
+    before: Sequence[Day]  # the days before them that belong to what is asked about three days
+    earlier: Sequence[Day]  # those that they are compared with
+    unheard: Mapping[str, float]  # by microphone: hours in which it heard nothing
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
     precisions: Mapping[str, float]
-    unread: int
+    unread: int  # how many logs could not be read, or only in part
 
     @property
     def home(self) -> str:

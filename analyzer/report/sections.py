@@ -12,27 +12,13 @@ BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 
 
 class Figure(NamedTuple):
-    """One figure of a day.
+    """One figure of a day."""
 
-    Attributes
-    ----------
-    title : str
-        In a table of one day.
-    short : str
-        As the head of a column.
-    value : callable
-        Finds it; None where it cannot be known.
-    name : str
-        The class that it is about, if it is about one.
-    sums : bool
-        Whether a total over days means something.
-    """
-
-    title: str
-    short: str
-    value: Callable[[Day], Value | None]
-    name: str = ""
-    sums: bool = True
+    title: str  # in a table of one day
+    short: str  # as the head of a column
+    value: Callable[[Day], Value | None]  # finds it; None where it cannot be known
+    name: str = ""  # the class that it is about, if it is about one
+    sums: bool = True  # whether a total over days means something
 
 
 class Section(NamedTuple):

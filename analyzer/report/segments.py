@@ -15,21 +15,12 @@ from hearthlog.schemas.logs.columns import Columns, join
 
 
 class Segments(NamedTuple):
-    """The segments of one microphone, in the order of time.
+    """The segments of one microphone, in the order of time."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC; they do not overlap.
-    labels : np.ndarray [shape=(n,)], str objects
-    confidences : np.ndarray [shape=(n,)], float64
-        1 where a person said it.
-    """
-
-    starts: Int64
+    starts: Int64  # shape (n,), in nanoseconds of UTC; they do not overlap
     ends: Int64
-    labels: NDArray[Any]
-    confidences: NDArray[np.float64]
+    labels: NDArray[Any]  # shape (n,)
+    confidences: NDArray[np.float64]  # shape (n,), 1 where a person said it
 
     @property
     def spans(self) -> Spans:

@@ -11,19 +11,11 @@ _WIDTH = 1.645  # standard deviations: nine times in ten the number is within
 
 @dataclass(frozen=True)
 class Count:
-    """A number of events, each of which may have been none.
+    """A number of events, each of which may have been none."""
 
-    Attributes
-    ----------
-    expected, variance : float
-        Of a Poisson binomial distribution: the sums of p and of p (1 - p).
-    certain, marked : int
-        How many a person has confirmed, and how many there are if all were right.
-    """
-
-    expected: float = 0.0
-    variance: float = 0.0
-    certain: int = 0
+    expected: float = 0.0  # sum of p: mean of a Poisson binomial distribution
+    variance: float = 0.0  # sum of p (1 - p)
+    certain: int = 0  # how many a person has confirmed
     marked: int = 0
 
     def __add__(self, other: "Count") -> "Count":

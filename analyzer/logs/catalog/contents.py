@@ -33,40 +33,22 @@ _LONGEST = 1000  # characters of what a log says of itself
 
 @dataclass
 class Contents:
-    """What a log holds.
+    """What a log holds."""
 
-    Attributes
-    ----------
-    complete : bool
-        Whether it was finished.
-    span : (int, int) or None
-        First and last log time.
-    record : dict of str to str
-        What its `hearthlog` records say, so far as they agree.
-    microphones : list of str
-    frames : int
-        Messages of features.
-    first, last : (int, int) or None
-        Number and stamp of the first and of the last frame; None where there are no features, or
-        those of several microphones.
-    gaps, gap_seconds : int, float
-    seconds : Counter of str
-        By label, of its segments.
-    segments : Counter of str
-        Their number, by label.
-    """
-
-    complete: bool
-    span: tuple[int, int] | None
+    complete: bool  # whether it was finished
+    span: tuple[int, int] | None  # first and last log time
+    # what its `hearthlog` records say, so far as they agree
     record: dict[str, str] = field(default_factory=dict)
     microphones: list[str] = field(default_factory=list)
-    frames: int = 0
+    frames: int = 0  # messages of features
+    # number and stamp of the first and of the last frame; None where there are no features, or
+    # those of several microphones
     first: tuple[int, int] | None = None
     last: tuple[int, int] | None = None
     gaps: int = 0
     gap_seconds: float = 0.0
-    seconds: Counter[str] = field(default_factory=Counter)
-    segments: Counter[str] = field(default_factory=Counter)
+    seconds: Counter[str] = field(default_factory=Counter)  # by label, of its segments
+    segments: Counter[str] = field(default_factory=Counter)  # their number, by label
 
 
 def read_contents(path: Path, labelling: str) -> Contents:

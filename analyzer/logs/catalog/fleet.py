@@ -18,29 +18,16 @@ _LABELLING = ("home", "kind", "model")
 
 @dataclass(frozen=True)
 class Home:
-    """The files of one home.
-
-    Attributes
-    ----------
-    home : str
-    logs, layers, unfinished, damaged : int
-    size : int
-        Bytes.
-    frames : int
-        Of the logs.
-    start, end : int or None
-        First and last log time of the logs.
-    gaps, gap_seconds : int, float
-    """
+    """The files of one home."""
 
     home: str
     logs: int
     layers: int
     unfinished: int
     damaged: int
-    size: int
-    frames: int
-    start: int | None
+    size: int  # bytes
+    frames: int  # of the logs
+    start: int | None  # first and last log time of the logs
     end: int | None
     gaps: int
     gap_seconds: float
@@ -53,20 +40,10 @@ class Home:
 
 @dataclass(frozen=True)
 class LabelAmount:
-    """How much of a label there is in one home.
-
-    Attributes
-    ----------
-    home : str
-    kind : str
-        Of the files that say so: `log`, `relabel`, `review`.
-    model : str or None
-    label : str
-    minutes, segments : float, int
-    """
+    """How much of a label there is in one home."""
 
     home: str
-    kind: str
+    kind: str  # of the files that say so: `log`, `relabel`, `review`
     model: str | None
     label: str
     minutes: float
