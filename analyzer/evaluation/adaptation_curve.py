@@ -39,8 +39,6 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve
 
     Parameters
     ----------
-    data : Dataset
-    method : Method
     progress : callable
         Told the share of the fits that is done.
 

@@ -62,8 +62,6 @@ def compare_models(
 
     Parameters
     ----------
-    a, b : Model
-    recordings : iterable of Recording
     scenario : Scenario
         With the classes of both.
 

@@ -42,8 +42,6 @@ def evaluate_model(
 
     Parameters
     ----------
-    model : Model
-    clips : sequence of LabelledClip
     scenario : Scenario
         With the classes of the model.
     progress : callable

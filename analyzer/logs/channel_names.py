@@ -25,8 +25,6 @@ def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, 
     ----------
     path : Path
         Of the log, for the message.
-    columns : Columns
-    field : str
 
     Raises
     ------

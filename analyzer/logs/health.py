@@ -83,7 +83,6 @@ def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple
     ----------
     texts : sequence of (int, str or None)
         When something was said, in the order of time; None is nothing.
-    end : int
 
     Yields
     ------

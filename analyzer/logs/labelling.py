@@ -24,11 +24,18 @@ MOST_CLASSES = 100
 
 @dataclass(frozen=True)
 class Labelling:
-    """Spans of time and their labels."""
+    """Spans of time and their labels.
 
-    starts: Int64  # shape (n,), nanoseconds of UTC; every end is after its start
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Nanoseconds of UTC; every end is after its start.
+    labels : np.ndarray [shape=(n,)] of str
+    """
+
+    starts: Int64
     ends: Int64
-    labels: NDArray[np.object_]  # shape (n,)
+    labels: NDArray[np.object_]
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -59,7 +66,6 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
 
     Parameters
     ----------
-    path : Path
     topic : str, optional
         By default that of the only microphone.
 

@@ -97,7 +97,6 @@ class Labellings:
 
         Parameters
         ----------
-        microphone : str
         text : str
             `live`, `review`, the name of a model, or `relabel` if there is only one.
 
@@ -132,7 +131,6 @@ class Labellings:
             As `microphone` and `find` return them.
         start, end : int, optional
             In nanoseconds: what is before and after is cut off.
-        progress : callable, optional
 
         Raises
         ------

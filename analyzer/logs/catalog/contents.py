@@ -56,7 +56,6 @@ def read_contents(path: Path, labelling: str) -> Contents:
 
     Parameters
     ----------
-    path : Path
     labelling : str
         `live`, `relabel` or `review`: segments of others are not counted.
 
