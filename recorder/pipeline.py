@@ -9,8 +9,7 @@ import numpy as np
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.labels.label_messages import label_columns, segment_columns
-from hearthlog.models.labels.labeller import FrameLabels, Labeller
+from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
@@ -233,7 +232,7 @@ class Pipeline:
             return []
         self.last_labels = labels
         self.segments_converged |= self._labeller.segmenter.segments_converged
-        columns = label_columns(labels, self.microphone)
+        columns = labels.columns(self.microphone)
         return [
             *self._segment_messages(segments),
             *self._messages("label", message_types.LABEL, labels.stamps, columns),

@@ -43,19 +43,7 @@ class Job(NamedTuple):
 def make_job(
     chain: Chain, place: int, model: Model, model_path: Path, *, continues_layer: bool
 ) -> Job:
-    """Make the job of one log of a chain, as if it had no layer.
-
-    Parameters
-    ----------
-    chain : Chain
-    place : int
-        Index of the log in the chain.
-    model : Model
-    model_path : Path
-        Where workers find the model.
-    continues_layer : bool
-        As in `Job`.
-    """
+    """Make the job of the log at a place in a chain, as if it had no layer."""
     log = chain.logs[place]
     first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
     return Job(
@@ -72,14 +60,6 @@ def make_job(
 
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
     """Tell whether a layer is what would be made again, apart from its open segment at the start.
-
-    Parameters
-    ----------
-    job : Job
-    metadata : LayerMetadata
-        Of the layer.
-    log_sha256 : str
-        `log_digest` of the log.
 
     Raises
     ------

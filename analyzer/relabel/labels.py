@@ -34,7 +34,7 @@ from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.labels.label_messages import label_columns, segment_columns
+from hearthlog.models.labels.labeller import segment_columns
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
@@ -126,13 +126,7 @@ def label_log(job: Job) -> LabelledLog:
 
 
 def complete_layer(job: Job, labelled: LabelledLog) -> None:
-    """Add the segments to the labels, and give the layer its name.
-
-    Parameters
-    ----------
-    job : Job
-    labelled : LabelledLog
-        With the start of its first segment.
+    """Add the segments, which lack no start, to the labels, and give the layer its name.
 
     Raises
     ------
@@ -234,7 +228,7 @@ def _write_labels(
             for event in read_sound(info, 0):
                 labels = labeller.push(event)
                 if labels is not None:
-                    columns = label_columns(labels, info.microphone)
+                    columns = labels.columns(info.microphone)
                     writer.write_columns([TopicBatch(topics[0].name, labels.stamps, columns)])
                     frames += len(labels.stamps)
             writer.flush()

@@ -98,22 +98,10 @@ def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
 def warm_up(
     info: RecorderInfo, earlier: Sequence[Path], classifier: Classifier, *, states_only: bool
 ) -> StreamLabeller:
-    """Label as much before a log as its first labels depend on.
+    """Label as much of the earlier logs, the last first, as the first labels of a log depend on.
 
-    Parameters
-    ----------
-    info : RecorderInfo
-        Of the log.
-    earlier : sequence of Path
-        Logs before it, the last first.
-    classifier : Classifier
-    states_only : bool
-        Whether it suffices that the states have converged; if not, the open segment is complete.
-
-    Returns
-    -------
-    StreamLabeller
-        Ready for the first frame of the log.
+    With `states_only` it suffices that the states have converged; the open segment may then lack
+    its beginning.
     """
     first, seconds_back = info.first_frame, _WARM_UP
     while first is not None and earlier:

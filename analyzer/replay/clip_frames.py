@@ -3,39 +3,38 @@
 from collections.abc import Iterator
 
 import numpy as np
-import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 
-_JOINED = 10_000_000  # nanoseconds between clips that still follow each other
+_JOINED = 10_000_000  # nanoseconds at most between clips that follow each other
 _REASON = "no clip holds it"
 
 
 class ClipFramer:
-    """Cuts clips into frames: those that follow each other as one sound.
+    """Cuts clips into frames; clips that follow each other are one sound.
 
-    After a hole the next frame begins with the first sample of a clip. What fills no frame before
-    a hole is not heard.
+    After a hole the next frame begins with the first sample of a clip. Samples before a hole that
+    do not fill a frame are dropped.
     """
 
     def __init__(self) -> None:
         self._next_frame = 0
-        self._end: int | None = None  # of the last frame, in UTC
-        self._rate = 0  # of the clips that follow each other; 0: none was heard yet
-        self._heard = 0  # samples of theirs
-        self._held = np.empty(0, np.float32)
-        self._cut = 0  # frames that were cut from them
-        self._resampler: soxr.ResampleStream | None = None
+        self._end: int | None = None  # end of the last frame, in nanoseconds of UTC
+        self._rate = 0  # of the clips that follow each other; 0 before the first one
+        self._samples = 0  # number of their samples
+        self._frames = 0  # number of frames cut from them
+        self._cutter = FrameCutter()
         # Where clips begin, in nanoseconds of their sound, and how much later that is in UTC.
         self._starts: list[int] = []
         self._offsets: list[int] = []
 
     def add(self, start: int, rate: int, samples: Float32) -> Iterator[Frames | Gap]:
-        """Take a clip, and hand on the frames that it completes and the gap before them.
+        """Add a clip, and yield the frames that it completes and the gap before them.
 
         Parameters
         ----------
@@ -47,53 +46,45 @@ class ClipFramer:
         """
         if rate != self._rate or abs(start - self._expected()) > _JOINED:
             yield from self.finish()
-            self._rate, self._heard, self._cut = rate, 0, 0
+            self._rate, self._samples, self._frames = rate, 0, 0
             self._starts, self._offsets = [], []
-            if rate != SAMPLE_RATE:
-                self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
+            self._cutter = FrameCutter(rate)
         position = self._position()
         self._starts.append(position)
         self._offsets.append(start - position)
-        self._heard += len(samples)
-        if self._resampler is not None:
-            samples = self._resampler.resample_chunk(samples)
-        yield from self._frames(samples)
+        self._samples += len(samples)
+        yield from self._events(self._cutter.push(samples))
 
     def finish(self) -> Iterator[Frames | Gap]:
-        """Hand on what is left of the clips that follow each other."""
-        if self._resampler is not None:
-            rest = self._resampler.resample_chunk(np.empty(0, np.float32), last=True)
-            yield from self._frames(rest)
-        self._resampler = None
-        self._held = np.empty(0, np.float32)
+        """Yield the last frames of the clips that follow each other."""
+        yield from self._events(self._cutter.push(np.empty(0, np.float32), last=True))
+        self._cutter = FrameCutter()
 
     def _position(self) -> int:
-        """Return how long the clips that follow each other last so far, in nanoseconds."""
-        return self._heard * NANOSECONDS // self._rate
+        """Return the length of the clips so far that follow each other, in nanoseconds."""
+        return self._samples * NANOSECONDS // self._rate
 
     def _expected(self) -> int:
         return self._position() + self._offsets[-1]
 
-    def _frames(self, samples: Float32) -> Iterator[Frames | Gap]:
-        self._held = np.concatenate([self._held, samples])
-        count = len(self._held) // FRAME_SAMPLES
+    def _events(self, frames: Float32) -> Iterator[Frames | Gap]:
+        count = len(frames)
         if not count:
             return
-        frames, self._held = np.split(self._held, [count * FRAME_SAMPLES])
         stamps = self._stamps(count)
-        if self._cut == 0 and self._end is not None:
+        if self._frames == 0 and self._end is not None:
             start, end = self._end, int(stamps[0])
             lost = max(round((end - start) / FRAME_NANOSECONDS), 1)
             self._next_frame += lost
             yield Gap(start, end, _REASON, lost)
-        yield Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
+        yield Frames(self._next_frame, frames, stamps)
         self._next_frame += count
-        self._cut += count
+        self._frames += count
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
 
     def _stamps(self, count: int) -> NDArray[np.int64]:
-        """Return when the next frames start: each by the clip that it starts in."""
-        positions = (self._cut + np.arange(count)) * FRAME_NANOSECONDS
+        """Return when the next frames start, each by the clip that it starts in."""
+        positions = (self._frames + np.arange(count)) * FRAME_NANOSECONDS
         clips = np.searchsorted(self._starts, positions, side="right") - 1
         stamps = positions + np.array(self._offsets)[clips]
         self._starts, self._offsets = self._starts[clips[-1] :], self._offsets[clips[-1] :]

@@ -12,33 +12,15 @@ from hearthlog.schemas.frames import FRAME_SECONDS
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How logs are replayed.
+    """How logs are replayed."""
 
-    Attributes
-    ----------
-    kind : str
-        What is replayed: "features", or "audio" for clips.
-    model : callable
-        Returns the model for the sound of a recorder; None for no labels.
-    output : Path or None
-        A folder for the new log; None for no log.
-    start_offset : float
-        Seconds from the first message.
-    duration : float or None
-        Seconds; None for all.
-    rate : float or None
-        Multiple of real time; None for as fast as possible.
-    loop : bool
-        Begin anew at the end, until stopped.
-    """
-
-    kind: str = "features"
-    model: Callable[[RecorderInfo], Model | None] = lambda _: None
-    output: Path | None = None
-    start_offset: float = 0.0
-    duration: float | None = None
-    rate: float | None = None
-    loop: bool = False
+    kind: str = "features"  # or "audio", for clips
+    model: Callable[[RecorderInfo], Model | None] = lambda _: None  # None: no labels
+    output: Path | None = None  # folder of the new log, if there is to be one
+    start_offset: float = 0.0  # seconds from the first message
+    duration: float | None = None  # seconds; None for all
+    rate: float | None = None  # multiple of real time; None for as fast as possible
+    loop: bool = False  # begin anew at the end, until stopped
 
 
 @dataclass

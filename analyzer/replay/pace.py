@@ -7,13 +7,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 class Pace:
-    """Waits until the time of a sound has come.
-
-    Parameters
-    ----------
-    rate : float or None
-        Multiple of real time; None for no waiting.
-    """
+    """Waits until the time of a sound has come; `rate` is that of `ReplayOptions`."""
 
     def __init__(self, rate: float | None) -> None:
         self._rate = rate
@@ -21,14 +15,7 @@ class Pace:
         self._anchor = 0.0, 0  # a time of the clock, and the time of the sound then
 
     def wait(self, start: int, end: int, stop: Flag) -> None:
-        """Wait until the end of some frames, or until stopped.
-
-        Parameters
-        ----------
-        start, end : int
-            Of the frames, in nanoseconds of UTC.
-        stop : threading.Event
-        """
+        """Wait until the end of frames from `start` to `end` (ns of UTC), or until stopped."""
         if self._rate is None:
             return
         if self._last is None or start < self._last:  # the clock was set back

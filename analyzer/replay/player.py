@@ -106,13 +106,7 @@ class Player:
         self._result.compared.add_segments(batch.segments, segments, end)
 
     def finish(self, *, cut: bool) -> None:
-        """Complete the log and the comparison.
-
-        Parameters
-        ----------
-        cut : bool
-            Whether the sound goes on: the last segment is then not as recorded.
-        """
+        """Complete the log and the comparison; if cut, the last segment is not as recorded."""
         self._close()
         if not cut and self._options.kind == "features":
             self.compare(RecordedBatch([], [], []))

@@ -17,8 +17,9 @@ from hearthlog.models.classifiers.description import Amount
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32, Float64, Indices
-from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
@@ -219,12 +220,8 @@ def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
     """Compute the features of a clip, shape (n, d); raises SourceError if it cannot be read."""
     extract = features.extractor()
     values = [np.empty((0, features.width), np.float32)]
-    rest = np.empty(0, np.float32)
-    for block in read_audio(clip.path):
-        samples = np.concatenate([rest, block])
-        whole = len(samples) // FRAME_SAMPLES * FRAME_SAMPLES
-        values.append(extract(samples[:whole].reshape(-1, FRAME_SAMPLES)))
-        rest = samples[whole:]
+    cutter = FrameCutter()
+    values += [extract(cutter.push(block)) for block in read_audio(clip.path)]
     return np.concatenate(values)
 
 

@@ -1,5 +1,6 @@
-"""From the features of one stream to labels and segments."""
+"""From the features of one stream to labels and segments, and to columns of their messages."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.labels.segments import Segment, Segmenter
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.messages.cdr_codec import Column
 
 
 class FrameLabels(NamedTuple):
@@ -32,19 +34,22 @@ class FrameLabels(NamedTuple):
     probabilities: Float32
     novelty: Float32
 
+    def columns(self, microphone: str) -> dict[str, Column]:
+        """Return the fields of one `AudioLabel` a frame."""
+        best = self.probabilities.argmax(axis=1)
+        return {
+            "header.stamp": self.stamps,
+            "header.frame_id": microphone,
+            "frame": self.frames,
+            "label": np.array(self.classes, object)[best],
+            "confidence": self.probabilities[np.arange(len(best)), best],
+            "novelty": self.novelty,
+            "probabilities": self.probabilities,
+        }
+
 
 class Labeller:
-    """Labels one stream of frames.
-
-    Parameters
-    ----------
-    classifier : Classifier
-
-    Attributes
-    ----------
-    classes : tuple of str
-    segmenter : Segmenter
-    """
+    """Labels one stream of frames, and divides it into segments."""
 
     def __init__(self, classifier: Classifier) -> None:
         self.classes = classifier.classes
@@ -87,3 +92,18 @@ class Labeller:
         """Return the remaining segments of a sound that ends at `end`, and begin anew."""
         self._inputs.restart()
         return self.segmenter.close(end)
+
+
+def segment_columns(
+    segments: Sequence[Segment], classes: Sequence[str], microphone: str
+) -> dict[str, Column]:
+    """Return the fields of one `AudioSegment` a segment."""
+    starts = np.array([segment.start for segment in segments], np.int64)
+    ends = np.array([segment.end for segment in segments], np.int64)
+    return {
+        "header.stamp": starts,
+        "header.frame_id": microphone,
+        "duration": ends - starts,
+        "label": [classes[segment.label] for segment in segments],
+        "confidence": np.array([segment.confidence for segment in segments], np.float32),
+    }

@@ -89,6 +89,8 @@ class Segmenter:
 
     Attributes
     ----------
+    open_run : Run or None
+        The frames after the last segment, as far as their states are decided.
     segments_converged : bool
         Whether frames before the first one would leave no trace in the segments to come.
     """
@@ -99,7 +101,7 @@ class Segmenter:
         if smoothing.method == "hmm":
             self._lag = round(smoothing.lag_seconds / frame_seconds)
             self._smoother = FixedLagSmoother(transitions, self._lag)
-        self._merger = SegmentMerger()
+        self.open_run: Run | None = None
         self._undecided: tuple[Float32, Int64] | None = None  # probabilities and stamps of frames
         self._frames = 0  # number of frames so far
         self._converged_at: int | None = None  # stamp from which on states have converged
@@ -113,15 +115,10 @@ class Segmenter:
         stamps = self._undecided[1]
         return not len(stamps) or self._converged_at <= int(stamps[0])
 
-    @property
-    def open_run(self) -> Run | None:
-        """The frames after the last segment, as far as their states are decided."""
-        return self._merger.open_run
-
     def discard_open(self) -> None:
         """Set the counts of the open run to zero; its label and start stay."""
-        if self._merger.open_run is not None:
-            self._merger.open_run = self._merger.open_run._replace(frames=0, confidence=0)
+        if self.open_run is not None:
+            self.open_run = self.open_run._replace(frames=0, confidence=0)
 
     def push(self, probabilities: Float32, stamps: Int64) -> list[Segment]:
         """Add successive frames and return the segments whose end they decide.
@@ -139,9 +136,7 @@ class Segmenter:
             stamps = np.concatenate([self._undecided[1], stamps])
         count = len(states)
         self._undecided = probabilities[count:], stamps[count:]
-        segments = self._merger.push(
-            states, _chosen(probabilities, states), stamps[:count], stamps[self._lag :]
-        )
+        segments = self._merge(states, probabilities, stamps[:count], stamps[self._lag :])
         converged_at = self._converged_at
         self.segments_converged |= converged_at is not None and any(
             segment.end > converged_at for segment in segments
@@ -155,10 +150,10 @@ class Segmenter:
             probabilities, stamps = self._undecided
             states = self._smoother.close()
             decided_at = np.full(len(states), end)
-            segments = self._merger.push(states, _chosen(probabilities, states), stamps, decided_at)
+            segments = self._merge(states, probabilities, stamps, decided_at)
         self._undecided = self._converged_at = None
         self._frames = 0
-        segments += self._merger.close(end, end)
+        segments += self._end_run(end, end)
         self.segments_converged |= bool(segments)
         return segments
 
@@ -173,45 +168,20 @@ class Segmenter:
             self._converged_at = int(stamps[frames - 1 - self._frames])
         self._frames += len(stamps)
 
-
-class SegmentMerger:
-    """Merges successive equal states of one stream.
-
-    Attributes
-    ----------
-    open_run : Run or None
-        The run that has not ended.
-    """
-
-    def __init__(self) -> None:
-        self.open_run: Run | None = None
-
-    def push(
-        self, states: Indices, confidences: Float32, stamps: Int64, decided_at: Int64
+    def _merge(
+        self, states: Indices, probabilities: Float32, stamps: Int64, decided_at: Int64
     ) -> list[Segment]:
-        """Add the states of successive frames and return the segments that they close.
-
-        Parameters
-        ----------
-        states : np.ndarray [shape=(n,)], intp
-            Indices of classes.
-        confidences : np.ndarray [shape=(n,)], float32
-            Probabilities of these classes.
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
-        decided_at : np.ndarray [shape=(n or more,)], int64
-            When each state was decided, in nanoseconds of UTC.
-        """
+        """Add the states of successive frames, decided at these times, to the open run."""
         segments: list[Segment] = []
         starts = np.flatnonzero(np.diff(states, prepend=-1))
         if not len(starts):
             return segments
-        units = np.rint(confidences.astype(np.float64) * _UNITS).astype(np.int64)
+        confidences = probabilities[np.arange(len(states)), states].astype(np.float64)
         columns = (
             states[starts],
             stamps[starts],
             np.diff(starts, append=len(states)),
-            np.add.reduceat(units, starts),
+            np.add.reduceat(np.rint(confidences * _UNITS).astype(np.int64), starts),
         )
         rows = zip(*(column.tolist() for column in columns), strict=True)
         for run, time in zip(map(Run._make, rows), decided_at[starts].tolist(), strict=True):
@@ -219,18 +189,10 @@ class SegmentMerger:
             if last is not None and last.label == run.label:
                 self.open_run = run.prepend(last)
             else:
-                segments += self.close(run.start, time)
+                segments += self._end_run(run.start, time)
                 self.open_run = run
         return segments
 
-    def close(self, end: int, decided_at: int) -> list[Segment]:
-        """End the open run, if there is one; both times are in nanoseconds of UTC."""
-        if self.open_run is None:
-            return []
+    def _end_run(self, end: int, decided_at: int) -> list[Segment]:
         run, self.open_run = self.open_run, None
-        return [Segment(run, end, decided_at)]
-
-
-def _chosen(probabilities: Float32, states: Indices) -> Float32:
-    """Return the probability of each frame's state."""
-    return probabilities[np.arange(len(states)), states]
+        return [] if run is None else [Segment(run, end, decided_at)]

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import soxr
 from numpy.typing import NDArray
 
 from hearthlog.recorder.clock import SampleClock
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.times import NANOSECONDS
@@ -74,8 +74,7 @@ class Framer:
         self._lost = 0  # samples that the sound card lost, which its driver did not count
         self._origin = 0  # index of the first sample since the last loss
         self._framed = 0  # samples at 16 kHz that became frames since then
-        self._held = np.empty(0, np.float32)
-        self._resampler: soxr.ResampleStream | None = None
+        self._cutter = FrameCutter()
 
     @property
     def ppm(self) -> float:
@@ -147,24 +146,18 @@ class Framer:
         self._reason = reason
         self._origin = origin
         self._framed = 0
-        self._held = np.empty(0, np.float32)
-        self._resampler = None
-        if self._rate != SAMPLE_RATE:
-            self._resampler = soxr.ResampleStream(self._rate, SAMPLE_RATE, 1, dtype="float32")
+        self._cutter = FrameCutter(self._rate)
 
     def _cut(self, samples: Float32) -> list[Frames | Gap]:
-        if self._resampler is not None:
-            samples = self._resampler.resample_chunk(samples)
-        self._held = np.concatenate([self._held, samples])
-        count = len(self._held) // FRAME_SAMPLES
+        frames = self._cutter.push(samples)
+        count = len(frames)
         if count == 0:
             return []
-        frames, self._held = np.split(self._held, [count * FRAME_SAMPLES])
         times = self._times(count)
         self._framed += count * FRAME_SAMPLES
         gap = self._gap_before(int(times[0]))
         stamps = times + self._wall_offset
-        complete = Frames(self._next_frame, frames.reshape(count, FRAME_SAMPLES), stamps)
+        complete = Frames(self._next_frame, frames, stamps)
         self._next_frame += count
         self._end = int(times[-1]) + FRAME_NANOSECONDS
         self._end_offset = self._wall_offset

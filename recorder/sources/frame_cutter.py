@@ -1,0 +1,26 @@
+"""From samples in pieces of any size to whole frames."""
+
+import numpy as np
+import soxr
+
+from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
+
+
+class FrameCutter:
+    """Resamples one sound to 16 kHz and cuts it into frames."""
+
+    def __init__(self, rate: float = SAMPLE_RATE) -> None:
+        self._held = np.empty(0, np.float32)
+        self._resampler = None
+        if rate != SAMPLE_RATE:
+            self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
+
+    def push(self, samples: Float32, *, last: bool = False) -> Float32:
+        """Add samples and return the frames that they complete, shape (n, 800)."""
+        if self._resampler is not None:
+            samples = self._resampler.resample_chunk(samples, last=last)
+        self._held = np.concatenate([self._held, samples])
+        whole = len(self._held) - len(self._held) % FRAME_SAMPLES
+        frames, self._held = np.split(self._held, [whole])
+        return frames.reshape(-1, FRAME_SAMPLES)
