@@ -21,14 +21,14 @@ from hearthlog.analyzer.training.transitions import (
     transitions_from_durations,
     transitions_from_sequences,
 )
-from hearthlog.analyzer.training.viterbi import smoothed, viterbi
+from hearthlog.analyzer.training.viterbi import viterbi
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.segments import Segmenter
-from hearthlog.models.labels.smoothing import FixedLagSmoother
+from hearthlog.models.labels.smoothing import FixedLagSmoother, log_likelihoods
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
@@ -134,7 +134,7 @@ def test_probabilities_of_zero_and_impossible_transitions_give_a_path():
     states = decided(FixedLagSmoother(transitions, 2000), probabilities, 100)
     assert states.tolist() == viterbi(probabilities, transitions).tolist()
     assert 4 not in states[1:]
-    assert np.isfinite(smoothed(probabilities, transitions)).all()
+    assert np.isfinite(log_likelihoods(probabilities)).all()
 
 
 def test_a_class_that_is_never_left_is_the_rest_of_the_path():
@@ -143,14 +143,6 @@ def test_a_class_that_is_never_left_is_the_rest_of_the_path():
     probabilities = made_up(10)
     states = decided(FixedLagSmoother(transitions, 5000), probabilities, 64)
     assert states.tolist() == viterbi(probabilities, transitions).tolist()
-
-
-def test_what_is_smoothed_with_the_whole_sound_are_probabilities():
-    probabilities = made_up(11)
-    posteriors = smoothed(probabilities, default_transitions(CLASSES))
-    np.testing.assert_allclose(posteriors.sum(axis=1), 1.0, atol=1e-9)
-    path = viterbi(probabilities, default_transitions(CLASSES))
-    assert (posteriors.argmax(axis=1) == path).mean() > 0.95
 
 
 @pytest.mark.parametrize("seed", range(8))

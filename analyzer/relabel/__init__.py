@@ -1,7 +1,6 @@
-"""Logs labelled anew by a model, in layers beside them.
+"""Relabelling: layers beside logs with the labels of another model.
 
-A log is a task: a worker reads its features, and as much of the logs before it as its first frames
-need, and writes the labels of every frame (`labels`). Where a segment lies in several logs, its
-parts are then put together, in the order of time, and the layer is completed (`layer`). `run` hands
-out the tasks; `neighbours` knows which log comes before which.
+Each log is a job: a worker reads its features, and as much of the logs before it as its first
+labels depend on, and writes the labels (`labels`). Segments that lie in several logs are then
+joined, in the order of time, and the layers are completed. `run` hands out the jobs.
 """

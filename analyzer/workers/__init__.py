@@ -1,4 +1,4 @@
-"""What runs tasks: this process, several processes of this machine, or a Dask cluster."""
+"""Workers: this process, several processes of this machine, or a Dask cluster."""
 
 from hearthlog.analyzer.workers.workers import Workers, open_workers
 

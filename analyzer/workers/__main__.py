@@ -1,4 +1,4 @@
-"""A worker: `processes.py` starts it."""
+"""A worker process, started by `processes.py`."""
 
 from hearthlog.analyzer.workers.processes import serve
 

@@ -40,7 +40,7 @@ def connected(scheduler: str) -> Iterator["Client"]:
         with suppress(OSError, ValueError):
             client = Client(scheduler, timeout=_CONNECT_SECONDS, set_as_default=False)
         if client is None:
-            gc.collect()  # else what is left of it locks up the next one, if it ends at that time
+            gc.collect()  # else the remains may block the next client, if they are collected then
             raise WorkerError(f"no Dask scheduler at {scheduler}; start one with: dask scheduler")
         try:
             _check_versions(client, scheduler)
@@ -51,7 +51,7 @@ def connected(scheduler: str) -> Iterator["Client"]:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep Dask from logging: what goes wrong is said once, by us."""
+    """Keep Dask from logging, since errors are reported once, by us."""
     names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
     levels = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -64,20 +64,12 @@ def _silence() -> Iterator[None]:
 
 
 def gone(scheduler: str) -> WorkerError:
-    """Return what to raise when the scheduler was lost."""
+    """Make the error that says that the scheduler was lost."""
     return WorkerError(f"the Dask scheduler at {scheduler} is gone; start it, and run this again")
 
 
 class Cluster:
-    """Workers of a Dask cluster.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        As `connected` makes it.
-    scheduler : str
-        For messages.
-    """
+    """Workers of a Dask cluster, through a client of `connected`."""
 
     def __init__(self, client: "Client", scheduler: str) -> None:
         self._client, self._scheduler = client, scheduler
@@ -86,28 +78,28 @@ class Cluster:
 
     @property
     def parallel(self) -> int:
-        """Threads of all workers just now; at least 1."""
+        """Number of threads of all workers at the moment; at least 1."""
         if self._client.status != "running":
             return 1
         return max(sum(self._client.nthreads().values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function that a module has at its top on any worker."""
-        wanted: Future[T] = Future()
+        """Run a function of the top level of a module on any worker."""
+        future: Future[T] = Future()
         if self._client.status != "running":
-            wanted.set_exception(gone(self._scheduler))
-            return wanted
+            future.set_exception(gone(self._scheduler))
+            return future
         sent = self._executor.submit(self._guard, pack_call(function, args))
-        sent.add_done_callback(lambda done: self._deliver(done, wanted))
-        return wanted
+        sent.add_done_callback(lambda done: self._deliver(done, future))
+        return future
 
-    def _deliver(self, done: Future[Any], wanted: Future[Any]) -> None:
-        if not wanted.set_running_or_notify_cancel():
+    def _deliver(self, done: Future[Any], future: Future[Any]) -> None:
+        if not future.set_running_or_notify_cancel():
             return
         try:
-            wanted.set_result(self._read(done))
+            future.set_result(self._read(done))
         except Exception as error:  # noqa: BLE001  raised where the result is asked for
-            wanted.set_exception(error)
+            future.set_exception(error)
 
     def _read(self, done: Future[Any]) -> Any:
         try:
@@ -134,7 +126,7 @@ def raise_if_killed(error: Exception) -> None:
 
 
 def _check_versions(client: "Client", scheduler: str) -> None:
-    """Refuse a cluster whose workers would compute something else."""
+    """Refuse a cluster with no workers, or with workers of another version."""
     try:
         client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
     except TimeoutError as error:
@@ -144,8 +136,8 @@ def _check_versions(client: "Client", scheduler: str) -> None:
         ) from error
     ours = version("hearthlog")
     # A function of the standard library, so that a worker without hearthlog can answer.
-    found = client.run(version, "hearthlog", on_error="return")
-    for worker, theirs in found.items():
+    versions = client.run(version, "hearthlog", on_error="return")
+    for worker, theirs in versions.items():
         if theirs != ours:
             raise WorkerError(_refusal(worker, theirs, ours))
 
@@ -156,10 +148,10 @@ def _refusal(worker: str, theirs: Any, ours: str) -> str:
 
 
 def _guard(ours: str) -> Callable[[bytes], tuple[str, bytes]]:
-    """Make the function that workers run: it lets a worker of this version do a call.
+    """Make the function that workers run: it refuses calls on a worker of another version.
 
-    It is a function within a function for Dask to send it as code: a worker that joined later may
-    have no hearthlog to import it from.
+    It is a nested function, which Dask sends as code, since a worker that joins later may have no
+    hearthlog to import it from.
     """
 
     def guarded(call: bytes) -> tuple[str, bytes]:

@@ -1,4 +1,4 @@
-"""Learning many machines at once, in threads or on a Dask cluster, with the same code."""
+"""Many fits at once, in threads or on a Dask cluster, with the same code."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -14,12 +14,9 @@ _MOST_THREADS = 4
 
 
 def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
-    """Yield what calls return, in their order.
+    """Yield the results of `joblib.delayed` calls, in their order.
 
-    Parameters
-    ----------
-    calls : iterable of joblib.delayed
-        They run in threads, since libsvm frees the lock, or where `joblib.parallel_config` says.
+    They run in threads, since libsvm releases the lock, or where `joblib.parallel_config` says.
     """
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
     return joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
@@ -27,7 +24,7 @@ def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
 
 @contextmanager
 def joblib_on(scheduler: str | None) -> Iterator[None]:
-    """Let what joblib runs in the block run on a Dask cluster, if one is named.
+    """Let joblib run calls in this block on a Dask cluster, if one is named.
 
     Raises
     ------
@@ -50,12 +47,12 @@ def joblib_on(scheduler: str | None) -> Iterator[None]:
 
 
 def _backend(client: Any) -> Any:
-    """Make joblib's Dask backend; where a task has killed its workers, it waits for ever."""
+    """Make joblib's Dask backend end where a task has killed its workers, instead of waiting."""
     from joblib._dask import DaskDistributedBackend  # noqa: PLC0415  part of the extra `cluster`
 
     class Backend(DaskDistributedBackend):  # type: ignore[misc]  # joblib has no types
         def submit(self, func: Any, callback: Any = None) -> Any:
-            """Run a batch; joblib waits for the callback, which is told of results alone."""
+            """Run a batch; report errors to the callback too, which joblib waits for."""
 
             def tell(done: Any) -> None:
                 if (error := done.exception()) is not None:

@@ -1,4 +1,4 @@
-"""How a call travels to another process and what came of it comes back."""
+"""Calls and replies as bytes, for other processes."""
 
 import pickle
 import traceback
@@ -10,29 +10,29 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
-    """Turn a call into bytes; the function must be one that a module has at its top."""
+    """Pickle a call; the function must be at the top level of a module."""
     return pickle.dumps((function, args))
 
 
 def attempt(call: bytes) -> bytes:
-    """Do a call; what it returns or raises is the reply."""
+    """Do a call, and pickle its result or its exception."""
     try:
-        function, args = pickle.loads(call)  # noqa: S301  what our own parent or client has sent
+        function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
         return pickle.dumps((function(*args), None))
-    except Exception as error:  # noqa: BLE001  raised anew where the reply is read
+    except Exception as error:  # noqa: BLE001  raised again where the reply is read
         return pickle.dumps((None, _portable(error)))
 
 
 def read_reply(reply: bytes) -> Any:
     """Return what the call returned, or raise what it raised."""
-    value, error = pickle.loads(reply)  # noqa: S301  what our own worker has sent
+    value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
     if error is not None:
         raise error
     return value
 
 
 def _portable(error: Exception) -> Exception:
-    """Return the error with its traceback as a note, or, if it cannot travel, one that can."""
+    """Return the error with its traceback as a note; a WorkerError if it cannot be pickled."""
     if not isinstance(error, HearthlogError):
         error.add_note("in a worker:\n" + "".join(traceback.format_exception(error)))
     try:

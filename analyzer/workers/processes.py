@@ -1,4 +1,8 @@
-"""Workers that are processes of this machine."""
+"""Workers that are processes of this machine.
+
+concurrent.futures.ProcessPoolExecutor does not suffice: one killed worker fails all running tasks,
+so does an exception that cannot be unpickled, and workers outlive a parent that was killed.
+"""
 
 import os
 import signal
@@ -18,8 +22,8 @@ from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_re
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogWarning
 
-MAX_ATTEMPTS = 3  # workers that a task may cost
-_TIDY_SECONDS = 3.0  # to remove what is half-written
+MAX_ATTEMPTS = 3  # of a task whose worker is killed
+_TIDY_SECONDS = 3.0  # for a task to remove unfinished files
 _SERVE = module_command("hearthlog.analyzer.workers")
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -28,12 +32,7 @@ T = TypeVar("T")
 
 
 class Processes:
-    """A number of processes, each with a thread here that gives it one task after the other.
-
-    Parameters
-    ----------
-    count : int
-    """
+    """Processes, each with a thread here that gives it one task after the other."""
 
     def __init__(self, count: int) -> None:
         self.parallel = count
@@ -44,11 +43,11 @@ class Processes:
         self._closed = False
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function that a module has at its top, when a process is free."""
+        """Run a function of the top level of a module, once a process is free."""
         return self._threads.submit(self._run, function, args)
 
     def close(self) -> None:
-        """Give up what is not done, and end the processes."""
+        """Give up the tasks that are not done, and end the processes."""
         with self._lock:
             self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
@@ -72,14 +71,14 @@ class Processes:
 
     def _process(self) -> "_Process":
         """Return the process of this thread; start one if there is none."""
-        found: _Process | None = getattr(self._mine, "process", None)
-        if found is None:
+        process: _Process | None = getattr(self._mine, "process", None)
+        if process is None:
             with self._lock:
                 if self._closed:
                     raise WorkerError("given up")
-                found = self._mine.process = _Process()
-                self._alive.add(found)
-        return found
+                process = self._mine.process = _Process()
+                self._alive.add(process)
+        return process
 
     def _drop(self, process: "_Process") -> None:
         process.end()
@@ -94,7 +93,7 @@ class _LostError(Exception):
 
 
 class _Process:
-    """A process that answers calls, until nobody can call any more."""
+    """A process that answers calls, until the other end of its pipe is closed."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(  # noqa: S603  our own module
@@ -105,7 +104,7 @@ class _Process:
             env=dict.fromkeys(_THREADS, "1")
             | os.environ
             | {"PYTHONPATH": os.pathsep.join(sys.path)},
-            process_group=0,  # Ctrl-C is for the parent, which then hangs up
+            process_group=0,  # Ctrl-C reaches the parent only, which then hangs up
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
@@ -123,11 +122,11 @@ class _Process:
             raise _LostError from error
 
     def hang_up(self) -> None:
-        """Tell the process to end."""
+        """Let the process end: nobody will call it again."""
         self._calls.close()
 
     def end(self) -> None:
-        """End the process, however sick it is."""
+        """End the process, even if it hangs."""
         self._calls.close()
         try:
             self._process.wait(2 * _TIDY_SECONDS)
@@ -143,9 +142,9 @@ def serve() -> None:
     replies = Connection(os.dup(1), readable=False)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
-    os.dup2(2, 1)  # what a task prints is no reply
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can tidy up
-    warnings.simplefilter("ignore", HearthlogWarning)  # who gave the task says it once
+    os.dup2(2, 1)  # what a task prints must not get into the replies
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that a task can clean up
+    warnings.simplefilter("ignore", HearthlogWarning)  # the parent warns once
     waiting: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
     while True:
@@ -153,7 +152,7 @@ def serve() -> None:
 
 
 def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
-    """Notice that the parent is gone while a task runs."""
+    """Receive calls, and end the process when the parent hangs up or dies, even during a task."""
     try:
         while True:
             waiting.put(calls.recv_bytes())

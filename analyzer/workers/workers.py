@@ -1,4 +1,4 @@
-"""The three kinds of workers behind one."""
+"""One way to run tasks: in this process, in several processes, or on a Dask cluster."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -13,35 +13,32 @@ T = TypeVar("T")
 
 
 class Workers(Protocol):
-    """What runs tasks.
+    """Workers, which run tasks.
 
-    A task is a function that a module has at its top, with arguments that are small and can be
-    pickled: paths, not arrays. It may run more than once, if its worker was lost.
+    A task is a function of the top level of a module, with arguments that are small and can be
+    pickled: paths, not arrays. It may run more than once, if its worker is lost.
     """
 
     @property
     def parallel(self) -> int:
-        """How many tasks run at once just now; at least 1."""
+        """Number of tasks that run at once at the moment; at least 1."""
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a task.
 
-        Returns
-        -------
-        concurrent.futures.Future
-            Of what the function returns or raises; WorkerError if its worker was lost three
-            times, the cluster is gone, or a worker has another version of hearthlog.
+        The future raises what the function raises, and WorkerError if the worker was lost three
+        times, the cluster is gone, or a worker has another version of hearthlog.
         """
 
 
 @contextmanager
 def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Workers]:
-    """Open what runs tasks; tasks that are not done when the block ends are given up.
+    """Open workers; tasks that are not done when the block ends are given up.
 
     Parameters
     ----------
     count : int
-        Processes; 1 runs each task in this one, when it is submitted.
+        Number of processes; 1 runs each task in this process, when it is submitted.
     scheduler : str, optional
         Address of a running Dask cluster, as `tcp://host:port`, instead.
 
@@ -61,12 +58,12 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
 
 
 class InlineWorkers:
-    """The process that asks."""
+    """Runs each task in this process, when it is submitted."""
 
     parallel = 1
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a function."""
+        """Run a function at once."""
         future: Future[T] = Future()
         try:
             future.set_result(function(*args, **kwargs))
