@@ -339,7 +339,7 @@ def test_what_the_model_is_unsure_of_or_finds_new_comes_first(logs, uncertain, r
     sources = find_labellings(log)
     found = sources.read("mic", "relabel/odd")
     queue = make_queue(sources, "mic", found, other=None, marks=None, count=5)
-    assert start <= queue.windows.starts[0] < queue.windows.ends[0] <= end
+    assert start <= queue.spans.starts[0] < queue.spans.ends[0] <= end
     assert REASONS[int(np.argmax(queue.weighted[:, 0]))] == reason
     assert queue.scores[0] == pytest.approx(1.0 if uncertain else 0.5)
     assert queue.scores[1] < queue.scores[0]
@@ -407,7 +407,7 @@ def test_a_queue_is_of_many_days_and_classes(tmp_path):
     rows = [(2 * i, 2 * i + 2, label) for i, label in enumerate(labels)]
     rows += [(start + 86_400, end + 86_400, label) for start, end, label in rows]
     queue = queue_of(write_home(tmp_path / "home.mcap", rows, lambda *_: [1 / 3] * 3), 8)
-    days = (queue.windows.starts - MIDNIGHT) // DAY
+    days = (queue.spans.starts - MIDNIGHT) // DAY
     assert min(np.bincount(days)) >= 3
     assert queue.labels.count("coughing") == queue.labels.count("speech") == 4
 
@@ -417,8 +417,8 @@ def test_of_a_long_segment_the_ten_worst_seconds_are_in_the_queue(tmp_path):
         return [0.0, 0.2, 0.8] if 30 <= second < 40 else [0.0, 1.0, 0.0]
 
     queue = queue_of(write_home(tmp_path / "home.mcap", [(0, 60, "speech")], probabilities), 5)
-    assert ((queue.windows.starts - MIDNIGHT) / NANOSECONDS).tolist() == [30.0]
-    assert ((queue.windows.ends - MIDNIGHT) / NANOSECONDS).tolist() == [40.0]
+    assert ((queue.spans.starts - MIDNIGHT) / NANOSECONDS).tolist() == [30.0]
+    assert ((queue.spans.ends - MIDNIGHT) / NANOSECONDS).tolist() == [40.0]
     assert queue.uncertainty == pytest.approx([0.8])
 
 

@@ -1,1 +1,1 @@
-"""Going through a timeline: marking what was heard, span after span."""
+"""The review of logs: their timeline in a viewer, and marks made there."""

@@ -122,7 +122,7 @@ def _queue(
             count=count,
             progress=progress,
         )
-    if not ranked.sure:
+    if not ranked.has_uncertainty:
         tell(
             f"{names[0]}: no labels with probabilities, so how sure the model was is no part of "
             "the score"

@@ -72,13 +72,13 @@ def _print_disagreements(difference: "Difference", spans: int) -> None:
 
 def print_queue(queue: "ReviewQueue") -> None:
     """Print a row for each span, the most useful first."""
-    windows = queue.windows
+    spans = queue.spans
     figures = (queue.scores, queue.uncertainty, queue.disagreement, queue.novelty)
     rows = [
         (*_span(start, end), *(shortened(name, NAME_WIDTH) for name in names), *values)
         for start, end, names, values in zip(
-            windows.starts.tolist(),
-            windows.ends.tolist(),
+            spans.starts.tolist(),
+            spans.ends.tolist(),
             zip(queue.labels, queue.others, strict=True),
             zip(*([f"{value:.2f}" for value in column] for column in figures), strict=True),
             strict=True,

@@ -1,4 +1,4 @@
-"""Windows: spans with one label, of a length that a person can judge."""
+"""Spans with one label each, of a length that a person can judge."""
 
 from dataclasses import dataclass
 
@@ -19,15 +19,16 @@ _MOST = 5_000_000
 
 @dataclass(frozen=True)
 class JudgeableSpans:
-    """Spans of time, in its order, that do not overlap.
+    """Spans in the order of time, which do not overlap.
 
     Attributes
     ----------
     starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
     labels : np.ndarray [shape=(n,)], int64
         Indices of classes.
     sources : np.ndarray [shape=(n,)], int64
-        Equal for windows that were cut from one stretch.
+        Equal for spans that were cut from one.
     """
 
     starts: Int64
@@ -38,7 +39,7 @@ class JudgeableSpans:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def taken(self, rows: Int64) -> "JudgeableSpans":
+    def take(self, rows: Int64) -> "JudgeableSpans":
         """Return some of them."""
         return JudgeableSpans(
             self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
@@ -48,9 +49,9 @@ class JudgeableSpans:
 def judgeable_spans(segments: Events) -> JudgeableSpans:
     """Join segments that flicker, and cut long ones.
 
-    Successive segments of less than a second each are one stretch, labelled as the longest of
-    them. Stretches of more than ten seconds are cut into equal windows; those of less than half a
-    second are left out, for nobody could judge them.
+    Successive segments of less than a second each are joined, with the label of the longest. What
+    is longer than ten seconds is cut into equal spans; what is shorter than half a second is left
+    out, for nobody could judge it.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     Raises
     ------
     DataError
-        If it is more than a year and a half.
+        If there are more than five million spans, as of a year and a half.
     """
     lengths = segments.ends - segments.starts
     short = lengths < _FLICKER
@@ -82,29 +83,29 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
 
 
 def without(segments: Events, starts: Int64, ends: Int64) -> Events:
-    """Leave of some segments what is outside of spans that do not overlap."""
+    """Return the parts of segments outside of spans that do not overlap."""
     spans, rows = remains(segments, Spans(starts, ends))
     return Events(*spans, segments.labels[rows])
 
 
-def other_labels(windows: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
-    """Tell what another labelling says in each window.
+def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
+    """Compare spans with another labelling.
 
     Returns
     -------
     labels : np.ndarray [shape=(n,)], int64
-        What it says the longest; -1 for nothing.
+        The other label of most of each span; -1 for none.
     differing : np.ndarray [shape=(n,)], float64
-        Share of the window in which it says something else.
+        The share of each span that has another label.
     """
-    own = Events(windows.starts, windows.ends, windows.labels)
+    own = Events(spans.starts, spans.ends, spans.labels)
     pieces = overlay([own, others]).in_all()
     row, label = pieces.rows[0], others.labels[pieces.rows[1]]
     lengths = pieces.ends - pieces.starts
-    apart = np.where(label != windows.labels[row], lengths, 0)
-    differing = np.bincount(row, apart, len(windows)) / (windows.ends - windows.starts)
+    apart = np.where(label != spans.labels[row], lengths, 0)
+    differing = np.bincount(row, apart, len(spans)) / (spans.ends - spans.starts)
     pairs, place = np.unique(np.stack([row, label]), axis=1, return_inverse=True)
     by_length = np.lexsort((np.bincount(place, lengths), pairs[0]))
-    labels = np.full(len(windows), -1)
+    labels = np.full(len(spans), -1)
     labels[pairs[0][by_length]] = pairs[1][by_length]  # of equal rows the last one stays
     return labels, differing

@@ -1,4 +1,4 @@
-"""What to review next, so that a person's time buys the most."""
+"""The queue of a review: the spans whose labels are the most likely to be wrong."""
 
 from dataclasses import dataclass
 
@@ -31,38 +31,38 @@ RANKINGS = (*_ALONE, RANDOM)
 
 @dataclass(frozen=True)
 class ReviewQueue:
-    """Windows to be reviewed, the most useful first.
+    """Spans to be reviewed, the most useful first.
 
     Attributes
     ----------
-    windows : JudgeableSpans
+    spans : JudgeableSpans
     labels, others : list of str
-        What the labelling says, and what the other one says; that is empty where it says nothing.
+        The label of most of each span by the labelling, and by the other one; empty without one.
     uncertainty, disagreement, novelty : np.ndarray [shape=(n,)], float64
         0 to 1.
     candidates : int
-        Windows that there were to choose from.
-    sure : bool
-        False if the logs do not say how sure the model was.
+        The number of spans that these were chosen from.
+    has_uncertainty : bool
+        False if the logs have no probabilities.
     """
 
-    windows: JudgeableSpans
+    spans: JudgeableSpans
     labels: list[str]
     others: list[str]
     uncertainty: Float64
     disagreement: Float64
     novelty: Float64
     candidates: int
-    sure: bool
+    has_uncertainty: bool
 
     @property
     def weighted(self) -> Float64:
-        """What the parts of the score weigh, shape (3, n)."""
+        """The weighted parts of the scores, shape (3, n)."""
         return _WEIGHTS * np.stack([self.uncertainty, self.disagreement, self.novelty])
 
     @property
     def scores(self) -> Float64:
-        """By what the windows are ranked, before they are spread over days and classes."""
+        """The scores, before spans are spread over days and classes."""
         return self.weighted.sum(axis=0)
 
 
@@ -77,7 +77,7 @@ def make_queue(  # noqa: PLR0913
     ranking: str | None = None,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
-    """Choose spans whose labels are likely to be wrong, of many days and classes.
+    """Choose the spans whose labels are the most likely to be wrong, of many days and classes.
 
     Parameters
     ----------
@@ -86,61 +86,61 @@ def make_queue(  # noqa: PLR0913
     side : NamedLabelling
         The labelling to be reviewed.
     other : NamedLabelling or None
-        Another one, to see where they disagree; another name for a class is no disagreement.
+        Another one, to find disagreements; another name for a class is none.
     marks : Labelling or None
-        What was reviewed already: it is left out.
+        What is reviewed already, and left out.
     count : int
-        Of spans.
+        Number of spans, at most.
     ranking : str, optional
-        One of `RANKINGS`: by what alone they are chosen.
+        One of `RANKINGS`, to rank by it alone.
     progress : callable, optional
         Is called with the share that is done.
 
     Raises
     ------
     DataError
-        If nothing is left to review, or nothing says what to review first.
+        If nothing is left to review, or there is nothing to rank by.
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
     segments = events_of(side.labelling, classes)
     if marks is not None:
         segments = without(segments, marks.starts, marks.ends)
-    windows = judgeable_spans(segments)
-    if not len(windows):
+    spans = judgeable_spans(segments)
+    if not len(spans):
         raise DataError(f"{side.name}: nothing is left to review")
-    doubt = ModelUncertainty(windows, classes)
-    _add_frames(doubt, sources, labelling_topic(microphone, side.name, "label"), windows, progress)
-    if other is None and not (doubt.uncertainty.known or doubt.novelty.known):
+    means = ModelUncertainty(spans, classes)
+    _add_frames(means, sources, labelling_topic(microphone, side.name, "label"), spans, progress)
+    if other is None and not (means.uncertainty.exist or means.novelty.exist):
         raise DataError(
             f"{side.name}: the logs do not say how sure the model was (no labels with "
             "probabilities); name a second labelling to compare it with"
         )
-    labels, differing = np.full(len(windows), -1), np.zeros(len(windows))
+    labels, differing = np.full(len(spans), -1), np.zeros(len(spans))
     if other is not None:
-        labels, differing = other_labels(windows, events_of(other.labelling, classes))
-    parts = doubt.uncertainty.values(), differing, doubt.novelty.values()
+        labels, differing = other_labels(spans, events_of(other.labelling, classes))
+    parts = means.uncertainty.values(), differing, means.novelty.values()
     scores = _scores(np.stack(parts), ranking)
     if not scores.any():
         raise DataError(f"{side.name}: no span is {ranking}")
-    rows = _best_of_each(scores, windows.sources)
+    rows = _best_of_each(scores, spans.sources)
     if ranking is not None:
         rows = rows[scores[rows] > 0.0]
-    rows = rows[_spread(scores[rows], windows.taken(rows), count)]
+    rows = rows[_spread(scores[rows], spans.take(rows), count)]
     return ReviewQueue(
-        windows.taken(rows),
-        [classes[i] for i in windows.labels[rows].tolist()],
+        spans.take(rows),
+        [classes[i] for i in spans.labels[rows].tolist()],
         [classes[i] if i >= 0 else "" for i in labels[rows].tolist()],
         uncertainty=parts[0][rows],
         disagreement=parts[1][rows],
         novelty=parts[2][rows],
-        candidates=len(windows),
-        sure=doubt.uncertainty.known,
+        candidates=len(spans),
+        has_uncertainty=means.uncertainty.exist,
     )
 
 
 def _scores(parts: Float64, ranking: str | None) -> Float64:
-    """Weigh what speaks for each window; at random the same windows come each time."""
+    """Return the score of each span; random ones are the same each time."""
     if ranking == RANDOM:
         return np.random.default_rng(0).random(parts.shape[1:])
     weights = _WEIGHTS if ranking is None else np.eye(len(parts))[:, [_ALONE[ranking]]]
@@ -149,38 +149,38 @@ def _scores(parts: Float64, ranking: str | None) -> Float64:
 
 
 def _add_frames(
-    doubt: ModelUncertainty,
+    means: ModelUncertainty,
     sources: Labellings,
     topic: str,
-    windows: JudgeableSpans,
+    spans: JudgeableSpans,
     progress: Progress,
 ) -> None:
-    start, end = int(windows.starts[0]), int(windows.ends[-1])
+    start, end = int(spans.starts[0]), int(spans.ends[-1])
     logs = sources.with_topic(topic, start, end)
     for i, log in enumerate(logs):
         try:
             for batch in iterate_columns([log.path], {topic}, start, end, LABEL_FIELDS):
                 for frames in batch:
-                    doubt.add(frames)
+                    means.add(frames)
         except LogError as error:
             sources.lose(error)
         progress((i + 1) / len(logs))
 
 
 def _best_of_each(scores: Float64, sources: Int64) -> Int64:
-    """Find the best window of each stretch, of equal ones the first."""
+    """Return the row of the best span of each source, of equal ones the first."""
     order = np.lexsort((-scores, sources))
     return order[np.flatnonzero(np.diff(sources[order], prepend=-1))]
 
 
-def _spread(scores: Float64, windows: JudgeableSpans, count: int) -> Int64:
-    """Choose the best, of many days and classes rather than of one.
+def _spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
+    """Choose the best spans, of many days and classes rather than of one.
 
-    Each time it is the one of the highest score divided by the square root of one more than were
-    chosen of its class, and by that of one more than were chosen of its day.
+    Each time it is the one with the highest score / sqrt((1 + c) (1 + d)), where c and d are how
+    many of its class and of its day are chosen already.
     """
-    _, day = np.unique(windows.starts // DAY, return_inverse=True)
-    label = windows.labels
+    _, day = np.unique(spans.starts // DAY, return_inverse=True)
+    label = spans.labels
     order = np.lexsort((-scores, label, day))  # only the best of a day and class can be next
     group = (day * (label.max() + 1) + label)[order]
     head = np.flatnonzero(np.diff(group, prepend=-1))

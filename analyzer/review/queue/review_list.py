@@ -31,13 +31,13 @@ class ReviewSpan(NamedTuple):
     ----------
     microphone : str
     start, end : int
-        Nanoseconds of UTC.
+        In nanoseconds of UTC.
     a, label_a : str
-        A labelling (`live`, `review`, `relabel/<model>`), and what it says the longest.
+        A labelling (`live`, `review`, `relabel/<model>`), and its label of most of the span.
     b, label_b : str
-        Another one; both are empty if there is none, the label where it says nothing.
+        Another one; both are empty if there is none, the label where it has none.
     score : float or None
-        None where nothing was ranked.
+        None in lists of disagreements, which are not ranked.
     reason : str
         One of `REASONS`.
     """
@@ -70,7 +70,7 @@ def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
 def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[ReviewSpan]:
     """List what is to be reviewed of labelling a, in that order; the reason is what weighs most."""
     most = np.argmax(queue.weighted, axis=0).tolist()
-    columns = queue.windows.starts, queue.windows.ends, queue.scores.round(3)
+    columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
     rows = zip(
         *(column.tolist() for column in columns), queue.labels, queue.others, most, strict=True
     )

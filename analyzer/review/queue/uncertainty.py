@@ -1,4 +1,4 @@
-"""How sure a model was of its labels, window by window."""
+"""How uncertain a model was of its labels, span by span."""
 
 from collections.abc import Sequence
 
@@ -12,82 +12,78 @@ from hearthlog.schemas.logs.columns import Columns
 
 
 class ModelUncertainty:
-    """Means over windows, of labels that come batch by batch.
+    """Mean uncertainty and novelty of spans, of labels that come batch by batch.
 
     Parameters
     ----------
-    windows : JudgeableSpans
+    spans : JudgeableSpans
         At least one.
     classes : sequence of str
-        What their labels stand for.
-
-    Attributes
-    ----------
-    uncertainty, novelty : SpanMeans
+        The names behind their labels.
     """
 
-    def __init__(self, windows: JudgeableSpans, classes: Sequence[str]) -> None:
-        self._windows, self._classes = windows, classes
-        self.uncertainty, self.novelty = SpanMeans(len(windows)), SpanMeans(len(windows))
+    def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
+        self._spans, self._classes = spans, classes
+        self.uncertainty, self.novelty = SpanMeans(len(spans)), SpanMeans(len(spans))
 
     def add(self, frames: Columns) -> None:
-        """Add frames; probabilities without names say nothing."""
+        """Add frames; probabilities without names are left out."""
         stamps, probabilities = frames["header.stamp"], frames["probabilities"]
-        window = np.searchsorted(self._windows.starts, stamps, side="right") - 1
-        inside = (window >= 0) & (stamps < self._windows.ends[window])
-        window = window[inside]
-        self.novelty.add(window, frames["novelty"][inside].astype(np.float64))
+        row = np.searchsorted(self._spans.starts, stamps, side="right") - 1
+        inside = (row >= 0) & (stamps < self._spans.ends[row])
+        row = row[inside]
+        self.novelty.add(row, frames["novelty"][inside].astype(np.float64))
         names = array_names(frames.metadata, "probabilities")
         if probabilities.ndim == 2 and probabilities.shape[1] == len(names) > 1:
             place = {name: i for i, name in enumerate(names)}
             columns = np.array([place.get(name, -1) for name in self._classes])
-            said = columns[self._windows.labels[window]]
-            self.uncertainty.add(window, uncertainty(probabilities[inside], said))
+            labelled = columns[self._spans.labels[row]]
+            self.uncertainty.add(row, uncertainty(probabilities[inside], labelled))
 
 
-def uncertainty(probabilities: NDArray[np.floating], said: Int64) -> Float64:
-    """Tell how far the likeliest other class comes up to the one that is said, or exceeds it.
+def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64:
+    """Return (1 - p + q) / 2, of the probabilities p of the label and q of the best other class.
 
-    Smoothing may say something else than the likeliest class, so the two likeliest would not do.
+    Smoothing may choose another label than the most probable class, so the difference of the two
+    highest probabilities would not do.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)]
-    said : np.ndarray [shape=(n,)], int64
-        Columns; -1 for a class that is none of them.
+    labelled : np.ndarray [shape=(n,)], int64
+        Columns of the labels; -1 for a label without a column, whose p is 0.
 
     Returns
     -------
     np.ndarray [shape=(n,)]
-        0 where all speaks for the label, 0.5 where another class is as likely, 1 where all speaks
-        for another.
+        0 (certain) to 1; 0.5 where another class is as probable as the label.
     """
     others = probabilities.astype(np.float64)
-    known = np.flatnonzero(said >= 0)
+    rows = np.flatnonzero(labelled >= 0)
     own = np.zeros(len(others))
-    own[known] = others[known, said[known]]
-    others[known, said[known]] = 0.0
+    own[rows] = others[rows, labelled[rows]]
+    others[rows, labelled[rows]] = 0.0
     return np.clip((1.0 - own + others.max(axis=1, initial=0.0)) / 2.0, 0.0, 1.0)
 
 
 class SpanMeans:
-    """Means by window, of what is finite."""
+    """Means of the finite values in each span."""
 
     def __init__(self, count: int) -> None:
         self._sums, self._counts = np.zeros(count), np.zeros(count)
 
-    def add(self, window: Int64, values: Float64) -> None:
-        """Add values, and the windows that they are in."""
+    def add(self, row: Int64, values: Float64) -> None:
+        """Add values, and the rows of the spans that contain them."""
         finite = np.isfinite(values)
-        window, values = window[finite], values[finite]
-        if len(window):
-            first = int(window.min())
-            part = slice(first, int(window.max()) + 1)
-            self._sums[part] += np.bincount(window - first, values)
-            self._counts[part] += np.bincount(window - first)
+        row, values = row[finite], values[finite]
+        if len(row):
+            first = int(row.min())
+            part = slice(first, int(row.max()) + 1)
+            self._sums[part] += np.bincount(row - first, values)
+            self._counts[part] += np.bincount(row - first)
 
     @property
-    def known(self) -> bool:
+    def exist(self) -> bool:
         """Whether there is any value."""
         return bool(self._counts.any())
 

@@ -1,1 +1,1 @@
-"""A review: what keys do, and the marks they make."""
+"""A review session: keys, and the marks that they make."""

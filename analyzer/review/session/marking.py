@@ -1,4 +1,4 @@
-"""Marks made one after the other, each in its layer before the next; and undone."""
+"""The marks of a review: written to their layers one by one, and undone."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ from hearthlog.analyzer.review.timeline.model import LabelledSpans
 
 @dataclass
 class _Change:
-    """What was in a layer where something was marked, for undoing."""
+    """The marks of a layer before a change, to undo it."""
 
     log: Path
     span: MarkedSpan
@@ -30,12 +30,12 @@ class Marking:
     ----------
     microphone : str
     coverage : Coverage
-        Which log has what.
+        Of the microphone.
     reviewer : str
     corrects : str
         The labelling that is reviewed: `live`, or the name of a model.
     labelled : LabelledSpans
-        What it says.
+        The segments of that labelling.
     """
 
     microphone: str
@@ -44,53 +44,47 @@ class Marking:
     corrects: str
     labelled: LabelledSpans
     _done: list[list[_Change]] = field(default_factory=list)
-    _known: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
+    _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
 
     def mark(self, start: int, end: int, label: str) -> list[Mark]:
-        """Say what was heard in a span of time, in nanoseconds of UTC.
+        """Label a span of time, in nanoseconds of UTC.
 
         Returns
         -------
         list of Mark
-            As they are in the layers now.
+            The new marks: one for each log of the span.
 
         Raises
         ------
         DataError
-            If not all of it was heard, or the label cannot be.
+            If a part of the span was not recorded, or the label is invalid.
         LogError
-            If a layer cannot be written; what was there is still there.
+            If a layer cannot be written; it is unchanged then.
         """
         return self._write(start, end, [(start, end, label)])
 
     def confirm(self, start: int, end: int) -> list[Mark]:
-        """Say that the labelling is right in a span of time; as `mark` otherwise."""
-        said = self.labelled
-        first, last = np.searchsorted(said.ends, start, "right"), np.searchsorted(said.starts, end)
-        inside = slice(int(first), int(last))
+        """Mark a span with the labels that it has; otherwise as `mark`."""
+        segments = self.labelled
+        first = int(np.searchsorted(segments.ends, start, "right"))
+        inside = slice(first, int(np.searchsorted(segments.starts, end)))
         spans = zip(
-            np.maximum(said.starts[inside], start).tolist(),
-            np.minimum(said.ends[inside], end).tolist(),
-            said.texts[inside].tolist(),
+            np.maximum(segments.starts[inside], start).tolist(),
+            np.minimum(segments.ends[inside], end).tolist(),
+            segments.texts[inside].tolist(),
             strict=True,
         )
-        found = [span for span in spans if span[0] < span[1]]
-        if not found:
-            raise DataError(f"{self.corrects} says nothing about this span: name what was heard")
-        return self._write(start, end, found)
+        labels = [span for span in spans if span[0] < span[1]]
+        if not labels:
+            raise DataError(f"{self.corrects} has no label in this span: name what was heard")
+        return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
-        """Take the marks of a span of time away; as `mark` otherwise."""
+        """Delete the marks of a span of time; otherwise as `mark`."""
         return self._write(start, end, [])
 
     def undo(self) -> tuple[int, int] | None:
-        """Take the last change back.
-
-        Returns
-        -------
-        (int, int) or None
-            The span that it was about; None if there is nothing to undo.
-        """
+        """Undo the last change; return its span, or None if there is nothing to undo."""
         if not self._done:
             return None
         changes = self._done[-1]
@@ -102,17 +96,18 @@ class Marking:
     def marks(self) -> LabelledSpans:
         """Return all marks of the microphone in these logs."""
         for log in self.coverage.logs:
-            if log not in self._known:
-                self._known[log] = read_marks(log)
-        marks = (mark for known in self._known.values() for mark in known)
-        found = sorted(mark for mark in marks if mark.microphone == self.microphone)
+            if log not in self._marks:
+                self._marks[log] = read_marks(log)
+        marks = (mark for same in self._marks.values() for mark in same)
+        own = sorted(mark for mark in marks if mark.microphone == self.microphone)
         return LabelledSpans(
-            np.array([mark.start for mark in found], np.int64),
-            np.array([mark.end for mark in found], np.int64),
-            np.array([mark.label for mark in found], object),
+            np.array([mark.start for mark in own], np.int64),
+            np.array([mark.end for mark in own], np.int64),
+            np.array([mark.label for mark in own], object),
         )
 
-    def _write(self, start: int, end: int, said: Iterable[tuple[int, int, str]]) -> list[Mark]:
+    def _write(self, start: int, end: int, labels: Iterable[tuple[int, int, str]]) -> list[Mark]:
+        """Replace the marks of a span by labels (start, end, label)."""
         start = max([start, *self.coverage.starts[:1]])
         end = min([end, *self.coverage.ends[-1:]])
         pieces = self.coverage.split(start, end) if start < end else []
@@ -122,7 +117,7 @@ class Marking:
         made = [
             Mark(self.microphone, max(a, first), min(b, last), label, self.reviewer, now,
                  self.corrects)
-            for a, b, label in said
+            for a, b, label in labels
             for _, first, last in pieces
             if max(a, first) < min(b, last)
         ]  # fmt: skip
@@ -135,10 +130,10 @@ class Marking:
 
     def _change_layer(self, log: Path, marks: Sequence[Mark], instead_of: MarkedSpan) -> None:
         write_marks(log, marks, [instead_of])
-        self._known[log] = read_marks(log)
+        self._marks[log] = read_marks(log)
 
     def _change(self, log: Path, start: int, end: int) -> _Change:
-        """Note the marks that a change will touch, and how far they reach."""
+        """Return the marks that a change will touch, and the span that they reach over."""
         touched = [
             mark
             for mark in read_marks(log)

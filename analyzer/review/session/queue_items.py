@@ -1,4 +1,4 @@
-"""What is to be gone through: what a queue finds, or a list that `diff` made."""
+"""The spans that a review goes through: of a queue, or of a list that `diff` made."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,14 +14,14 @@ Limits = tuple[int | None, int | None]
 
 
 def queue_items(
-    wanted: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int
+    queue: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int
 ) -> list[ReviewItem]:
-    """Choose spans of a labelling that are to be reviewed.
+    """Choose spans of a labelling for a review.
 
     Parameters
     ----------
-    wanted : str
-        One of `analyzer.diff.queue.RANKINGS`, or the name of a list that `hearthlog diff` made.
+    queue : str
+        One of `RANKINGS`, or the name of a list that `hearthlog diff` made.
     sources : Labellings
     labelled : (str, str)
         The microphone, and the labelling: `live`, or `relabel/` and a model.
@@ -36,40 +36,41 @@ def queue_items(
         If there is nothing to review, or no such list.
     """
     microphone, labelling = labelled
-    if wanted not in RANKINGS:
-        if not wanted.endswith(".csv"):
-            known = ", ".join(RANKINGS)
-            raise DataError(f"--queue {wanted[:64]}: use {known}, or a list *.csv of `diff --list`")
-        return _items(_listed(Path(wanted), microphone, limits)[:count])
+    if queue not in RANKINGS:
+        if not queue.endswith(".csv"):
+            raise DataError(
+                f"--queue {queue[:64]}: use {', '.join(RANKINGS)}, or a list *.csv of `diff --list`"
+            )
+        return _items(_listed(Path(queue), microphone, limits)[:count])
     side = sources.read(microphone, labelling, *limits)
     others = [name for name in sources.names(microphone) if name not in {labelling, REVIEW}]
-    if wanted == "disagreeing" and not others:
+    if queue == "disagreeing" and not others:
         raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
     other = sources.read(microphone, others[0], *limits) if others else None
-    found = make_queue(
+    chosen = make_queue(
         sources,
         microphone,
         side,
         other=other,
         marks=sources.marks(microphone, *limits),
         count=count,
-        ranking=wanted,
+        ranking=queue,
     )
-    return _items(queued(found, microphone, labelling, "" if other is None else other.name))
+    return _items(queued(chosen, microphone, labelling, "" if other is None else other.name))
 
 
 def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
     start, end = limits
-    found = [
+    spans = [
         span
         for span in read_list(path)
         if span.microphone == microphone
         and (start is None or span.end > start)
         and (end is None or span.start < end)
     ]
-    if not found:
+    if not spans:
         raise DataError(f"{path}: lists nothing of {microphone} in these logs")
-    return found
+    return spans
 
 
 def _items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:

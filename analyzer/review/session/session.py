@@ -1,4 +1,4 @@
-"""A reviewer at a viewer: keys in, marks out."""
+"""A review session: what the keys of a reviewer do."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,66 +25,56 @@ _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time
 
 
 class ReviewItem(NamedTuple):
-    """A span that is to be reviewed.
+    """A span to be reviewed."""
 
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    label : str
-        What it is labelled, the longest; this is what is accepted.
-    text : str
-        What else there is to say.
-    """
-
-    start: int
+    start: int  # in nanoseconds of UTC
     end: int
-    label: str
-    text: str
+    label: str  # of most of it; the key `a` accepts it
+    text: str  # for the reviewer
 
 
 class Screen(Protocol):
-    """What a session asks of a viewer; all may raise ConnectionError or TimeoutError."""
+    """A viewer, for a session; all methods may raise ConnectionError or TimeoutError."""
 
     def is_open(self) -> bool:
-        """Tell whether it is still there."""
+        """Tell whether it is open."""
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span that is marked with the mouse."""
+        """Return the span that is selected with the mouse."""
 
     def cursor(self) -> int | None:
-        """Return where the time cursor is."""
+        """Return the time of the cursor."""
 
     def show(self, start: int, end: int, margin: int) -> None:
-        """Mark a span, and show it with a margin."""
+        """Select a span, and show it with a margin."""
 
     def play(self, start: int) -> None:
         """Let the time cursor run from a time on."""
 
     def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Show marks as they are now."""
+        """Draw the marks of a microphone again."""
 
 
 @dataclass
 class Session:
-    """What keys do.
+    """A review, driven by keys.
 
     Parameters
     ----------
     screen : Screen
     marking : Marking
     classes : sequence of str
-        That get a key.
+        Each gets a key.
     zone : tzinfo
-        Of the home, for what is said.
+        Of the home, for times in texts.
     say : callable
-        Takes a line for the reviewer.
+        Shows a line to the reviewer.
     look_closely : callable
         Draws a span (start, end) at the resolution of its frames.
     listen : callable
-        Plays the sound of a span, if it was kept; returns what there is to say about it.
+        Plays the kept sound of a span (start, end); returns a line for the reviewer.
     items : sequence of ReviewItem
-        What is to be gone through; empty where the reviewer chooses spans.
+        The spans to go through; empty where the reviewer chooses spans.
     """
 
     screen: Screen
@@ -102,7 +92,7 @@ class Session:
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """List the keys, and what they do."""
+        """The keys, and what they do."""
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
@@ -111,12 +101,12 @@ class Session:
         return [*keys, ("q", "quit")]
 
     def run(self, keys: "SimpleQueue[str]") -> int:
-        """Do what keys say until the reviewer quits, closes the viewer, or is through.
+        """Obey keys until the reviewer quits or closes the viewer, or the last item is done.
 
         Returns
         -------
         int
-            How many spans were marked.
+            The number of marked spans.
         """
         self._began = time.monotonic()
         self._redraw()
@@ -135,7 +125,7 @@ class Session:
         return self._marked
 
     def press(self, key: str) -> None:
-        """Do what one key says; what cannot be done is said, and nothing is lost."""
+        """Obey one key. An error is shown to the reviewer, and changes nothing."""
         try:
             self._press(key)
         except HearthlogError as error:
@@ -197,7 +187,7 @@ class Session:
 
     @contextmanager
     def _unless_silent(self) -> Iterator[None]:
-        """Say that the viewer does not show what was done."""
+        """Tell the reviewer if the viewer does not answer; what was done stays done."""
         try:
             yield
         except (ConnectionError, TimeoutError):
@@ -241,7 +231,7 @@ class Session:
         return span
 
     def _go(self, step: int) -> None:
-        """Show the next or the last span of the queue."""
+        """Show the next or the previous item."""
         self._at = max(self._at + step, 0)
         if self._at >= len(self.items):
             return

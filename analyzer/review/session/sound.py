@@ -1,4 +1,4 @@
-"""What was kept of a span of time, to be heard."""
+"""Play the kept sound of a span of time."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
-    """Play what was kept of a span of time, without waiting for its end.
-
-    Returns
-    -------
-    str
-        What there is to say about it.
-    """
+    """Start to play the kept sound of a span of time; return a line for the reviewer."""
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
         return "no sound of this span was kept"
@@ -30,9 +24,9 @@ def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
 
 
 def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
-    """Return the rate and the samples of what was kept of a span of time, one after the other.
+    """Return the sample rate and the kept samples of a span of time, without the holes.
 
-    What is of another rate than the first is left out.
+    Clips of another rate than the first are left out.
     """
     parts, rate = [np.empty(0, np.float32)], 0
     for clip in clips:

@@ -1,1 +1,1 @@
-"""What some logs hold, at the resolution of a screen: what a timeline shows."""
+"""Logs as a timeline: at the resolution of a screen, or as they are being written."""
