@@ -1,1 +1,1 @@
-"""Marks: a reviewer's corrections, their layers, and files of labels."""
+"""Marks of a reviewer: their layers, label files of other programs, enrolled sounds."""

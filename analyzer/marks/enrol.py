@@ -1,4 +1,4 @@
-"""Seconds of a sound, taken into the home's own training set: a log of features, and one mark."""
+"""Enrol sounds in the training set of a home: each is a log of features with one mark."""
 
 import shutil
 import tempfile
@@ -37,7 +37,7 @@ from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import NANOSECONDS
 
-SECONDS = 5.0  # of a microphone, unless it is said
+SECONDS = 5.0  # of a microphone, by default
 LEAST_SECONDS, MOST_SECONDS = 1.0, 3600.0
 _PATIENCE = 10.0  # seconds for a microphone to wake
 _STAMP = "header.stamp"
@@ -46,7 +46,7 @@ _ENERGY = "energy"
 
 @dataclass(frozen=True)
 class Enrolled:
-    """A log in the home's training set, and how many seconds of sound it holds."""
+    """A log in the training set of a home, and its length in seconds."""
 
     log: Path
     seconds: float
@@ -55,13 +55,13 @@ class Enrolled:
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
     """Enrol an audio file, or its first seconds.
 
-    Its frames get times that end now, or before what was enrolled of this class already: logs of
-    one class do not overlap.
+    Its frames get times that end now, or before older enrolled logs of the class: logs of one class
+    do not overlap.
 
     Parameters
     ----------
     home : Path
-        Folder of the training set; the log comes into its folder `enrolled`.
+        Folder of the training set; the log goes to its folder `enrolled`.
     label : str
         Class of the sound.
     audio : Path
@@ -76,11 +76,11 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     Raises
     ------
     DataError
-        If the label cannot be a class, if there is less than a second of sound, or only silence.
+        If the label is no valid class, or there is less than a second of sound, or only silence.
     SourceError
         If the file is no audio.
     LogError
-        If it cannot be written.
+        If the log cannot be written.
     """
     _check_label(label)
     length = audio_seconds(audio)
@@ -97,10 +97,10 @@ def enrol_microphone(
     seconds: float = SECONDS,
     listening: Callable[[], None] = lambda: None,
 ) -> list[Enrolled]:
-    """Enrol what a microphone hears now; `listening` is called when it does.
+    """Enrol what a microphone hears now; otherwise as `enrol_file`.
 
-    The other parameters and the errors are those of `enrol_file`; `device` is a name as
-    `hearthlog devices` lists it, empty for the default one.
+    `device` is named as `hearthlog devices` lists it, empty for the default one; `listening` is
+    called when it is open.
     """
     _check_label(label)
     with closing(MicrophoneSource(device)) as source:
@@ -121,10 +121,10 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
     ----------
     home : Path
     label : str
-        Both as of `enrol_file`.
+        As of `enrol_file`.
     log : Path
     start, end : int
-        Nanoseconds of UTC: the frames from `start` on, before `end`.
+        In nanoseconds of UTC: the frames from `start` on, before `end`.
 
     Raises
     ------
@@ -134,14 +134,14 @@ def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enroll
         If there is no such log, if one is damaged, or if nothing can be written.
     """
     _check_label(label)
-    heard = find_coverage(log)
-    if len(heard) > 1:
-        names = ", ".join(sorted(heard))
+    coverage = find_coverage(log)
+    if len(coverage) > 1:
+        names = ", ".join(sorted(coverage))
         raise DataError(
             f"{log}: is of several microphones ({names}); make a log of one of them first, with "
             "`hearthlog cut --topics '/NAME/*'`"
         )
-    (microphone,) = heard
+    (microphone,) = coverage
     selection = select([log], start=start, end=end)
     stamps, energies = _frames(selection.logs, microphone, start, end)
     _check_sound(label, energies)
@@ -177,22 +177,22 @@ class _First:
 def _enrol(
     home: Path, label: str, source: SoundSource, seconds: float, stop: threading.Event
 ) -> list[Enrolled]:
-    """Record elsewhere, and take what came of it into the training set if it is good."""
+    """Record to a temporary folder, and copy the logs to the training set if they have sound."""
     microphone = MicrophoneSettings()
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
-        asked = {
+        options = {
             "node": label,
             "output": Path(folder),
             "model": None,
             "max_bag_duration": 86_400,
             "statistics_every": 1,
         }
-        settings = load_settings(None, asked, microphone.model_dump())
+        settings = load_settings(None, options, microphone.model_dump())
         logs = record(settings, microphone, _First(source, seconds), stop).logs
-        heard = {log: _frames([log], microphone.name) for log in logs}
-        _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in heard.values())]))
+        frames = {log: _frames([log], microphone.name) for log in logs}
+        _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in frames.values())]))
         enrolled = []
-        for log, (stamps, _) in heard.items():
+        for log, (stamps, _) in frames.items():
             if not len(stamps):
                 continue
             path = home / ENROLLED / log.relative_to(folder)
@@ -223,20 +223,20 @@ def _check_sound(label: str, energies: NDArray[np.floating[Any]]) -> None:
 def _frames(
     logs: Sequence[Path], microphone: str, start: int | None = None, end: int | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]]]:
-    """Read when the frames of some logs were heard, and their energies."""
+    """Read the times of the frames of some logs, and their energies."""
     name = topic(microphone, "features")
-    found = read_columns(logs, {name}, start, end, {_STAMP, "values"}).get(name)
-    if found is None:
+    columns = read_columns(logs, {name}, start, end, {_STAMP, "values"}).get(name)
+    if columns is None:
         return np.empty(0, np.int64), np.empty(0)
-    names = array_names(found.metadata, "values")
-    values = found["values"]
+    names = array_names(columns.metadata, "values")
+    values = columns["values"]
     if _ENERGY not in names or values.shape[1:] != (len(names),):
         raise DataError(f"{logs[0]}: {name} has no energy; it was not recorded by hearthlog")
-    return found[_STAMP], values[:, names.index(_ENERGY)]
+    return columns[_STAMP], values[:, names.index(_ENERGY)]
 
 
 def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) -> Enrolled:
-    """Mark all of a log that was just made; there is no such log without its mark."""
+    """Mark all of a new log, or delete the log."""
     start, end = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
     try:
         write_marks(path, [Mark(microphone, start, end, label)])
@@ -247,7 +247,7 @@ def _marked(path: Path, microphone: str, label: str, stamps: NDArray[np.int64]) 
 
 
 def _free_start(home: Path, label: str, seconds: float) -> int:
-    """Return the start of the last span of time that ends by now and is not taken."""
+    """Return the start of the last span of time that ends by now and overlaps no enrolled log."""
     length = int(seconds * NANOSECONDS)
     logs = filter(is_log, (home / ENROLLED).rglob(f"{label}_*{SUFFIX}"))
     spans = [span for log in logs if (span := time_span(log)) is not None]

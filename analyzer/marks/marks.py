@@ -1,4 +1,4 @@
-"""Marks: what a reviewer says that was heard, in a layer beside the log it speaks about."""
+"""Marks: the corrections of a reviewer, in a layer beside the log."""
 
 import re
 import tempfile
@@ -32,34 +32,24 @@ LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
 PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
 _KINDS = {message_types.SEGMENT: "segment", message_types.MARK: "mark"}
 _SPAN = ("header.stamp", "duration", "label")
-_SAYS = ("reviewer", "made", "corrects")
-_FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_SAYS)}
+_ORIGIN = ("reviewer", "made", "corrects")
+_FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_ORIGIN)}
 
 
 class Mark(NamedTuple):
-    """What was heard from `start` on, before `end`, in nanoseconds of UTC, and who says so.
-
-    Attributes
-    ----------
-    reviewer : str
-        Empty if nobody knows, as of what is below.
-    made : int
-        When the mark was made, in nanoseconds of UTC; 0 if nobody knows.
-    corrects : str
-        The labelling that it corrects: `live`, or the name of a model.
-    """
+    """The label of a span of time by a reviewer, in nanoseconds of UTC."""
 
     microphone: str
     start: int
     end: int
     label: str
-    reviewer: str = ""
-    made: int = 0
-    corrects: str = ""
+    reviewer: str = ""  # empty if unknown, as what follows
+    made: int = 0  # when the mark was made; 0 if unknown
+    corrects: str = ""  # the labelling that it corrects: `live`, or the name of a model
 
 
 class MarkedSpan(NamedTuple):
-    """A span of time that a microphone heard, in nanoseconds of UTC."""
+    """A span of time of a microphone, in nanoseconds of UTC."""
 
     microphone: str
     start: int
@@ -67,17 +57,12 @@ class MarkedSpan(NamedTuple):
 
 
 def read_marks(log: Path) -> list[Mark]:
-    """Read the marks of a log, those of each microphone in the order of time.
-
-    Returns
-    -------
-    list of Mark
-        Those of a microphone do not overlap. Empty if nobody has reviewed the log.
+    """Read the marks of a log, by microphone and time; empty if there is no review layer.
 
     Raises
     ------
     LogError
-        If the layer is damaged, or its marks cannot be.
+        If the layer is damaged, or its marks are invalid.
     """
     path = review_path(log)
     if not path.exists():
@@ -93,15 +78,15 @@ def read_marks(log: Path) -> list[Mark]:
             raise LogError(f"{path}: is no review layer: it has a topic {name!r}; move it away")
     selection.verify()
     spans: list[Mark] = []
-    said: dict[tuple[Any, ...], Mark] = {}
+    marks: dict[tuple[Any, ...], Mark] = {}
     for batch in selection.messages():
         for columns in decode_types(path, batch, _FIELDS):
             if columns.type == message_types.SEGMENT:
                 spans += _marks(columns)
             else:
-                said |= {mark[:4]: mark for mark in _marks(columns)}
+                marks |= {mark[:4]: mark for mark in _marks(columns)}
     try:
-        return _checked(said.get(mark[:4], mark) for mark in spans)
+        return _checked(marks.get(mark[:4], mark) for mark in spans)
     except (DataError, LogError) as error:
         raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
 
@@ -109,8 +94,7 @@ def read_marks(log: Path) -> list[Mark]:
 def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] = ()) -> Path:
     """Add marks to the review layer of a log; where they overlap older marks, they win.
 
-    The layer is replaced in one step: whatever happens, the old or the new one is there. One
-    process waits for another that does the same.
+    The layer is replaced in one step. Processes that write to the same folder wait for each other.
 
     Parameters
     ----------
@@ -122,35 +106,35 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] 
     Returns
     -------
     Path
-        The layer; with no marks left it is not there any more.
+        The layer, which is deleted if no marks are left.
 
     Raises
     ------
     DataError
-        If the new marks overlap each other, or cannot be.
+        If the new marks overlap each other, or are invalid.
     LogError
         If there is no such log, if its layer is damaged, or if it cannot be written.
     """
     new = _checked(marks)
     path = review_path(log)
-    with _alone(path):
-        left = read_marks(log)
+    with _locked(path):
+        layer = read_marks(log)
         for span in deleted:
-            left = list(_left(left, [span]))
-        left = _checked([*_left(left, new), *new])
-        if not left:
+            layer = list(_subtract(layer, [span]))
+        layer = _checked([*_subtract(layer, new), *new])
+        if not layer:
             path.unlink(missing_ok=True)
             return path
         node = next((record.get("node", "") for record in select([log]).metadata), "")
-        about = provenance(node, log=stem(log) + SUFFIX)
+        metadata = provenance(node, log=stem(log) + SUFFIX)
         with replaced_file(path) as temporary:
-            temporary.write_bytes(_layer(path.name, left, about))
+            temporary.write_bytes(_layer_bytes(path.name, layer, metadata))
     return path
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Keep other writers of review layers out of a folder."""
+def _locked(path: Path) -> Iterator[None]:
+    """Keep other writers of review layers out of the folder."""
     with ExitStack() as stack:
         try:
             stack.enter_context(locked_folder(path.parent))
@@ -163,13 +147,13 @@ def _marks(columns: Columns) -> Iterator[Mark]:
     microphone = columns.topic.split("/")[1]
     starts = columns["header.stamp"]
     ends = starts + columns["duration"]
-    says = [columns[name].tolist() for name in _SAYS if columns.type == message_types.MARK]
-    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *says, strict=True):
+    origin = [columns[name].tolist() for name in _ORIGIN if columns.type == message_types.MARK]
+    for row in zip(starts.tolist(), ends.tolist(), columns["label"].tolist(), *origin, strict=True):
         yield Mark(microphone, *row)
 
 
 def _checked(marks: Iterable[Mark]) -> list[Mark]:
-    """Sort marks, and raise DataError if one cannot be."""
+    """Sort marks; raise DataError if one is invalid."""
     ordered = sorted(marks)
     for mark in ordered:
         if not 0 <= mark.start < mark.end <= LATEST:
@@ -187,8 +171,8 @@ def _checked(marks: Iterable[Mark]) -> list[Mark]:
     return ordered
 
 
-def _left(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
-    """Yield what new marks leave of the old ones."""
+def _subtract(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
+    """Yield what is left of old marks outside of new ones."""
     for microphone in {mark.microphone for mark in old}:
         own = [mark for mark in new if mark.microphone == microphone]
         starts, ends = [mark.start for mark in own], [mark.end for mark in own]
@@ -211,8 +195,8 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
     ]
 
 
-def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
-    """Make the file; elsewhere, for there it must not be taken for a log being written."""
+def _layer_bytes(name: str, marks: Sequence[Mark], metadata: dict[str, str]) -> bytes:
+    """Write the file in another folder, where nobody takes it for a log being recorded."""
     microphones = sorted({mark.microphone for mark in marks})
     topics = [
         Topic(labelling_topic(microphone, REVIEW, kind), type_)
@@ -220,7 +204,7 @@ def _layer(name: str, marks: Sequence[Mark], about: dict[str, str]) -> bytes:
         for microphone in microphones
     ]
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
-        writer = LogWriter(Path(folder) / name, topics, about)
+        writer = LogWriter(Path(folder) / name, topics, metadata)
         writer.write_columns([_rows(t.name, t.type, marks) for t in topics])
         return writer.finish().read_bytes()
 
@@ -238,9 +222,9 @@ def _rows(name: str, kind: str, marks: Sequence[Mark]) -> TopicBatch:
     }
     if kind == message_types.SEGMENT:
         return TopicBatch(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
-    says = {
+    origin = {
         "reviewer": [mark.reviewer for mark in own],
         "made": np.array([mark.made for mark in own]),
         "corrects": [mark.corrects for mark in own],
     }
-    return TopicBatch(name, ends, fields | says)
+    return TopicBatch(name, ends, fields | origin)

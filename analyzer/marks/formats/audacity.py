@@ -1,4 +1,4 @@
-"""Label tracks of Audacity: start, end and label with tabs between them, of one microphone."""
+"""Label tracks of Audacity: start, end and label separated by tabs, of one microphone."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""CSV: a line for each label, with the names of the columns in the first."""
+"""CSV: a line for each label, below the names of the columns."""
 
 import csv
 import io
@@ -33,14 +33,14 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table with all that marks say; its times are of UTC."""
+    """Write a table with all fields of the marks; its times are UTC."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(_COLUMNS)
     for mark in marks:
         start, end = time_text(mark.start), time_text(mark.end)
-        says = mark.reviewer, made_text(mark), mark.corrects
-        table.writerow([start, end, mark.label, mark.microphone, *says])
+        origin = mark.reviewer, made_text(mark), mark.corrects
+        table.writerow([start, end, mark.label, mark.microphone, *origin])
     return text.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""ELAN: a tier for each microphone and reviewer; what marks say besides in tiers that depend on it.
+"""ELAN: a tier for each microphone and reviewer, and tiers below it for the other fields of marks.
 
 Times in ELAN are whole milliseconds.
 """
@@ -24,8 +24,8 @@ from hearthlog.schemas.times import time_text
 
 _MILLISECOND = 1_000_000  # ns
 _START = "hearthlog:start"  # the property that says when the document begins
-_MARKS = "marks"  # a type of tiers, as these two:
-_SAYS = ("made", "corrects")
+_MARKS = "marks"  # a type of tiers, as these two
+_ORIGIN = ("made", "corrects")
 _DEEPEST = 20  # elements within elements; ELAN has 5
 _ENDLESS = re.compile(r"<[^<>]{65536}")  # a tag that would take the parser minutes
 _SCHEMA = "http://www.mpi.nl/tools/elan/EAFv3.0.xsd"
@@ -42,17 +42,17 @@ class _Annotation(NamedTuple):
 
 
 class _Wrong(Exception):  # noqa: N818
-    """What is wrong in a line; for ELAN's XML is fine XML all the same."""
+    """An error in XML that is well-formed, but no document of ELAN."""
 
 
 class _Document(ContentHandler):
-    """Gathers what a document says of times and labels."""
+    """Gathers the times and labels of a document."""
 
     def __init__(self) -> None:
         super().__init__()
         self.start = ""
         self.annotations: dict[str, _Annotation] = {}
-        self.said: dict[str, dict[str, str]] = {kind: {} for kind in _SAYS}
+        self.origins: dict[str, dict[str, str]] = {kind: {} for kind in _ORIGIN}
         self.slots: dict[str, str] = {}
         self._locator: Locator | None = None
         self._depth = 0
@@ -67,11 +67,11 @@ class _Document(ContentHandler):
         return (self._locator.getLineNumber() if self._locator else None) or 1
 
     def setDocumentLocator(self, locator: Locator) -> None:  # noqa: N802
-        """Take what knows the line."""
+        """Keep the locator, which knows the line."""
         self._locator = locator
 
     def startElement(self, name: str, attrs: AttributesImpl) -> None:  # noqa: N802
-        """Take note of an element."""
+        """Read the attributes of an element."""
         self._depth += 1
         given = dict(attrs.items())
         if (self._depth == 1 and name != "ANNOTATION_DOCUMENT") or self._depth > _DEEPEST:
@@ -89,12 +89,12 @@ class _Document(ContentHandler):
             self._text.clear()
 
     def characters(self, content: str) -> None:
-        """Take a piece of text."""
+        """Append a piece of text."""
         if self._open:
             self._text.append(content)
 
     def endElement(self, name: str) -> None:  # noqa: N802
-        """Take note of what is complete."""
+        """Store a complete annotation or property."""
         self._depth -= 1
         depends = "PARENT_REF" in self._tier
         text = "".join(self._text).strip()
@@ -106,14 +106,14 @@ class _Document(ContentHandler):
             self.annotations[identity] = _Annotation(self._line, self._tier, start, end, text)
         elif name == "REF_ANNOTATION" and depends:
             kind = self._tier.get("LINGUISTIC_TYPE_REF", "")
-            self.said.get(kind, {})[self._open.get("ANNOTATION_REF", "")] = text
+            self.origins.get(kind, {})[self._open.get("ANNOTATION_REF", "")] = text
         if name in {"ALIGNABLE_ANNOTATION", "REF_ANNOTATION", "PROPERTY"}:
             self._open = {}
             self._text.clear()
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the annotations of the tiers that depend on no other."""
+    """Yield the annotations of the top tiers."""
     document = _Document()
     endless = _ENDLESS.search(text)
     if endless is not None:
@@ -128,25 +128,26 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         raise DataError(f"{path}:{document.line}: declares a DTD, as ELAN never does") from error
     except _Wrong as error:
         raise DataError(f"{path}:{document.line}: {error}") from error
-    for identity, found in document.annotations.items():
+    for identity, each in document.annotations.items():
         yield FileLabel(
-            found.line,
-            _seconds(path, found, document.slots.get(found.start)),
-            _seconds(path, found, document.slots.get(found.end)),
-            found.label,
-            microphone=found.tier.get("PARTICIPANT", ""),
-            reviewer=found.tier.get("ANNOTATOR", ""),
-            made=document.said["made"].get(identity, ""),
-            corrects=document.said["corrects"].get(identity, ""),
+            each.line,
+            _seconds(path, each, document.slots.get(each.start)),
+            _seconds(path, each, document.slots.get(each.end)),
+            each.label,
+            microphone=each.tier.get("PARTICIPANT", ""),
+            reviewer=each.tier.get("ANNOTATOR", ""),
+            made=document.origins["made"].get(identity, ""),
+            corrects=document.origins["corrects"].get(identity, ""),
             zero=document.start,
         )
 
 
-def _seconds(path: Path, found: _Annotation, milliseconds: str | None) -> str:
+def _seconds(path: Path, annotation: _Annotation, milliseconds: str | None) -> str:
+    where = f"{path}:{annotation.line}"
     if not milliseconds:
-        raise DataError(f"{path}:{found.line}: {found.label[:64]!r} has no time; align it in ELAN")
+        raise DataError(f"{where}: {annotation.label[:64]!r} has no time; align it in ELAN")
     if not (milliseconds.isascii() and milliseconds.isdecimal() and len(milliseconds) < 16):
-        raise DataError(f"{path}:{found.line}: {milliseconds[:64]!r} is no number of milliseconds")
+        raise DataError(f"{where}: {milliseconds[:64]!r} is no number of milliseconds")
     return seconds_text(int(milliseconds) * _MILLISECOND)
 
 
@@ -176,7 +177,7 @@ def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -
 
 
 def _in_milliseconds(marks: Sequence[Mark], zero: int) -> list[tuple[int, int]]:
-    """Round spans such that none vanishes, and none overlaps the next of its microphone."""
+    """Round spans; none becomes empty, and none overlaps the next one of its microphone."""
     spans = [(0, 0)] * len(marks)
     last: dict[str, int] = {}
     for i in sorted(range(len(marks)), key=marks.__getitem__):
@@ -200,7 +201,7 @@ def _add_slots(root: ET.Element, spans: Sequence[tuple[int, int]]) -> None:
 
 
 def _add_tiers(root: ET.Element, marks: Sequence[Mark]) -> list[str]:
-    """Add the tiers; return the kinds of those that depend on others."""
+    """Add the tiers; return the types of those below others."""
     kinds: list[str] = []
     identity = len(marks)
     for microphone, reviewer in sorted({(mark.microphone, mark.reviewer) for mark in marks}):
@@ -210,18 +211,18 @@ def _add_tiers(root: ET.Element, marks: Sequence[Mark]) -> list[str]:
             if (mark.microphone, mark.reviewer) == (microphone, reviewer)
         }
         name = f"{microphone}@{reviewer}" if reviewer else microphone
-        about = {"PARTICIPANT": microphone, "ANNOTATOR": reviewer}
-        tier = ET.SubElement(root, "TIER", about, TIER_ID=name, LINGUISTIC_TYPE_REF=_MARKS)
+        who = {"PARTICIPANT": microphone, "ANNOTATOR": reviewer}
+        tier = ET.SubElement(root, "TIER", who, TIER_ID=name, LINGUISTIC_TYPE_REF=_MARKS)
         for i, mark in own.items():
             slots = {"TIME_SLOT_REF1": f"ts{2 * i}", "TIME_SLOT_REF2": f"ts{2 * i + 1}"}
             _add(tier, "ALIGNABLE_ANNOTATION", slots | {"ANNOTATION_ID": f"a{i}"}, mark.label)
-        for kind in _SAYS:
+        for kind in _ORIGIN:
             texts = {i: made_text(m) if kind == "made" else m.corrects for i, m in own.items()}
             if not any(texts.values()):
                 continue
             kinds.append(kind)
             below = {"TIER_ID": f"{kind}: {name}", "PARENT_REF": name, "LINGUISTIC_TYPE_REF": kind}
-            tier = ET.SubElement(root, "TIER", about | below)
+            tier = ET.SubElement(root, "TIER", who | below)
             for i, text in texts.items():
                 if text:
                     identity += 1
@@ -236,12 +237,12 @@ def _add(tier: ET.Element, kind: str, attributes: dict[str, str], text: str) -> 
 
 
 def _add_types(root: ET.Element, kinds: Sequence[str]) -> None:
-    """Add the types of tiers, and what they must obey."""
-    about = {"LINGUISTIC_TYPE_ID": _MARKS, "TIME_ALIGNABLE": "true", "GRAPHIC_REFERENCES": "false"}
-    ET.SubElement(root, "LINGUISTIC_TYPE", about)
+    """Add the types of tiers, and their constraint."""
+    top = {"LINGUISTIC_TYPE_ID": _MARKS, "TIME_ALIGNABLE": "true", "GRAPHIC_REFERENCES": "false"}
+    ET.SubElement(root, "LINGUISTIC_TYPE", top)
     for kind in kinds:
         own = {"LINGUISTIC_TYPE_ID": kind, "TIME_ALIGNABLE": "false"}
-        ET.SubElement(root, "LINGUISTIC_TYPE", about | own, CONSTRAINTS="Symbolic_Association")
+        ET.SubElement(root, "LINGUISTIC_TYPE", top | own, CONSTRAINTS="Symbolic_Association")
     ET.SubElement(
         root,
         "CONSTRAINT",

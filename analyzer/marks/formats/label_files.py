@@ -77,15 +77,7 @@ def read_labels(
 def read_lines(
     path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
 ) -> list[PlacedMark]:
-    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
-
-    Parameters and errors are otherwise those of `read_labels`.
-
-    Returns
-    -------
-    list of PlacedMark
-        With their lines, or their places in a file that has none.
-    """
+    """Read a label file as `read_labels`; labels may overlap, or lie where nothing was recorded."""
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
     if format_ in {AUDACITY, RAVEN}:
@@ -105,7 +97,6 @@ def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Cover
     path : Path
         With a suffix of `table.FORMATS`. Must not exist.
     marks : sequence of Mark
-        Of one microphone for a label track of Audacity.
     coverage : mapping of str to Coverage
         Of each microphone.
 

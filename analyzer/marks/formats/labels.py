@@ -18,36 +18,18 @@ _LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and the logs of 
 
 
 class FileLabel(NamedTuple):
-    """A label as it is in a file: text, empty where the file does not say it.
+    """A label as it is in a file: text, empty where the file has none."""
 
-    Attributes
-    ----------
-    place : int or str
-        The line, or the place in a file without lines.
-    start, end : str
-        Seconds since `zero`, or ISO 8601.
-    label : str
-    microphone, reviewer : str
-    made : str
-        When the label was made, ISO 8601.
-    corrects : str
-        The labelling that it corrects.
-    zero : str
-        ISO 8601; by default the first frame of the microphone.
-    length : str
-        Length of the labelled recording, in seconds.
-    """
-
-    place: int | str
-    start: str
+    place: int | str  # the line, or the place in a file without lines
+    start: str  # seconds since `zero`, or ISO 8601
     end: str
     label: str
     microphone: str = ""
     reviewer: str = ""
-    made: str = ""
+    made: str = ""  # ISO 8601
     corrects: str = ""
-    zero: str = ""
-    length: str = ""
+    zero: str = ""  # ISO 8601; by default the first frame of the microphone
+    length: str = ""  # of the labelled recording, in seconds
 
 
 class PlacedMark(NamedTuple):
@@ -65,22 +47,9 @@ def place_text(path: Path, place: int | str) -> str:
 def make_mark(
     path: Path, label: FileLabel, coverage: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
-    """Make a mark of a label.
+    """Make a mark of a label; `microphone` is that of a label that names none.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file, for errors.
-    label : FileLabel
-    coverage : mapping of str to Coverage
-        Of each microphone.
-    microphone : str or None
-        Of a label that does not name one; not needed if there is only one.
-
-    Raises
-    ------
-    DataError
-        With file and place, if it is no valid mark.
+    Raises DataError with file and place, if it is no valid mark.
     """
     where = place_text(path, label.place)
     only = next(iter(coverage)) if len(coverage) == 1 else ""
@@ -118,13 +87,7 @@ def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
 
 
 def read_seconds(where: str, text: str) -> Decimal:
-    """Read a number of seconds.
-
-    Raises
-    ------
-    DataError
-        If it is no number.
-    """
+    """Read a number of seconds; raise DataError if it is none."""
     if not _SECONDS.fullmatch(text):
         raise DataError(f"{where}: {text[:64]!r} is no number of seconds")
     return Decimal(text)

@@ -1,4 +1,4 @@
-"""Tasks of Label Studio: a task is a microphone, an item of its result a mark."""
+"""Tasks of Label Studio: one for each microphone, with an item for each mark."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,25 +47,25 @@ def _task(microphone: str, marks: Sequence[Mark], coverage: Coverage) -> str:
 
 
 def _item(number: int, mark: Mark, zero: int, length: str) -> str:
-    """Write an item; in pieces, for `json` has no decimals."""
-    says = {"reviewer": mark.reviewer, "made": made_text(mark), "corrects": mark.corrects}
-    about = {
+    """Write an item; its times in pieces, for `json` would round them."""
+    origin = {"reviewer": mark.reviewer, "made": made_text(mark), "corrects": mark.corrects}
+    item = {
         "id": f"mark{number}",
         "from_name": "label",
         "to_name": "audio",
         "type": _TYPE,
         "origin": "manual",
-        "meta": {name: text for name, text in says.items() if text},
+        "meta": {name: text for name, text in origin.items() if text},
     }
     value = (
         f'{{"start": {seconds_text(mark.start - zero)}, "end": {seconds_text(mark.end - zero)}, '
         f'"channel": 0, "labels": [{dumps(mark.label)}]}}'
     )
-    return f'{dumps(about)[:-1]}, "original_length": {length}, "value": {value}}}'
+    return f'{dumps(item)[:-1]}, "original_length": {length}, "value": {value}}}'
 
 
 def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLabel]:
-    """Yield the items of a task: what was annotated or, where it never could be, predicted."""
+    """Yield the annotated items of a task; the predicted ones if it has no annotations."""
     kind = next((kind for kind in ("annotations", "predictions") if kind in task), None)
     if kind is None or not isinstance(task[kind], list):
         raise DataError(f"{path}: {place}: has no annotations and no predictions")
@@ -89,7 +89,7 @@ def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLa
 
 
 def _of_item(path: Path, place: str, item: Any) -> FileLabel | None:
-    """Read an item, None if it is none that labels (a rating, a remark, a relation)."""
+    """Read an item; None for one without a label (a rating, a remark, a relation)."""
     kind = item.get("type") if isinstance(item, dict) else None
     if not isinstance(kind, str) or not kind.endswith(_TYPE):
         return None
@@ -100,15 +100,15 @@ def _of_item(path: Path, place: str, item: Any) -> FileLabel | None:
     if len(names) != 1:
         raise DataError(f"{path}: {place}: has {len(names)} labels; choose one")
     meta = item.get("meta")
-    says = meta if isinstance(meta, dict) else {}
+    origin = meta if isinstance(meta, dict) else {}
     return FileLabel(
         place,
         _text(value["start"]),
         _text(value["end"]),
         _text(names[0]),
-        reviewer=_text(says.get("reviewer")),
-        made=_text(says.get("made")),
-        corrects=_text(says.get("corrects")),
+        reviewer=_text(origin.get("reviewer")),
+        made=_text(origin.get("made")),
+        corrects=_text(origin.get("corrects")),
         length=_text(item.get("original_length")),
     )
 
@@ -124,5 +124,5 @@ def _completed(annotation: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _text(value: Any) -> str:
-    """Return text, empty if there is none; what should be text, and is not, as it is written."""
+    """Return a text, empty for null; other values as JSON."""
     return value if isinstance(value, str) else "" if value is None else dumps(value)

@@ -1,4 +1,4 @@
-"""Selection tables of Raven: columns with tabs between them, and their names in the first line."""
+"""Selection tables of Raven: columns separated by tabs, below their names."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
 from hearthlog.analyzer.marks.marks import Mark
 
-_BAND = ("0.000", "8000.000")  # Hz; of the sound that is listened to
+_BAND = ("0.000", "8000.000")  # Hz, of sound at 16 kHz
 _COLUMNS = (
     "Selection",
     "View",
@@ -25,11 +25,11 @@ _COLUMNS = (
 )
 _TIMES = [name.casefold() for name in _COLUMNS[3:5]]
 _ANNOTATION = _COLUMNS[7].casefold()
-_SAYS = [name.casefold() for name in _COLUMNS[8:]]
+_ORIGIN = [name.casefold() for name in _COLUMNS[8:]]
 
 
 def is_table(text: str) -> bool:
-    """Tell a selection table by its first line."""
+    """Tell by the first line whether this is a selection table."""
     return set(_TIMES) <= set(_names(text.lstrip().split("\n", 1)[0]))
 
 
@@ -49,7 +49,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
                 f"{path}:{number}: has {len(values)} fields, the first line names {len(columns)}"
             )
         row = dict(zip(columns, values, strict=False))  # empty ones may be missing at the end
-        fields = [row.get(name, "") for name in (*_TIMES, _ANNOTATION, *_SAYS)]
+        fields = [row.get(name, "") for name in (*_TIMES, _ANNOTATION, *_ORIGIN)]
         selection = row.get("selection", "")
         identity = (selection, *fields)
         if not selection or identity not in seen:
@@ -58,7 +58,7 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table; what Raven has no column for is in columns of our own, which it keeps."""
+    """Write a table; Raven keeps the columns of ours."""
     channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
     lines = ["\t".join(_COLUMNS)]
     for number, mark in enumerate(marks, 1):

@@ -12,23 +12,12 @@ _MEGABYTE = 1 << 20
 
 
 class LabelFormat(NamedTuple):
-    """A format of label files.
+    """A format of label files."""
 
-    Attributes
-    ----------
-    name : str
-        Of the program, or of the format.
-    suffix : str
-    module : str
-        In this folder.
-    size_limit : int
-        In bytes; the default is enough for a hundred thousand labels.
-    """
-
-    name: str
+    name: str  # of the program, or of the format
     suffix: str
     module: str
-    size_limit: int = 16 * _MEGABYTE
+    size_limit: int = 16 * _MEGABYTE  # enough for a hundred thousand labels
 
     @property
     def pattern(self) -> str:

@@ -1,7 +1,7 @@
-"""The few messages of Rerun's viewer control (0.41) that a page in the browser takes, in protobuf.
+"""The messages of Rerun's viewer control (0.41) that the page in a browser takes, in protobuf.
 
-A viewer in a window takes them from Rerun's own client. A field is its number, times eight and with
-its kind of value; then the value.
+A viewer in a window takes them from Rerun's own client. A field is a head, 8 * number + kind, and a
+value.
 """
 
 from collections.abc import Iterator
@@ -18,22 +18,22 @@ Value = int | bytes
 
 
 def get_state() -> bytes:
-    """Ask what the viewer shows."""
+    """Make the request for what the viewer shows."""
     return _field(_STATE, b"")
 
 
 def get_blueprint() -> bytes:
-    """Ask for the blueprint, which has what the user marked."""
+    """Make the request for the blueprint, which has the selection of the user."""
     return _field(_BLUEPRINT, b"")
 
 
 def set_blueprint(blueprint: str) -> bytes:
-    """Replace the blueprint by one in JSON."""
+    """Make the request to replace the blueprint by one in JSON."""
     return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
 
 
 def set_time(nanoseconds: int, *, play: bool) -> bytes:
-    """Put the cursor on a time."""
+    """Make the request to put the cursor on a time, in nanoseconds of UTC."""
     timeline = _field(2, _field(1, TIMELINE.encode()))
     time = _field(3, _field(1, nanoseconds))
     return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
@@ -45,7 +45,7 @@ def read_blueprint(answer: bytes) -> str:
 
 
 def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
-    """Read the version of a viewer, the reports of each of its views, and its cursor."""
+    """Read the version of a viewer, the errors of each of its views, and its cursor (ns of UTC)."""
     state = _message(answer, _STATE)
     reports = [
         [f"{_text(view, 3)}: {_text(report, 2)}" for report in _messages(view, 6)]
@@ -65,11 +65,11 @@ def _field(number: int, value: Value) -> bytes:
 
 def _varint(value: int) -> bytes:
     """Write a number in groups of seven bits, the lowest first."""
-    found = bytearray()
+    groups = bytearray()
     while value > 0x7F:
-        found.append(value & 0x7F | 0x80)
+        groups.append(value & 0x7F | 0x80)
         value >>= 7
-    return bytes([*found, value])
+    return bytes([*groups, value])
 
 
 def _fields(content: bytes) -> Iterator[tuple[int, Value]]:
@@ -113,23 +113,20 @@ def _read_varint(content: bytes, place: int) -> tuple[int, int]:
     raise ValueError("a number is too long")
 
 
-def _last(content: bytes, wanted: int) -> Value | None:
+def _last(content: bytes, field: int) -> Value | None:
     """Return the last value of a field, which counts; None if there is none."""
-    found: Value | None = None
-    for number, value in _fields(content):
-        if number == wanted:
-            found = value
-    return found
+    values = [value for number, value in _fields(content) if number == field]
+    return values[-1] if values else None
 
 
-def _messages(content: bytes, wanted: int) -> list[bytes]:
-    return [v for number, v in _fields(content) if number == wanted and isinstance(v, bytes)]
+def _messages(content: bytes, field: int) -> list[bytes]:
+    return [v for number, v in _fields(content) if number == field and isinstance(v, bytes)]
 
 
-def _message(content: bytes, wanted: int) -> bytes:
-    found = _last(content, wanted)
-    return found if isinstance(found, bytes) else b""
+def _message(content: bytes, field: int) -> bytes:
+    value = _last(content, field)
+    return value if isinstance(value, bytes) else b""
 
 
-def _text(content: bytes, wanted: int) -> str:
-    return _message(content, wanted).decode(errors="replace")
+def _text(content: bytes, field: int) -> str:
+    return _message(content, field).decode(errors="replace")

@@ -1,4 +1,4 @@
-"""A viewer that shows a timeline, and tells what its user has marked with the mouse."""
+"""A viewer that shows a timeline, and in which the user selects spans with the mouse."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,35 +29,24 @@ Blueprint = dict[str, Any]
 
 
 class ViewerState(NamedTuple):
-    """What a viewer says of itself.
-
-    Attributes
-    ----------
-    version : str
-    views : int
-        That there are.
-    errors : list of str
-        That they report.
-    cursor : int or None
-        Where the time cursor is, in nanoseconds of UTC.
-    """
+    """The state of a viewer, as it reports it."""
 
     version: str
     views: int
     errors: list[str]
-    cursor: int | None
+    cursor: int | None  # of time, in nanoseconds of UTC
 
 
 class ViewerControl(Protocol):
-    """How to speak with one kind of viewer; all raise ConnectionError or TimeoutError."""
+    """Controls one kind of viewer; all methods may raise ConnectionError or TimeoutError."""
 
     process: ViewerProcess
 
     def state(self) -> ViewerState:
-        """Ask what it shows."""
+        """Return its state."""
 
     def blueprint(self) -> Blueprint:
-        """Ask for its blueprint, which has what the user marked."""
+        """Return its blueprint, which has the selection of the user."""
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
         """Replace its blueprint."""
@@ -66,10 +55,10 @@ class ViewerControl(Protocol):
         """Put its cursor on a time."""
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons, where it can."""
+        """Offer buttons (key and text), where there is a page."""
 
     def say(self, text: str) -> None:
-        """Show a line, where it can."""
+        """Show a line, where there is a page."""
 
     def close(self) -> None:
         """Stop it."""
@@ -82,7 +71,7 @@ class Viewer:
     ----------
     control : ViewerControl
     address : str
-        What is to be opened to see it; empty if it opens itself.
+        URL of its page; empty if it opens itself.
     """
 
     def __init__(self, control: ViewerControl, address: str = "") -> None:
@@ -102,21 +91,15 @@ class Viewer:
         self._control.close()
 
     def is_open(self) -> bool:
-        """Tell whether it is still there; somebody may have closed it."""
+        """Tell whether it runs; its user may have closed it."""
         return self._control.process.is_running()
 
     def check(self) -> None:
-        """Raise DataError if it ended because it could not go on."""
+        """Raise DataError if it failed."""
         self._control.process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
-        """Show a timeline, whose spans can be marked.
-
-        Parameters
-        ----------
-        timeline : Timeline
-        close_up : bool
-            Whether its spans are to be looked at one by one.
+        """Show a timeline, with room for short spans of it if `close_up`.
 
         Raises
         ------
@@ -134,17 +117,17 @@ class Viewer:
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
-        """Show every single frame of a span of it, to be zoomed into."""
+        """Draw every frame of a span of the timeline."""
         draw_frames(timeline, self._canvas, start, end)
         self._flush()
 
     def draw_close_up(self, timeline: Timeline) -> None:
-        """Show a short span of it at the resolution of its frames."""
+        """Draw a short timeline beside the one that it is a part of."""
         draw_close_up(timeline, self._canvas)
         self._flush()
 
     def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Show marks as they are now."""
+        """Draw the marks of a microphone again."""
         times, states = changes(marks)
         drawn = self._times.setdefault(microphone, set())
         drawn |= set(times.tolist())
@@ -163,7 +146,7 @@ class Viewer:
         Raises
         ------
         DataError
-            If it ends instead, takes too long, or is of another version than the package.
+            If it ends, takes too long, or is of another version than the package.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:
@@ -181,20 +164,20 @@ class Viewer:
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
 
     def state(self) -> ViewerState:
-        """Ask what it shows; raises ConnectionError or TimeoutError."""
+        """Return its state; raises ConnectionError or TimeoutError, as all that follows."""
         return self._control.state()
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span that is marked on the time ruler, in nanoseconds of UTC."""
+        """Return the span that is selected on the time ruler, in nanoseconds of UTC."""
         panel = self._control.blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
         return _span(panel.get("time_selection"))
 
     def cursor(self) -> int | None:
-        """Return where the time cursor is, in nanoseconds of UTC."""
+        """Return the time of the cursor, in nanoseconds of UTC."""
         return self.state().cursor
 
     def show(self, start: int, end: int, margin: int) -> None:
-        """Mark a span, let the time axes show it and a margin, and put the cursor on its start."""
+        """Select a span, show it with a margin, and put the cursor on its start."""
         blueprint = self._control.blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
         panel["time_selection"] = {"min": start, "max": end}
@@ -209,7 +192,7 @@ class Viewer:
         self._control.set_time(start, play=True)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons in its page, if it has one; each has a key and a text."""
+        """Offer buttons (key and text) in its page, if it has one."""
         self._control.offer(keys, press)
 
     def say(self, text: str) -> None:
@@ -221,19 +204,19 @@ class Viewer:
             self._recording.flush(timeout_sec=_FLUSH_SECONDS)
 
 
-def check_version(found: str) -> None:
+def check_version(version: str) -> None:
     """Raise DataError if a viewer is of another version than the package."""
-    if found != rr.__version__:
+    if version != rr.__version__:
         raise DataError(
-            f"the viewer is of Rerun {found or 'an unknown version'}, and hearthlog works with "
+            f"the viewer is of Rerun {version or 'an unknown version'}, and hearthlog works with "
             f"{rr.__version__}; `pip install rerun-sdk=={rr.__version__}`"
         )
 
 
-def _span(found: Any) -> tuple[int, int] | None:
-    if not isinstance(found, Mapping):
+def _span(selection: Any) -> tuple[int, int] | None:
+    if not isinstance(selection, Mapping):
         return None
-    start, end = found.get("min"), found.get("max")
+    start, end = selection.get("min"), selection.get("max")
     if not isinstance(start, int) or not isinstance(end, int) or start >= end:
         return None
     return start, end

@@ -1,4 +1,4 @@
-"""The viewer in a browser: a page of this machine that relays what is asked of it."""
+"""The viewer in a browser: a page of this machine, which relays requests to the viewer in it."""
 
 import json
 import queue
@@ -26,53 +26,40 @@ _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 @dataclass
 class Relay:
-    """What is asked of a page, and what it answered.
-
-    Attributes
-    ----------
-    keys : list of (str, str)
-        Buttons of the page: the key, and what it does.
-    press : callable
-        Takes the key that was pressed in the page.
-    """
+    """Requests to a page, and its answers. Keys are buttons of the page: a key, and its text."""
 
     keys: Sequence[tuple[str, str]] = ()
     press: Callable[[str], None] = lambda _: None
-    said: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
-    asked: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
+    texts: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
+    requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
     answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
     _last: int = 0
 
     def ask(self, request: bytes) -> bytes:
         """Ask the page, and wait for its answer.
 
-        Raises
-        ------
-        TimeoutError
-            If there is none.
-        ConnectionError
-            If the viewer in the page refused.
+        Raises TimeoutError without an answer, ConnectionError if the viewer in the page refused.
         """
         self._last += 1
         number, answer = self._last, Future[bytes]()
         self.answers[number] = answer
-        self.asked.put((number, request))
+        self.requests.put((number, request))
         try:
             return answer.result(_ANSWER_SECONDS)
         finally:
             del self.answers[number]
 
     def next(self) -> tuple[int, bytes]:
-        """Return the number and content of what is asked next; 0 if nothing is for a while."""
+        """Return number and content of the next request; 0 if there is none for a while."""
         with suppress(queue.Empty):
             while True:
-                number, request = self.asked.get(timeout=_POLL_SECONDS)
+                number, request = self.requests.get(timeout=_POLL_SECONDS)
                 if number in self.answers:  # somebody still waits for it
                     return number, request
         return 0, b""
 
     def answer(self, number: int, content: bytes | None) -> None:
-        """Take an answer; None if the viewer refused."""
+        """Take the answer to a request; None if the viewer refused."""
         waiting = self.answers.get(number)
         if waiting is None or waiting.done():
             return
@@ -83,7 +70,7 @@ class Relay:
 
 
 class _Server(ThreadingHTTPServer):
-    """Serves the page, to those who know its secret."""
+    """Serves the page, below a secret path."""
 
     daemon_threads = True
 
@@ -100,19 +87,19 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers the page; every path begins with the secret."""
+    """Answers requests of the page."""
 
     protocol_version = "HTTP/1.1"
 
     @property
-    def _about(self) -> _Server:
+    def _page(self) -> _Server:
         return cast(_Server, self.server)
 
     def log_message(self, *_: object) -> None:
         """Keep quiet."""
 
     def do_GET(self) -> None:
-        """Hand out the page, the viewer's files, and what is asked next."""
+        """Send the page, the files of the viewer, the next request or the next text."""
         name = self._name()
         if name == "":
             page = files("hearthlog.analyzer.review.viewer").joinpath("page.html").read_bytes()
@@ -120,13 +107,12 @@ class _Handler(BaseHTTPRequestHandler):
                 page, "text/html; charset=utf-8", {"Content-Security-Policy": self._policy()}
             )
         elif name == "about":
-            relay = self._about.relay
-            about = {"data": self._about.data, "keys": list(relay.keys)}
-            self._send(json.dumps(about).encode(), "application/json")
+            description = {"data": self._page.data, "keys": list(self._page.relay.keys)}
+            self._send(json.dumps(description).encode(), "application/json")
         elif name == "next":
             self._send_next()
         elif name == "text":
-            self._send_said()
+            self._send_text()
         elif name in _VIEWER_FILES:
             self._send_viewer_file(name)
         else:
@@ -136,7 +122,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Take an answer, or a key."""
         name = self._name()
         content = self._content()
-        relay = self._about.relay
+        relay = self._page.relay
         if name is None or content is None:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
@@ -148,19 +134,19 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(b"", "text/plain")
 
     def _policy(self) -> str:
-        """Let the page speak with this machine only: the viewer would send usage statistics."""
-        allowed = self._about.data.removeprefix("rerun+").removesuffix("/proxy")
+        """Allow the page to reach this machine only: the viewer would send usage statistics."""
+        allowed = self._page.data.removeprefix("rerun+").removesuffix("/proxy")
         return (
             "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
             f"style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' {allowed}"
         )
 
     def _name(self) -> str | None:
-        """Return what follows the secret; a name of another host is somebody else's page."""
+        """Return the path behind the secret; None if the secret or the host is another one."""
         secret, _, name = self.path.removeprefix("/").partition("/")
-        hosts = {f"{host}:{self._about.server_port}" for host in (HOST, "localhost")}
-        known = secrets.compare_digest(secret.encode(), self._about.secret.encode())
-        return name if known and self.headers.get("Host") in hosts else None
+        hosts = {f"{host}:{self._page.server_port}" for host in (HOST, "localhost")}
+        is_ours = secrets.compare_digest(secret.encode(), self._page.secret.encode())
+        return name if is_ours and self.headers.get("Host") in hosts else None
 
     def _content(self) -> bytes | None:
         length = self.headers.get("Content-Length", "")
@@ -170,12 +156,12 @@ class _Handler(BaseHTTPRequestHandler):
         return self.rfile.read(int(length))
 
     def _send_next(self) -> None:
-        number, request = self._about.relay.next()
+        number, request = self._page.relay.next()
         self._send(request, "application/octet-stream", {"Number": str(number)})
 
-    def _send_said(self) -> None:
+    def _send_text(self) -> None:
         try:
-            text = self._about.relay.said.get(timeout=_POLL_SECONDS)
+            text = self._page.relay.texts.get(timeout=_POLL_SECONDS)
         except queue.Empty:
             self._send(b"", "text/plain; charset=utf-8")
         else:
@@ -183,8 +169,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_viewer_file(self, name: str) -> None:
         kind = "text/javascript" if name.endswith(".js") else "application/wasm"
-        with urllib.request.urlopen(f"{self._about.viewer_files}/{name}") as found:  # noqa: S310
-            self._send(found.read(), kind)
+        with urllib.request.urlopen(f"{self._page.viewer_files}/{name}") as file:  # noqa: S310
+            self._send(file.read(), kind)
 
     def _send(self, content: bytes, kind: str, more: dict[str, str] | None = None) -> None:
         self.send_response(HTTPStatus.OK)
@@ -200,51 +186,37 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
 
-class WebControl:
-    """Speaks with a viewer through the page that it is in.
-
-    Parameters
-    ----------
-    process : ViewerProcess
-        Which hands out data and the files of the viewer.
-    server : _Server
-    """
+class _WebControl:
+    """Controls a viewer through the page that it is in."""
 
     def __init__(self, process: ViewerProcess, server: _Server) -> None:
-        self.process = process
-        self.address = server.url
+        self.process = process  # it hands out the data and the files of the viewer
         self._relay = server.relay
         self._server = server
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
     def state(self) -> ViewerState:
-        """Ask what it shows."""
         version, reports, cursor = messages.read_state(self._relay.ask(messages.get_state()))
         return ViewerState(version, len(reports), [text for one in reports for text in one], cursor)
 
     def blueprint(self) -> Blueprint:
-        """Ask for its blueprint."""
-        found: Any = json.loads(messages.read_blueprint(self._relay.ask(messages.get_blueprint())))
-        return found if isinstance(found, dict) else {}
+        text = messages.read_blueprint(self._relay.ask(messages.get_blueprint()))
+        blueprint: Any = json.loads(text)
+        return blueprint if isinstance(blueprint, dict) else {}
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
-        """Replace its blueprint."""
         self._relay.ask(messages.set_blueprint(json.dumps(blueprint)))
 
     def set_time(self, nanoseconds: int, *, play: bool) -> None:
-        """Put its cursor on a time."""
         self._relay.ask(messages.set_time(nanoseconds, play=play))
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons in the page."""
         self._relay.keys, self._relay.press = keys, press
 
     def say(self, text: str) -> None:
-        """Show a line in the page."""
-        self._relay.said.put(text)
+        self._relay.texts.put(text)
 
     def close(self) -> None:
-        """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
         self.process.close()
@@ -257,7 +229,7 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
     ----------
     port : int, optional
     data : str, optional
-        URL of a server whose data it shows; by default it waits for what is sent to it.
+        URL of a server whose data it shows; by default it shows what is sent to it.
 
     Raises
     ------
@@ -267,4 +239,4 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
     page, viewer_files = free_port(port), free_port()
     process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())
     server = _Server(page, Relay(), f"http://{HOST}:{viewer_files}", data or process.url)
-    return Viewer(WebControl(process, server), server.url)
+    return Viewer(_WebControl(process, server), server.url)

@@ -12,13 +12,8 @@ from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerSta
 _MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
 
 
-class WindowControl:
-    """Speaks with a viewer by Rerun's own client, over gRPC.
-
-    Parameters
-    ----------
-    process : ViewerProcess
-    """
+class _WindowControl:
+    """Controls a viewer by Rerun's own client, over gRPC."""
 
     def __init__(self, process: ViewerProcess) -> None:
         self.process = process
@@ -26,35 +21,30 @@ class WindowControl:
 
     @property
     def client(self) -> ViewerClient:
-        """Rerun's client, connected."""
         if self._client is None:
             self._client = ViewerClient.connect(self.process.url)
         return self._client
 
     def state(self) -> ViewerState:
-        """Ask what it shows."""
-        found = self.client.get_state()
+        state = self.client.get_state()
         errors = [
-            f"{view.name}: {report.summary}" for view in found.views for report in view.reports
+            f"{view.name}: {report.summary}" for view in state.views for report in view.reports
         ]
         cursors = [
             each.current_time
-            for each in found.recordings
-            if each.store_id == found.active_recording
+            for each in state.recordings
+            if each.store_id == state.active_recording
         ]
         cursor = cursors[0] if cursors else None
-        return ViewerState(found.viewer_version or "", len(found.views), errors, cursor)
+        return ViewerState(state.viewer_version or "", len(state.views), errors, cursor)
 
     def blueprint(self) -> Blueprint:
-        """Ask for its blueprint."""
         return self.client.get_blueprint().blueprint
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
-        """Replace its blueprint."""
         self.client.set_blueprint(blueprint, of="recording")
 
     def set_time(self, nanoseconds: int, *, play: bool) -> None:
-        """Put its cursor on a time."""
         self.client.set_time(
             TIMELINE,
             timestamp=np.datetime64(nanoseconds, "ns"),
@@ -68,24 +58,18 @@ class WindowControl:
         """Say nothing: lines are those of the terminal."""
 
     def close(self) -> None:
-        """Close the window."""
         self.process.close()
 
 
 class WindowViewer(Viewer):
-    """A viewer in a window.
-
-    Parameters
-    ----------
-    process : ViewerProcess
-    """
+    """A viewer in a window of its own."""
 
     def __init__(self, process: ViewerProcess) -> None:
-        self._window = WindowControl(process)
+        self._window = _WindowControl(process)
         super().__init__(self._window)
 
     def picture(self) -> bytes:
-        """Return what it shows, as PNG; raises ConnectionError or TimeoutError."""
+        """Return a picture of it as PNG; raises ConnectionError or TimeoutError."""
         return self._window.client.take_screenshot()
 
 
@@ -96,7 +80,7 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
     ----------
     port : int, optional
     data : str, optional
-        URL of a server whose data it shows; by default it waits for what is sent to it.
+        URL of a server whose data it shows; by default it shows what is sent to it.
 
     Raises
     ------
@@ -108,18 +92,16 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
         if data is None
         else "--serve to look from another machine"
     )
-    return _opened(port, *(["--expect-data-soon"] if data is None else _source(data)))
-
-
-def _source(data: str) -> list[str]:
-    return ["--connect", data, "--memory-limit", _MEMORY]
+    if data is None:
+        return _opened(port, "--expect-data-soon")
+    return _opened(port, "--connect", data, "--memory-limit", _MEMORY)
 
 
 def open_hidden(port: int | None = None) -> WindowViewer:
-    """Run the same viewer without a window, for pictures of it; raises as `open_window`."""
+    """Run the same viewer without a window, for pictures; raises DataError as `open_window`."""
     return _opened(port, "--expect-data-soon", "--headless")
 
 
 def _opened(port: int | None, *more: str) -> WindowViewer:
-    limit = ["--server-memory-limit", "32MB"]  # nobody comes later to see what was sent
+    limit = ["--server-memory-limit", "32MB"]  # no other viewer connects later
     return WindowViewer(ViewerProcess(["--hide-welcome-screen", *limit, *more], free_port(port)))
