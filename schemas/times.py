@@ -28,6 +28,12 @@ def millisecond_text(nanoseconds: int) -> str:
 
 
 def time_text(nanoseconds: int) -> str:
-    """Write a time so that none of its digits is lost."""
+    """Write a time with all nine decimals of its seconds."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09}Z"
+
+
+def seconds_text(nanoseconds: int) -> str:
+    """Write nanoseconds as seconds with all nine decimals."""
+    seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
+    return f"{'-' * (nanoseconds < 0)}{seconds}.{rest:09}"

@@ -1,1 +1,1 @@
-"""Logs in the formats of others."""
+"""Logs in other formats, merged or cut."""

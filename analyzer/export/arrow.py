@@ -26,14 +26,14 @@ _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 def schema_of(topic: str, fields: Mapping[str, Field], selection: Selection) -> pa.Schema:
     """Return the Arrow schema of a topic.
 
-    Its metadata are those of the channel, as far as all logs agree on them, and, as JSON list,
-    the `hearthlog` records of the logs.
+    Its metadata are those of the channel that are equal in all logs, and the `hearthlog` records of
+    the logs as a JSON list.
     """
     channels = [channel for channel, _ in selection.channels[topic]]
     agreed = set.intersection(*(set(channel.metadata.items()) for channel in channels))
-    about = {"topic": topic, "hearthlog": json.dumps(selection.metadata)}
+    own = {"topic": topic, "hearthlog": json.dumps(selection.metadata)}
     columns = _HEADS | {column_name(path): type_of(field) for path, field in fields.items()}
-    return pa.schema(columns.items(), metadata=dict(agreed) | about)
+    return pa.schema(columns.items(), metadata=dict(agreed) | own)
 
 
 def column_name(path: str) -> str:

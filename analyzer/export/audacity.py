@@ -13,10 +13,10 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 class LabelTrack:
-    """A label track being written: start, end, label, with tabs between them.
+    """A label track being written: start, end and label, separated by tabs.
 
-    Times are seconds from the first frame of the microphone in the span, and where there are no
-    frames, from the first segment. A segment that began before is cut.
+    Times are seconds since the first frame of the microphone in the span or, without frames, since
+    the first segment. A segment that began before is cut.
     """
 
     def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:
@@ -39,7 +39,7 @@ class LabelTrack:
         lines = [
             f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
             for start, end, label in rows
-            if end > 0  # or it was over before, and known only then
+            if end > 0  # or it ended before, and was logged in the span
         ]
         self._stream.write("".join(lines).encode())
 
@@ -49,10 +49,10 @@ class LabelTrack:
 
 def _first_frame(topic: str, selection: Selection) -> int | None:
     features = topic_of(topic.split("/")[1] if topic.startswith("/") else "", "features")
-    found = iterate_columns(
+    batches = iterate_columns(
         selection.logs, {features}, selection.start, selection.end, {"header.stamp"}
     )
-    first = next(found, None)
+    first = next(batches, None)
     return None if first is None else int(first[0]["header.stamp"].min())
 
 

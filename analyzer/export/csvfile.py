@@ -1,4 +1,4 @@
-"""A topic as CSV: a column a number, named by the channel where it names them."""
+"""A topic as CSV: a column for each number, with the name that the channel gives it."""
 
 from itertools import zip_longest
 from typing import Any, BinaryIO
@@ -72,7 +72,7 @@ class CsvFile:
     def _columns(self, piece: TypedColumns) -> dict[str, pa.Array]:
         columns = piece.columns
         moment = pa.timestamp("ns", "UTC")
-        found = {
+        arrays = {
             "log_time": pa.array(columns.log_times).cast(moment),
             "publish_time": pa.array(columns.publish_times).cast(moment),
             "sequence": pa.array(columns.sequences),
@@ -81,17 +81,17 @@ class CsvFile:
             field = piece.fields[path]
             name = column_name(path)
             if field.elements or (field.size is not None and field.type == "uint8"):
-                found[name] = pa.array(json_texts(values, field), pa.string())
+                arrays[name] = pa.array(json_texts(values, field), pa.string())
             elif field.size is not None:
-                found |= self._spread(piece, path)
+                arrays |= self._spread(piece, path)
             elif field.type == DURATION:
-                found[name] = pa.array(values / NANOSECONDS)
+                arrays[name] = pa.array(values / NANOSECONDS)
             else:
-                found[name] = array_of(values, field)
-        return found
+                arrays[name] = array_of(values, field)
+        return arrays
 
     def _spread(self, piece: TypedColumns, path: str) -> dict[str, pa.Array]:
-        """Make columns of the elements of an array, those that other logs name among them."""
+        """Make a column for each element of an array, and for those that only other logs have."""
         elements = _elements(piece.columns[path], piece.fields[path])
         own = array_names(piece.columns.metadata, path)
         if not own:
@@ -107,14 +107,14 @@ class CsvFile:
 
 
 def _harmless(column: pa.Array) -> pa.Array:
-    """Leave out of texts what would steer a terminal."""
+    """Replace control characters, which would steer a terminal."""
     if not pa.types.is_string(column.type):
         return column
     return pc.replace_substring_regex(column, _CONTROLS, _IN_THEIR_PLACE)
 
 
 def _elements(values: NDArray[Any], field: Field) -> list[pa.Array]:
-    """Turn an array in every message into one column for each of its elements."""
+    """Make a column for each element of an array field."""
     element = field._replace(size=None)
     if values.ndim == 2:
         return [array_of(column, element) for column in np.ascontiguousarray(values.T)]

@@ -13,18 +13,11 @@ from hearthlog.schemas.progress import Progress
 
 
 class OutputFiles:
-    """The files of an export, under temporary names until all are written.
-
-    Attributes
-    ----------
-    path : Path
-        The only file, or the folder.
-    output : Path
-        The name that it gets.
-    """
+    """The files of an export, under temporary names until all are written."""
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
-        self.path, self.output = path, output
+        self.path = path  # the only file, or the folder
+        self.output = output  # the name that it gets
         self._suffix = suffix
         self._names: set[str] = set()
 
@@ -42,20 +35,13 @@ class OutputFiles:
 class Exporter(NamedTuple):
     """How a format writes messages.
 
-    Attributes
-    ----------
-    save : callable
-        Writes a selection to files; raises LogError if a log is damaged, if there is no message, or
-        one that the format has no place for.
-    type : str
-        The only message type that it takes; empty: any.
-    fields : collection of str
-        Those that it needs.
+    `save` raises LogError if a log is damaged, if there is no message, or one that the format has
+    no place for.
     """
 
     save: Callable[[Selection, OutputFiles, Progress], None]
-    type: str = ""
-    fields: Collection[str] = ()
+    type: str = ""  # the only message type that it takes; any by default
+    fields: Collection[str] = ()  # that messages must have
 
 
 class TopicWriter(Protocol):

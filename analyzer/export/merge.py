@@ -1,4 +1,4 @@
-"""Logs put together, or a part of them cut out: messages are copied as they are."""
+"""Logs merged, or a part of them cut out: messages are copied as they are."""
 
 import hashlib
 import json
@@ -40,8 +40,8 @@ def merge_logs(
 ) -> None:
     """Write the messages of a selection to one log, in the order of their log times.
 
-    Messages of one time keep the order of their log. Channels of the same topic, definition and
-    metadata become one. Metadata records and attachments of the logs are kept, the same ones
+    Messages of one time keep the order of their log. Channels of equal topic, definition and
+    metadata become one. Metadata records and attachments of the logs are copied, equal ones
     once; the `rosbag2` record is made anew.
 
     Parameters
@@ -50,11 +50,11 @@ def merge_logs(
     output : Path
         Must not exist.
     progress : callable
-        Is told the share that is done.
+        Is called with the share that is done.
     latched : bool
-        Begin with what a late subscriber would still be given: the last message before the span
-        of every channel that is transient local without end, at the log time of the first one in
-        the span. Its publish time and its content stay as they were.
+        Begin with what a late subscriber would still receive: the last message before the span
+        of each channel that is transient local without end, with the log time of the first message
+        in the span, and its own publish time.
 
     Raises
     ------
@@ -112,7 +112,7 @@ class _Log:
                 self._channel(described)
 
     def write(self, batch: Sequence[RawMessages]) -> None:
-        """Append messages; those of one time in the order in which they were read."""
+        """Append messages; those of one time keep the order in which they were read."""
         places: dict[int, int] = {}
         end = 0
         blocks: list[Block] = []
@@ -180,22 +180,20 @@ class _Log:
         return self._schemas[key]
 
     def _topics(self) -> dict[str, rosbag2.TopicCount] | None:
-        """Describe topics as rosbag2 does; None if it cannot."""
-        found: dict[str, rosbag2.TopicCount] = {}
+        """Describe the topics for rosbag2; None if it cannot describe them."""
+        topics: dict[str, rosbag2.TopicCount] = {}
         for number, (channel, schema) in self._described.items():
-            about = {
+            metadata = {
                 "offered_qos_profiles": json.dumps(_profiles(channel)),
                 "topic_type_hash": channel.metadata.get("topic_type_hash", ""),
             }
             name = "" if schema is None else schema.name
-            topic = found.setdefault(channel.topic, rosbag2.TopicCount(name, about))
-            if channel.message_encoding != ENCODING or (topic.type, topic.channel_metadata) != (
-                name,
-                about,
-            ):
+            topic = topics.setdefault(channel.topic, rosbag2.TopicCount(name, metadata))
+            same = (topic.type, topic.channel_metadata) == (name, metadata)
+            if not same or channel.message_encoding != ENCODING:
                 return None
             topic.messages += self._counts[number]
-        return found
+        return topics
 
 
 def _profile(logs: Sequence[Path]) -> str:
@@ -207,7 +205,7 @@ def _profile(logs: Sequence[Path]) -> str:
 
 
 def _key(record: McapRecord | None) -> Hashable:
-    """Return what equal records have in common; None for those that are not copied."""
+    """Return a key that equal records share; None for those that are not copied."""
     if isinstance(record, Metadata) and record.name != rosbag2.METADATA:
         return record.name, frozenset(record.metadata.items())
     if isinstance(record, Attachment):
@@ -216,15 +214,15 @@ def _key(record: McapRecord | None) -> Hashable:
 
 
 def _latched(selection: Selection) -> dict[str, RawMessages]:
-    """Find, by topic, the last message before the span, where it outlasts its writer."""
+    """Return the last message before the span of each latched topic."""
     lasting = {
         topic
         for topic, same in selection.channels.items()
         if any(is_latched(channel) for channel, _ in same)
     }
-    found: dict[str, RawMessages] = {}
+    latest: dict[str, RawMessages] = {}
     for path in selection.earlier:
-        missing = lasting - found.keys()
+        missing = lasting - latest.keys()
         if not missing:
             break
         last: dict[str, RawMessages] = {}
@@ -233,8 +231,8 @@ def _latched(selection: Selection) -> dict[str, RawMessages]:
                 topic = messages.channel.topic
                 if topic not in last or messages.log_times[-1] >= last[topic].log_times[-1]:
                     last[topic] = messages
-        found |= last
-    return found
+        latest |= last
+    return latest
 
 
 def _at(time: int, messages: RawMessages) -> RawMessages:
@@ -245,7 +243,7 @@ def _at(time: int, messages: RawMessages) -> RawMessages:
 
 
 def is_latched(channel: Channel) -> bool:
-    """Tell whether a late subscriber is still given the last message, however old it is."""
+    """Tell whether a late subscriber still receives the last message, however old it is."""
     return any(
         profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER
         for profile in _profiles(channel)
@@ -253,7 +251,7 @@ def is_latched(channel: Channel) -> bool:
 
 
 def _profiles(channel: Channel) -> list[Any]:
-    """Read the quality of service that a channel offers; nothing if it cannot be understood."""
+    """Read the offered quality of service of a channel; empty if it is invalid."""
     text = channel.metadata.get("offered_qos_profiles", "")
     try:
         return list(dump_qos_v9(parse_qos(text if len(text) < _PROFILES_LIMIT else "")))

@@ -86,7 +86,7 @@ def _column(path: str, values: NDArray[Any], field: Field) -> dict[str, NDArray[
 
 
 def _texts(path: str, values: NDArray[Any]) -> NDArray[np.str_]:
-    """Give all texts the same room, which is how NumPy has them."""
+    """Make an array of texts of equal size, as NumPy has them."""
     longest = max(map(len, values.reshape(-1).tolist()), default=0)
     if values.size * longest * 4 > _TEXTS_LIMIT:
         raise LogError(f"{path}: texts are too long for NPZ; choose parquet")

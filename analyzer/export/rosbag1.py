@@ -80,7 +80,7 @@ class _Bag:
         self._trim()
 
     def _trim(self) -> None:
-        """Forget where messages are in chunks that are written: how many there are is enough."""
+        """Replace the places of messages in written chunks by their number, which is enough."""
         for chunk in self._writer.chunks[self._trimmed : -1]:
             counts = {key: range(len(each)) for key, each in chunk.connections.items()}
             chunk.connections = counts  # type: ignore[assignment]
@@ -110,9 +110,9 @@ class _Bag:
 
 def _types_of(schema: Schema) -> Typestore:
     """Return the types by which messages of a channel are encoded."""
-    known = typestore()
-    if schema.name in known.fielddefs and schema.data == definition(schema.name).encode():
-        return known
+    ours = typestore()
+    if schema.name in ours.fielddefs and schema.data == definition(schema.name).encode():
+        return ours
     try:
         if schema.encoding != SCHEMA_ENCODING:
             raise LogError(f"{schema.name!r} is defined as {schema.encoding!r}")
@@ -121,7 +121,7 @@ def _types_of(schema: Schema) -> Typestore:
             if not _NAME.fullmatch(name):  # code is made of these types
                 raise LogError(f"{name!r} is no name of a type")
         types = get_typestore(Stores.EMPTY)
-        types.register({**known.fielddefs, **own})
+        types.register({**ours.fielddefs, **own})
         types.get_msgdef(schema.name)
     except (TypesysError, UnicodeDecodeError, RecursionError, ValueError, KeyError) as error:
         raise LogError(f"the definition of {schema.name!r} cannot be read") from error

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS, seconds_text
 
 _SHOWN = 4  # elements of an array
 _LENGTH = 120  # characters of a field
@@ -25,13 +25,13 @@ def in_order(
     pieces: Iterable[TypedColumns], lines: Callable[[TypedColumns], list[str]]
 ) -> list[str]:
     """Make a line of every message, in the order of their log times."""
-    found: list[str] = []
+    texts: list[str] = []
     times: list[Int64] = []
     for piece in pieces:
-        found += lines(piece)
+        texts += lines(piece)
         times.append(piece.columns.log_times)
     order = np.argsort(np.concatenate(times), kind="stable")
-    return [found[i] for i in order.tolist()]
+    return [texts[i] for i in order.tolist()]
 
 
 def json_lines(piece: TypedColumns) -> list[str]:
@@ -68,7 +68,7 @@ def text_lines(piece: TypedColumns) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Return a text as it is, or in quotes where it has spaces or could upset a terminal."""
+    """Return a text, in quotes if it has spaces or could steer a terminal."""
     harmless = text.isprintable()
     plain = harmless and text and not set(text) & set(' "')
     return text if plain else json.dumps(text, ensure_ascii=not harmless)
@@ -128,7 +128,7 @@ def _cut(text: str) -> str:
 
 
 def _each(text: Callable[[str], str], values: NDArray[Any]) -> list[str]:
-    """Make texts of strings, of which most are equal."""
+    """Make a text of each string; most are equal."""
     strings = values.tolist()
     made = {value: text(value) for value in set(strings)}
     return [made[value] for value in strings]
@@ -146,11 +146,7 @@ def _numbers(values: NDArray[Any], of_floats: str, separator: str) -> list[str]:
 
 
 def _seconds(values: Int64) -> list[str]:
-    """Make texts of nanoseconds: seconds, none of whose digits is lost."""
-    return [
-        f"{'-' * (value < 0)}{abs(value) // NANOSECONDS}.{abs(value) % NANOSECONDS:09}"
-        for value in values.tolist()
-    ]
+    return list(map(seconds_text, values.tolist()))
 
 
 def _moments(values: Int64) -> list[str]:

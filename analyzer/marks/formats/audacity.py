@@ -5,8 +5,9 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel
 from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import seconds_text
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:

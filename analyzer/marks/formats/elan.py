@@ -18,9 +18,9 @@ from defusedxml.sax import parseString
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import time_text
+from hearthlog.schemas.times import seconds_text, time_text
 
 _MILLISECOND = 1_000_000  # ns
 _START = "hearthlog:start"  # the property that says when the document begins

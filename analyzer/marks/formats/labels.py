@@ -93,12 +93,6 @@ def read_seconds(where: str, text: str) -> Decimal:
     return Decimal(text)
 
 
-def seconds_text(nanoseconds: int) -> str:
-    """Write nanoseconds as seconds with all nine decimals."""
-    seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
-    return f"{'-' if nanoseconds < 0 else ''}{seconds}.{rest:09}"
-
-
 def made_text(mark: Mark) -> str:
     """Write the time at which a mark was made; empty if it is unknown."""
     return time_text(mark.made) if mark.made else ""

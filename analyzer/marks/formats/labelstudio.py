@@ -8,9 +8,9 @@ from typing import Any
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
 from hearthlog.analyzer.marks.marks import Mark
-from hearthlog.schemas.times import time_text
+from hearthlog.schemas.times import seconds_text, time_text
 
 _TYPE = "labels"
 

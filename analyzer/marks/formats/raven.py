@@ -5,8 +5,9 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
 from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import seconds_text
 
 _BAND = ("0.000", "8000.000")  # Hz, of sound at 16 kHz
 _COLUMNS = (

@@ -5,8 +5,9 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, read_seconds, seconds_text
+from hearthlog.analyzer.marks.formats.labels import FileLabel, read_seconds
 from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.times import seconds_text
 
 _TYPE = "SPEAKER"
 _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
