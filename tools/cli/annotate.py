@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.analyzer.marks.formats.table import PATTERNS, find_format
-from hearthlog.tools.cli.options import Microphone, reviewer_name
+from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
@@ -20,12 +20,11 @@ annotate = typer.Typer(
     no_args_is_help=True,
     help="Take marks from the label files of other programs, or write them to such files.",
 )
-_Log = Annotated[Path, typer.Argument(help="A log, or a folder of logs.")]
 
 
 @annotate.command("import")
 def import_labels(
-    log: _Log,
+    log: LocalLog,
     labels: Annotated[Path, typer.Argument(help=f"Labels: {PATTERNS}.")],
     *,
     microphone: Microphone = None,
@@ -63,7 +62,7 @@ def import_labels(
 
 @annotate.command("export")
 def export_labels(
-    log: _Log,
+    log: LocalLog,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to make: {PATTERNS}.")],
     microphone: Microphone = None,

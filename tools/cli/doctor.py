@@ -2,23 +2,18 @@
 
 import json
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.options import Json
+from hearthlog.tools.cli.options import Json, LocalLog
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
 
 
-def doctor(
-    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
-    *,
-    as_json: Json = False,
-) -> None:
+def doctor(path: LocalLog, *, as_json: Json = False) -> None:
     """Check logs: MCAP, the contract, and how they follow each other.
 
     Exit status 1: a log is damaged, or not as hearthlog writes them; 3: one has gaps, or is

@@ -1,11 +1,12 @@
 """`hearthlog enrol`: seconds of a sound into the home's own training set."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import parse_span
+from hearthlog.tools.cli.options import End, Start, parse_span
 from hearthlog.tools.cli.text import tell, wrong_use
 
 
@@ -17,13 +18,8 @@ def enrol(
     log: Annotated[
         Path | None, typer.Option(help="Log, or folder of logs, to enrol a span of.")
     ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            help="Start of the span, as 2026-03-01T07:00:00 (UTC unless it says otherwise)."
-        ),
-    ] = None,
-    end: Annotated[str | None, typer.Option(help="Its end.")] = None,
+    start: Start = None,
+    end: End = None,
     microphone: Annotated[
         str | None, typer.Option(help="Microphone to listen to, as `hearthlog devices` lists it.")
     ] = None,
@@ -50,10 +46,8 @@ def enrol(
         done = enrolment.enrol_file(home, label, file, seconds)
     elif log is None:
         seconds = seconds or enrolment.SECONDS
-        message = f"listening for {seconds:g} s"
-        done = enrolment.enrol_microphone(
-            home, label, microphone or "", seconds, lambda: tell(message)
-        )
+        listening = partial(tell, f"listening for {seconds:g} s")
+        done = enrolment.enrol_microphone(home, label, microphone or "", seconds, listening)
     elif first is None or last is None or seconds is not None:
         wrong_use("--log wants --start and --end, and no --seconds")
     else:

@@ -13,8 +13,11 @@ from typer.core import TyperGroup
 from hearthlog.schemas.text import shortened
 from hearthlog.tools.cli.options import (
     METHODS,
+    SCENARIO,
     Clips,
     Json,
+    LocalLog,
+    OwnScenario,
     Scheduler,
     check_output,
     chosen_method,
@@ -40,7 +43,6 @@ _MOVED = {  # options of one verb that is several now
     "--model": "model",
     "--reference": "log",
 }
-_MOST_NAMED = 10
 
 
 class _Group(TyperGroup):
@@ -60,9 +62,7 @@ evaluate = typer.Typer(
 )
 
 _Method = Annotated[str, typer.Argument(help=METHODS)]
-_Scenario = Annotated[
-    str, typer.Option(help="What is told apart: bathroom, general, or a TOML file.")
-]
+_Scenario = Annotated[str, typer.Option(help=SCENARIO)]
 _Folds = Annotated[
     Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
 ]
@@ -71,7 +71,7 @@ _Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
 
 @evaluate.command("log")
 def evaluate_log(
-    log: Annotated[Path, typer.Argument(help="A log, or a folder of logs.")],
+    log: LocalLog,
     *,
     reference: Annotated[
         str, typer.Option(help="Label file, as `annotate` reads it; or review, for review layers.")
@@ -130,13 +130,7 @@ def evaluate_model(
     model: Annotated[Path, typer.Argument(help="Model file.")],
     *,
     data: Clips,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help="What is told apart: bathroom, general, or a TOML file.",
-            show_default="what the model was trained for",
-        ),
-    ] = None,
+    scenario: OwnScenario = None,
     plot: _Plot = None,
     as_json: Json = False,
 ) -> None:
@@ -305,7 +299,7 @@ def _calibration(result: "CrossValidation | Evaluation") -> dict[str, Any]:
 
 def _unknown_text(seconds_of: Any) -> str:
     """Name the labels that only the reference has, those of the longest time first."""
-    most = sorted(seconds_of.items(), key=lambda item: -item[1])[:_MOST_NAMED]
+    most = sorted(seconds_of.items(), key=lambda item: -item[1])[:10]
     names = ", ".join(f"{shortened(name, NAME_WIDTH)} ({seconds:.1f} s)" for name, seconds in most)
     more = f" and {len(seconds_of) - len(most)} more" if len(seconds_of) > len(most) else ""
     return f"the log does not know these labels of the reference: {names}{more}"

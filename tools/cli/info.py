@@ -2,13 +2,16 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.progress import Progress
 from hearthlog.tools.cli.options import Json, Log
+from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
 
@@ -32,9 +35,9 @@ def info(
         wrong_use("say `hearthlog catalog FOLDER`")
     from hearthlog.analyzer.logs.summarise import summarise
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.progress import track
 
-    summary = summarise(track(find_logs(path), "reading logs"))
+    with share_done("reading logs") as progress:
+        summary = summarise(_each(find_logs(path), progress))
     for error in summary.damaged.values():
         tell(error)
     if not summary.files:
@@ -45,6 +48,12 @@ def info(
         _print(summary)
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
+
+
+def _each(paths: Sequence[Path], progress: Progress) -> Iterator[Path]:
+    for count, path in enumerate(paths, 1):
+        yield path
+        progress(count / len(paths))
 
 
 def _as_json(summary: "Summary") -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.options import Json, manifest_path
+from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, manifest_path
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
@@ -71,20 +71,11 @@ def compare(
     a: Annotated[str, typer.Argument(help="A model, or an alias.")] = "champion",
     b: Annotated[str, typer.Argument(help="A model, or an alias.")] = "candidate",
     folder: _Folder = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv."),
-    ] = None,
+    data: Annotated[Path | None, typer.Option(help=CLIPS)] = None,
     logs: Annotated[
         Path | None, typer.Option(help="Folder of logs with review layers, or one log.")
     ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            help="What is told apart: bathroom, general, or a TOML file.",
-            show_default="what A was trained for",
-        ),
-    ] = None,
+    scenario: OwnScenario = None,
     as_json: Json = False,
 ) -> None:
     """Run two models on the same sound, and say which is better, and how surely.

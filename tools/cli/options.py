@@ -31,6 +31,7 @@ Log = Annotated[
         help="A log, or a folder of logs, or a URL such as s3://bucket/home.", parser=log_location
     ),
 ]
+LocalLog = Annotated[Path, typer.Argument(help="A log, or a folder of logs.")]
 Logs = Annotated[
     list[Path],
     typer.Argument(
@@ -56,8 +57,11 @@ Timezone = Annotated[
         help="Time zone of the home, as Europe/Vienna.", show_default="what the logs say, or UTC"
     ),
 ]
-Clips = Annotated[
-    Path, typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv.")
+CLIPS = "Manifest of labelled clips (CSV), or the folder of a manifest.csv."
+Clips = Annotated[Path, typer.Option(help=CLIPS)]
+SCENARIO = "What is told apart: bathroom, general, or a TOML file."
+OwnScenario = Annotated[
+    str | None, typer.Option(help=SCENARIO, show_default="what the (first) model was trained for")
 ]
 Scheduler = Annotated[
     str | None, typer.Option(help="Work on this Dask cluster, as tcp://host:port.")
@@ -71,13 +75,7 @@ def manifest_path(path: Path) -> Path:
 
 
 def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:
-    """End with the exit status of wrong use unless a new file may have this name.
-
-    Raises
-    ------
-    LogError
-        If it exists.
-    """
+    """End with the exit status of wrong use unless a new file may have this name."""
     from hearthlog.schemas.storage.new_files import check_new
 
     if path is not None and path.suffix != suffix:

@@ -58,10 +58,10 @@ def report(
     count = 1 if week is None else WEEK
     page = output or Path(_name(home_logs, first, count))
     with share_done("reading what was heard") as progress:
-        made = make_report(home_logs, Period(first, count, zone), page, labels, progress)
-    print(made.page)
-    print(made.picture)
-    end_with_warnings(made.losses)
+        result = make_report(home_logs, Period(first, count, zone), page, labels, progress)
+    print(result.page)
+    print(result.picture)
+    end_with_warnings(result.losses)
 
 
 def _first_day(day: str | None, week: str | None) -> date:

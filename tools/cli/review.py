@@ -12,7 +12,7 @@ import typer
 from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
-from hearthlog.tools.cli.options import Microphone, Timezone, parse_span, reviewer_name
+from hearthlog.tools.cli.options import End, Microphone, Start, Timezone, parse_span, reviewer_name
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.text import end_with_warnings, wrong_use
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.timeline.model import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
-_SPANS = 60
 _ALL_FRAMES = 3 * 3600 * 10**9  # ns: of more, the viewer would take a gigabyte
 
 
@@ -31,10 +30,8 @@ def review(
     day: Annotated[
         str | None, typer.Option(help="A day of the home, as 2026-03-01, today or yesterday.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option(help="From this time on, as 2026-03-01T07:00 (UTC).")
-    ] = None,
-    end: Annotated[str | None, typer.Option(help="Up to this time.")] = None,
+    start: Start = None,
+    end: End = None,
     *,
     save: Annotated[
         Path | None,
@@ -48,7 +45,7 @@ def review(
             "a list of `hearthlog diff --list`."
         ),
     ] = None,
-    spans: Annotated[int, typer.Option(min=1, help="How many to go through.")] = _SPANS,
+    spans: Annotated[int, typer.Option(min=1, help="How many to go through.")] = 60,
     labels: Annotated[
         str, typer.Option(help="Labelling to correct: live, or the model of a relabel layer.")
     ] = "live",

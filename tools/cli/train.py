@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import METHODS, Json, Scheduler, chosen_method, manifest_path
+from hearthlog.tools.cli.options import (
+    CLIPS,
+    METHODS,
+    SCENARIO,
+    Json,
+    Scheduler,
+    chosen_method,
+    manifest_path,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
 from hearthlog.tools.cli.table import print_table
@@ -28,13 +36,8 @@ def train(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to make, *.safetensors.")
     ],
-    data: Annotated[
-        list[Path] | None,
-        typer.Option(help="Manifest of labelled clips (CSV), or the folder of a manifest.csv."),
-    ] = None,
-    scenario: Annotated[
-        str | None, typer.Option(help="What to tell apart: bathroom, general, or a TOML file.")
-    ] = None,
+    data: Annotated[list[Path] | None, typer.Option(help=CLIPS)] = None,
+    scenario: Annotated[str | None, typer.Option(help=SCENARIO)] = None,
     home: Annotated[
         list[Path] | None,
         typer.Option(help="Logs with review layers, and enrolled sounds, to learn from as well."),
