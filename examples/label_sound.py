@@ -10,11 +10,11 @@ import hearthlog
 def main(model: str, path: str) -> None:
     """Print what is heard from when to when, and how sure the model is."""
     sound, rate = soundfile.read(path, dtype="int16")
-    heard = hearthlog.classify(hearthlog.load_model(model), sound, rate)
-    confidence = heard.probabilities.max(axis=1)
-    spans = heard.segments
+    labels = hearthlog.classify(hearthlog.load_model(model), sound, rate)
+    confidence = labels.probabilities.max(axis=1)
+    spans = labels.segments
     for start, end, label in zip(spans.starts, spans.ends, spans.labels, strict=True):
-        mean = confidence[(heard.times >= start) & (heard.times < end)].mean()
+        mean = confidence[(labels.times >= start) & (labels.times < end)].mean()
         print(f"{start / 1e9:8.2f} s {end / 1e9:8.2f} s  {label:20} {mean:.2f}")
 
 

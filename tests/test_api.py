@@ -18,7 +18,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import convert_sound, read_audio
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 
@@ -30,8 +30,8 @@ PUBLIC = [name for name in hearthlog.__all__ if not name.startswith("_")]
 FUNCTIONS = [name for name in PUBLIC if inspect.isfunction(getattr(hearthlog, name))]
 
 
-def make_logs(folder, model, sounds):
-    settings = Settings(output=folder, model=model)
+def make_logs(folder, model, sounds, **options):
+    settings = Settings(output=folder, model=model, **options)
     record(settings, settings.microphone[0], FileSource(sounds, START), Flag())
     return folder
 
@@ -51,7 +51,8 @@ def folder(tmp_path_factory, day, model_file, training_set) -> Path:
 def examples_of(name):
     """The examples of a public function, or of a class and its public methods."""
     finder = doctest.DocTestFinder(recurse=inspect.isclass(getattr(hearthlog, name)))
-    return [test for test in finder.find(getattr(hearthlog, name), name) if test.examples]
+    tests = finder.find(getattr(hearthlog, name), name, globs={"hearthlog": hearthlog})
+    return [test for test in tests if test.examples]
 
 
 @pytest.mark.parametrize("name", PUBLIC)
@@ -124,18 +125,18 @@ def test_an_array_of_sound_gives_the_bits_that_a_recorder_logs(model, form, day,
 
     samples, rate = soundfile.read(file, dtype="int16")
     features = hearthlog.extract_features(samples, rate, start=START)
-    heard = hearthlog.classify(hearthlog.load_model(path), samples, rate, START)
+    labels = hearthlog.classify(hearthlog.load_model(path), samples, rate, START)
 
     label, segment = logged["/mic/label"], logged["/mic/segment"]
     assert features.values.tobytes() == logged["/mic/features"]["values"].tobytes()
     assert features.times.tolist() == logged["/mic/features"]["header.stamp"].tolist()
-    assert heard.probabilities.tobytes() == label["probabilities"].tobytes()
-    assert heard.novelty.tobytes() == label["novelty"].tobytes()
-    assert heard.times.tolist() == label["header.stamp"].tolist()
-    assert heard.labels.tolist() == label["label"].tolist()
-    assert heard.segments.starts.tolist() == segment["header.stamp"].tolist()
-    assert (heard.segments.ends - heard.segments.starts).tolist() == segment["duration"].tolist()
-    assert heard.segments.labels.tolist() == segment["label"].tolist()
+    assert labels.probabilities.tobytes() == label["probabilities"].tobytes()
+    assert labels.novelty.tobytes() == label["novelty"].tobytes()
+    assert labels.times.tolist() == label["header.stamp"].tolist()
+    assert labels.labels.tolist() == label["label"].tolist()
+    assert labels.segments.starts.tolist() == segment["header.stamp"].tolist()
+    assert (labels.segments.ends - labels.segments.starts).tolist() == segment["duration"].tolist()
+    assert labels.segments.labels.tolist() == segment["label"].tolist()
 
 
 @pytest.mark.parametrize("dtype", ["int16", "int32", "float32", "float64"])
@@ -160,8 +161,8 @@ def test_what_is_no_sound_is_refused(sound, rate):
 
 
 def test_sound_shorter_than_a_window_has_no_label(model_file):
-    heard = hearthlog.classify(hearthlog.load_model(model_file), np.zeros(8000), 16_000)
-    assert len(heard.times) == len(heard.labels) == len(heard.segments) == 0
+    labels = hearthlog.classify(hearthlog.load_model(model_file), np.zeros(8000), 16_000)
+    assert len(labels.times) == len(labels.labels) == len(labels.segments) == 0
 
 
 def test_arrays_tables_and_frames_hold_the_same(folder):
@@ -182,8 +183,8 @@ def test_a_span_of_time_is_what_is_read(folder):
     logs = hearthlog.open_logs(folder / "logs", START + 60 * SECOND, START + 90 * SECOND)
     times = logs.columns("/mic/features").log_times
     assert (int(times[0]), len(times)) == (START + 60 * SECOND, 600)
-    heard = logs.segments()
-    assert (heard.starts[0], heard.ends[-1]) == (logs.start, logs.end)
+    spans = logs.segments()
+    assert (spans.starts[0], spans.ends[-1]) == (logs.start, logs.end)
     with pytest.raises(HearthlogError, match="no topic /mic/other; there are /diagnostics, "):
         logs.columns("/mic/other")
 
@@ -206,3 +207,14 @@ def test_a_package_that_is_missing_is_named(method, module, folder, monkeypatch)
     logs = hearthlog.open_logs(folder / "logs")
     with pytest.raises(ModuleNotFoundError, match=f"{module} is not installed; try: pip install"):
         getattr(logs, method)("/mic/label")
+
+
+def test_a_damaged_log_is_left_out_of_the_segments_with_a_warning(day, model_file, tmp_path):
+    make_logs(tmp_path / "logs", model_file, [day], max_bag_duration=60)
+    (first, *_) = find_logs(tmp_path / "logs")
+    data = bytearray(first.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    first.write_bytes(data)
+    logs = hearthlog.open_logs(tmp_path / "logs")
+    with pytest.warns(HearthlogWarning, match="damaged"):
+        assert logs.segments().starts[0] >= START + 50 * SECOND

@@ -21,12 +21,13 @@ if TYPE_CHECKING:
         save_model,
     )
     from hearthlog._training import Comparison, compare, train
-    from hearthlog.schemas.errors import HearthlogError
+    from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 
 __all__ = [
     "Columns",
     "Comparison",
     "HearthlogError",
+    "HearthlogWarning",
     "Labelling",
     "Logs",
     "Mark",

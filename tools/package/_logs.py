@@ -1,5 +1,6 @@
 """The public way to read logs; it says what `hearthlog.analyzer.logs` does in fewer words."""
 
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property
 from importlib import import_module
@@ -15,7 +16,7 @@ from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs import follow as growing
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import is_layer
@@ -35,15 +36,9 @@ __all__ = ["Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
 
 
 class Logs:
-    """A log or the logs of a folder, with the layers beside them.
+    """A log or the logs of a folder, with the layers beside them; `open_logs` makes it.
 
-    `open_logs` makes it. All times are integers: nanoseconds of UTC since 1970.
-
-    Parameters
-    ----------
-    path : Path
-    start, end : int, optional
-        Log times: from `start` on, before `end`.
+    All times are integers: nanoseconds of UTC since 1970.
     """
 
     def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
@@ -78,8 +73,8 @@ class Logs:
     @property
     def labellings(self) -> dict[str, list[str]]:
         """Names of the labellings of each microphone that has some, for `segments`."""
-        sources = self._sources
-        return {name: names for name in self.microphones if (names := sources.names(name))}
+        named = {name: self._labellings.names(name) for name in self.microphones}
+        return {name: names for name, names in named.items() if names}
 
     def columns(self, topic: str, fields: Collection[str] | None = None) -> Columns:
         """Read a topic as numpy arrays, one row a message.
@@ -101,7 +96,6 @@ class Logs:
 
         Examples
         --------
-        >>> import hearthlog
         >>> features = hearthlog.open_logs("logs").columns("/mic/features")
         >>> features["values"].shape, features["values"].dtype
         ((3600, 21), dtype('float32'))
@@ -134,7 +128,6 @@ class Logs:
 
         Examples
         --------
-        >>> import hearthlog
         >>> table = hearthlog.open_logs("logs").arrow("/mic/segment")
         >>> table.schema.field("header.stamp").type, table.schema.field("duration").type
         (TimestampType(timestamp[ns, tz=UTC]), DurationType(duration[ns]))
@@ -142,9 +135,9 @@ class Logs:
         table = _optional("pyarrow").Table
         from hearthlog.analyzer.export.arrow import batch_of, schema_of  # noqa: PLC0415  an extra
 
-        parts = self._pieces(topic)
+        parts = self._parts(topic)
         schema = schema_of(topic, parts[0].fields, self._only(topic))
-        return table.from_batches([batch_of(piece, schema) for piece in parts])
+        return table.from_batches([batch_of(part, schema) for part in parts])
 
     def pandas(self, topic: str) -> "pd.DataFrame":
         """Read a topic as a DataFrame; arrays become a column for each of their elements.
@@ -169,14 +162,13 @@ class Logs:
 
         Examples
         --------
-        >>> import hearthlog
         >>> day = hearthlog.open_logs("logs").pandas("/mic/features")
         >>> day["values.energy"].dtype, int(day["header.stamp"].diff().max().total_seconds() * 1000)
         (dtype('float32'), 50)
         """
         pandas = _optional("pandas")
-        parts = self._pieces(topic)
-        columns, fields = join([piece.columns for piece in parts]), parts[0].fields
+        parts = self._parts(topic)
+        columns, fields = join([part.columns for part in parts]), parts[0].fields
         series: dict[str, Any] = {}
         for path, values in columns.fields.items():
             if values.ndim == 2:
@@ -209,18 +201,24 @@ class Logs:
         DataError
             If there is no such labelling, or there are several microphones.
         LogError
-            If there is no segment in this span of time, or a log is damaged.
+            If there is no segment in this span of time.
+
+        Warns
+        -----
+        HearthlogWarning
+            If a log is left out because it is damaged.
 
         Examples
         --------
-        >>> import hearthlog
-        >>> heard = hearthlog.open_logs("logs").segments()
-        >>> heard.labels[0], float(heard.ends[0] - heard.starts[0]) / 1e9
+        >>> spans = hearthlog.open_logs("logs").segments()
+        >>> spans.labels[0], float(spans.ends[0] - spans.starts[0]) / 1e9
         ('silence', 5.95)
         """
-        sources = self._sources
-        microphone = sources.microphone(microphone)
-        side = sources.read(microphone, sources.find(microphone, labelling), self.start, self.end)
+        microphone = self._labellings.microphone(microphone)
+        name = self._labellings.find(microphone, labelling)
+        side = self._labellings.read(microphone, name, self.start, self.end)
+        for loss in self._labellings.losses:
+            warnings.warn(HearthlogWarning(loss, self.path), stacklevel=2)
         return side.labelling
 
     def marks(self) -> list[Mark]:
@@ -238,7 +236,6 @@ class Logs:
 
         Examples
         --------
-        >>> import hearthlog
         >>> [(mark.label, mark.reviewer) for mark in hearthlog.open_logs("logs").marks()]
         [('coughing', 'ada')]
         """
@@ -246,7 +243,7 @@ class Logs:
         return sorted((mark for log in logs for mark in read_marks(log)), key=lambda m: m.start)
 
     @cached_property
-    def _sources(self) -> Labellings:
+    def _labellings(self) -> Labellings:
         return find_labellings(self.path)
 
     def _only(self, topic: str) -> Selection:
@@ -254,12 +251,12 @@ class Logs:
             raise LogError(f"{self.path}: no topic {topic}; there are {', '.join(self.topics)}")
         return self._selection.only([topic])
 
-    def _pieces(self, topic: str) -> list[TypedColumns]:
+    def _parts(self, topic: str) -> list[TypedColumns]:
         selection = self._only(topic)
-        found = [piece for batch in selection.messages() for piece in decode_all(batch)]
-        if not found:
+        parts = [part for batch in selection.messages() for part in decode_all(batch)]
+        if not parts:
             raise selection.nothing()
-        return found
+        return parts
 
 
 def open_logs(path: Path | str, start: int | None = None, end: int | None = None) -> Logs:
@@ -283,7 +280,6 @@ def open_logs(path: Path | str, start: int | None = None, end: int | None = None
 
     Examples
     --------
-    >>> import hearthlog
     >>> logs = hearthlog.open_logs("logs")
     >>> logs.microphones, logs.labellings
     (['mic'], {'mic': ['live', 'review']})
@@ -324,7 +320,6 @@ def follow(
 
     Examples
     --------
-    >>> import hearthlog
     >>> for batch in hearthlog.follow("logs", ["/mic/label"], start=0):
     ...     print(batch[0].topic, batch[0]["label"][0])
     ...     break

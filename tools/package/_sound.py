@@ -101,7 +101,6 @@ def extract_features(
 
     Examples
     --------
-    >>> import hearthlog
     >>> import numpy as np
     >>> tone = 0.1 * np.sin(2 * np.pi * 440 * np.arange(8000) / 16000)
     >>> features = hearthlog.extract_features(tone, 16000)
@@ -143,13 +142,12 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
 
     Examples
     --------
-    >>> import hearthlog
     >>> import soundfile
     >>> sound, rate = soundfile.read("sound.flac", dtype="int16")
-    >>> heard = hearthlog.classify(hearthlog.load_model("home.safetensors"), sound, rate)
-    >>> heard.times[:2] / 1e9, heard.probabilities.shape
+    >>> labels = hearthlog.classify(hearthlog.load_model("home.safetensors"), sound, rate)
+    >>> labels.times[:2] / 1e9, labels.probabilities.shape
     (array([0.95, 1.  ]), (3581, 9))
-    >>> heard.labels[0], heard.segments.labels[0]
+    >>> labels.labels[0], labels.segments.labels[0]
     ('silence', 'silence')
     """
     classifier = Classifier(model)
@@ -190,7 +188,6 @@ def load_model(path: Path | str) -> Model:
 
     Examples
     --------
-    >>> import hearthlog
     >>> model = hearthlog.load_model("home.safetensors")
     >>> model.classes[:3], model.description.feature_set
     (('silence', 'speech', 'music'), 'auros21')
@@ -214,7 +211,6 @@ def save_model(model: Model, path: Path | str) -> None:
 
     Examples
     --------
-    >>> import hearthlog
     >>> hearthlog.save_model(hearthlog.load_model("home.safetensors"), "copy.safetensors")
     """
     modelfile.save_model(model, Path(path))

@@ -45,7 +45,6 @@ def train(
 
     Examples
     --------
-    >>> import hearthlog
     >>> model = hearthlog.train("clips/manifest.csv", "bathroom", method="paper")
     >>> model.classes
     ('silence', 'flushing_water', 'shower', 'tap_water', 'other')
@@ -82,7 +81,6 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
 
     Examples
     --------
-    >>> import hearthlog
     >>> model = hearthlog.load_model("home.safetensors")
     >>> hearthlog.compare(model, model, "clips/manifest.csv").clear
     False
