@@ -25,7 +25,7 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Judged:
+class ComparedModel:
     """One of the models."""
 
     name: str
@@ -37,14 +37,27 @@ class Judged:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What came of it."""
+    """Two models on the same clips.
 
-    a: Judged
-    b: Judged
-    difference: F1Difference  # macro F1 of b minus that of a
-    sources_left_out: int  # one of the models has learned from these
-    held_out: bool  # false if there are no others, and all were used
-    skipped: Mapping[str, int]  # why recordings gave no segment, and how many
+    Attributes
+    ----------
+    a, b : ComparedModel
+    difference : F1Difference
+        Macro F1 of b minus that of a.
+    sources_left_out : int
+        One of the models has learned from these.
+    held_out : bool
+        False if there are no others, and all were used.
+    skipped : mapping of str to int
+        Why recordings gave no segment, and how many.
+    """
+
+    a: ComparedModel
+    b: ComparedModel
+    difference: F1Difference
+    sources_left_out: int
+    held_out: bool
+    skipped: Mapping[str, int]
 
     @property
     def clear(self) -> bool:
@@ -93,7 +106,7 @@ def compare_models(
         for one, i in zip((first, second), inputs, strict=True)
     ]
     judged = [
-        Judged(
+        ComparedModel(
             name=model.name,
             sha256=model.sha256,
             scores=score(target, p.argmax(axis=1), group, data.classes),
