@@ -31,17 +31,9 @@ class Frames:
 
 @dataclass(frozen=True)
 class Gap:
-    """Audio that was not recorded.
+    """Audio that was not recorded."""
 
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    reason : str
-    frames_lost : int
-    """
-
-    start: int
+    start: int  # in nanoseconds of UTC
     end: int
     reason: str
     frames_lost: int
@@ -49,38 +41,21 @@ class Gap:
 
 @dataclass(frozen=True)
 class SourceHealth:
-    """State of a source of sound.
+    """State of a source of sound."""
 
-    Attributes
-    ----------
-    stamp : int
-        In nanoseconds of UTC.
-    level : int
-        `OK`, `WARNING` or `ERROR`.
-    summary : str
-    values : mapping of str to str
-        Details by name.
-    """
-
-    stamp: int
-    level: int
+    stamp: int  # in nanoseconds of UTC
+    level: int  # `OK`, `WARNING` or `ERROR`
     summary: str
-    values: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, str] = field(default_factory=dict)  # details by name
 
 
 Event = Frames | Gap | SourceHealth
 
 
 class SoundSource(Protocol):
-    """Where sound comes from.
+    """Where sound comes from."""
 
-    Attributes
-    ----------
-    device : str
-        Its name.
-    """
-
-    device: str
+    device: str  # its name
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield what the source gives, until it ends or `stop` is set."""
@@ -94,14 +69,7 @@ def event_time(event: Event) -> int:
 
 
 class Notice(NamedTuple):
-    """A sentence about the recorder for its log.
+    """A sentence about the recorder for its log."""
 
-    Attributes
-    ----------
-    level : int
-        `OK`, `WARNING` or `ERROR`.
-    text : str
-    """
-
-    level: int
+    level: int  # `OK`, `WARNING` or `ERROR`
     text: str

@@ -27,17 +27,8 @@ _NEVER = (1 << 63) - 1
 class LogDescription:
     """What every file of a recording says of itself.
 
-    Attributes
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-    topics : sequence of Topic
-    infos : sequence of messages
-        The `AudioStreamInfo` of each microphone, without its stamp.
-    metadata : mapping of str to str
-        The `hearthlog` record.
-    attachments : sequence of Attachment
+    `infos` are the `AudioStreamInfo` of each microphone, without stamps; `metadata` is the
+    `hearthlog` record.
     """
 
     root: Path
@@ -159,20 +150,7 @@ class RollingLog:
         return self._begun[0][1], until
 
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
-        """Complete the open file, and let the next message begin one of another description.
-
-        Parameters
-        ----------
-        description : LogDescription
-            Of the files to come.
-        messages : sequence of EncodedMessage
-            The last ones of the open file.
-
-        Raises
-        ------
-        LogError
-            As `finish` does.
-        """
+        """Complete the file as `finish` does; the next message begins one of this description."""
         self.finish(messages)
         self._description = description
         self._until = 0

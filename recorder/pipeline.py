@@ -29,20 +29,11 @@ from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
 
 
 class EncodedMessage(NamedTuple):
-    """One message on its way into the log.
+    """One message on its way into the log."""
 
-    Attributes
-    ----------
-    log_time : int
-        In nanoseconds of UTC.
-    topic : str
-    data : bytes
-        The message in CDR.
-    """
-
-    log_time: int
+    log_time: int  # in nanoseconds of UTC
     topic: str
-    data: bytes
+    data: bytes  # CDR
 
 
 def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
@@ -127,7 +118,7 @@ class Pipeline:
         return self._push_health(event)
 
     def push_features(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Turn the features of successive frames into messages.
+        """Turn the features of successive frames into messages, in the order of their log times.
 
         Parameters
         ----------
@@ -136,11 +127,6 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times.
         """
         mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))
@@ -189,16 +175,7 @@ class Pipeline:
         return closing, self.report("model", stamp, notice)
 
     def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
-        """Turn a notice into messages.
-
-        Parameters
-        ----------
-        subject : str
-            What it is about: "model" or "clips".
-        stamp : int
-            In nanoseconds of UTC.
-        notice : Notice
-        """
+        """Turn a notice about the "model" or the "clips" into messages."""
         name = f"hearthlog: {self.microphone} {subject}"
         return [
             self._diagnostics(stamp, notice.level, name, notice.text, {}),

@@ -32,24 +32,13 @@ from hearthlog.schemas.messages.topics import topics_of
 
 @dataclass
 class RecordingSummary:
-    """What was recorded.
+    """What was recorded."""
 
-    Attributes
-    ----------
-    logs : list of Path
-        Finished logs.
-    recovered : sequence of Recovered
-        Logs of an earlier recorder that were completed first.
-    frames_lost, gaps : int
-    models_refused : int
-        Model files that could not be used.
-    """
-
-    logs: list[Path]
-    recovered: Sequence[Recovered] = ()
+    logs: list[Path]  # finished ones
+    recovered: Sequence[Recovered] = ()  # logs of an earlier recorder, completed first
     frames_lost: int = 0
     gaps: int = 0
-    models_refused: int = 0
+    models_refused: int = 0  # files that could not be used
 
 
 def record_files(
@@ -151,7 +140,7 @@ def record(
         if settings.model is not None:
             watch = ModelWatch(settings.model, reload_requests or SimpleQueue())
             stack.enter_context(closing(watch))
-        recording = Recording(settings, microphone.name, source.device, watch)
+        recording = RecordingSession(settings, microphone.name, source.device, watch)
         try:
             for event in source.events(stop):
                 recording.add(event)
@@ -160,23 +149,8 @@ def record(
     return recording.summary
 
 
-class Recording:
-    """Everything that one source ends in: its log, and clips beside it.
-
-    Parameters
-    ----------
-    settings : Settings
-    microphone : str
-        Its name.
-    device : str
-        Name of the source.
-    watch : ModelWatch or None
-        Gives the models, one after the other; None for no labels.
-
-    Attributes
-    ----------
-    summary : RecordingSummary
-    """
+class RecordingSession:
+    """The recording of one source: its log, the clips beside it, and the models that label it."""
 
     def __init__(
         self, settings: Settings, microphone: str, device: str, watch: ModelWatch | None
@@ -261,17 +235,7 @@ def _configured_features(settings: Settings, classifier: Classifier | None) -> F
 def describe_log(
     settings: Settings, info: Any, features: FeatureSet, model: Model | None
 ) -> LogDescription:
-    """Return the description of the logs of a recording.
-
-    Parameters
-    ----------
-    settings : Settings
-    info : message
-        Their `AudioStreamInfo`.
-    features : FeatureSet
-    model : Model or None
-        That labels the sound.
-    """
+    """Return the description of the logs of a recording with this `AudioStreamInfo`."""
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]

@@ -27,7 +27,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.service import Recording
+from hearthlog.recorder.service import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
@@ -249,7 +249,7 @@ def ready(watch):
 def record_and_promote(folder, logs, events):
     """Record events; before the second block of frames another model is ready."""
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
-    recording = Recording(Settings(output=logs), "mic", "test", watch)
+    recording = RecordingSession(Settings(output=logs), "mic", "test", watch)
     recording.add(events[0])
     promote(folder, "two")
     ready(watch)

@@ -45,8 +45,8 @@ from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.storage.new_files import new_file, replaced_file
 
 
-class LabelledLog(NamedTuple):
-    """A log that is labelled, its layer not yet complete.
+class UnfinishedLayer(NamedTuple):
+    """The labels of a log, and its segments as far as they are known without other layers.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class LabelledLog(NamedTuple):
     frames: int
     loss: str
 
-    def with_start(self, open_at_start: Run | None) -> "LabelledLog":
+    def with_start(self, open_at_start: Run | None) -> "UnfinishedLayer":
         """Add the open segment with which the layer before ends, where it is lacking."""
         if not self.lacks_start:
             return self
@@ -100,7 +100,7 @@ class LabelledLog(NamedTuple):
         )
 
 
-def label_log(job: Job) -> LabelledLog:
+def label_log(job: Job) -> UnfinishedLayer:
     """Write the labels of a log, and find its segments.
 
     The whole parts of a damaged log are labelled.
@@ -125,7 +125,7 @@ def label_log(job: Job) -> LabelledLog:
             raise LogError(str(error).replace(str(copy), str(job.log))) from error
 
 
-def complete_layer(job: Job, labelled: LabelledLog) -> None:
+def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     """Add the segments, which lack no start, to the labels, and give the layer its name.
 
     Raises
@@ -171,7 +171,7 @@ def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
     return model, Classifier(model)
 
 
-def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> LabelledLog:
+def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> UnfinishedLayer:
     """Label a log, or the copy that was saved of it."""
     info = _checked_info(log, job.log, model)
     labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
@@ -187,7 +187,7 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Labelle
         labeller.close()
     before = stem(job.earlier[0]) if job.earlier else ""
     behind = "" if job.next_log is None or goes_on is None else stem(job.next_log)
-    return LabelledLog(
+    return UnfinishedLayer(
         part=part,
         writer=writer,
         inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),

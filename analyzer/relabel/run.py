@@ -11,7 +11,7 @@ from typing import Any
 
 from hearthlog.analyzer.logs.layers import Chain, find_chains
 from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
-from hearthlog.analyzer.relabel.labels import LabelledLog, complete_layer, label_log
+from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_log
 from hearthlog.analyzer.relabel.layer import (
     LayerMetadata,
     log_digest,
@@ -110,7 +110,7 @@ class _Task:
     job: Job
     metadata: LayerMetadata | None  # of the layer that is there, and may be replaced
     state: _State
-    labelled: LabelledLog | None = None
+    labelled: UnfinishedLayer | None = None
 
 
 class _ChainQueue:
@@ -222,7 +222,7 @@ class _Relabelling:
             if not isinstance(error, Exception):
                 raise error
             self._fail(queue, task, error)
-        elif isinstance(labelled := future.result(), LabelledLog):
+        elif isinstance(labelled := future.result(), UnfinishedLayer):
             task.state, task.labelled = _State.LABELLED, labelled
             check_version(labelled.provenance, task.job.log)
             self._parts.add(labelled.part)
@@ -257,12 +257,12 @@ class _Relabelling:
                     self.result.current.append(task.job.layer)
                     queue.pop(task.metadata.open_at_end)
 
-    def _complete(self, queue: _ChainQueue, task: _Task, labelled: LabelledLog) -> None:
+    def _complete(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
         task.labelled = labelled
         queue.pop(labelled.open_at_end)
         self._running[self._workers.submit(complete_layer, task.job, labelled)] = queue, task
 
-    def _label_alone(self, queue: _ChainQueue, task: _Task, labelled: LabelledLog) -> None:
+    def _label_alone(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
         """Label a log once more, by itself: the layer before, which it should continue, failed."""
         self._delete(labelled.part)
         job = self._job(queue.chain, task.place, continues_layer=False)

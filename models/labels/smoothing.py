@@ -5,9 +5,8 @@ decided a fixed number of frames after its own.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _FLOOR = 1e-6  # least probability: no single frame forbids a class
 # Logarithms are rounded to multiples of this, so that their sums are exact. The path then depends
@@ -16,8 +15,6 @@ _STEP = 2.0**-30
 _FRAMES_AT_ONCE = 4096
 _LANE = 128  # frames
 _WARM_UP = 64  # frames; in real sound 99 of 100 beginnings are forgotten after 32
-
-Indices = NDArray[np.intp]
 
 
 def log_likelihoods(probabilities: Float32) -> Float64:

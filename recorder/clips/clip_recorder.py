@@ -18,15 +18,6 @@ from hearthlog.schemas.times import NANOSECONDS
 class ClipRecorder:
     """Keeps the clips of one recording, if that is configured, and always deletes old ones.
 
-    Parameters
-    ----------
-    settings : Settings
-    pipeline : Pipeline
-        Of the microphone whose sound it is.
-    file_at : callable
-        Returns the log that contains a time, and the end of that log; times are in nanoseconds of
-        UTC.
-
     Raises
     ------
     ConfigurationError
@@ -61,14 +52,7 @@ class ClipRecorder:
         return []
 
     def after(self, event: Event, labels: FrameLabels | None) -> list[Notice]:
-        """Keep the sound of an event that was logged.
-
-        Parameters
-        ----------
-        event : Event
-        labels : FrameLabels or None
-            Of its last frames, if they are labelled.
-        """
+        """Keep the sound of an event that was logged; the labels are those of its last frames."""
         now = event_time(event)
         notices = self._retention.tick(now)
         if self._keep == "off":

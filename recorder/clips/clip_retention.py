@@ -16,16 +16,9 @@ _TIME = "%Y%m%dT%H%M%SZ"
 
 
 class ClipRetention:
-    """Deletes the old clips of a recorder once an hour, by the time of the sound.
+    """Deletes the clips of a node whose logs began `days` ago, once an hour of sound.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of logs; links in it are not followed.
-    node : str
-        Node whose clips they are.
-    days : int
-        Age at which a layer is deleted, counted from the start of its log.
+    Links in the folder are not followed.
     """
 
     def __init__(self, root: Path, node: str, days: int) -> None:
@@ -35,24 +28,19 @@ class ClipRetention:
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
-        """Delete what is old, unless that was done less than an hour ago.
-
-        Parameters
-        ----------
-        now : int
-            In nanoseconds of UTC.
-        """
+        """Delete what is old now (ns of UTC), unless that was done less than an hour ago."""
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
         self._last = now
         deleted = 0
         failures: list[OSError] = []
-        for layer in self._old(now - self._kept, failures):
-            try:
-                layer.unlink()
-                deleted += 1
-            except OSError as error:
-                failures.append(error)
+        for layer, start in find_clips(self._root, self._node, failures):
+            if start < now - self._kept:
+                try:
+                    layer.unlink()
+                    deleted += 1
+                except OSError as error:
+                    failures.append(error)
         notices = []
         if deleted:
             days = self._kept // _DAY
@@ -65,21 +53,11 @@ class ClipRetention:
             notices.append(Notice(WARNING, text))
         return notices
 
-    def _old(self, limit: int, failures: list[OSError]) -> Iterator[Path]:
-        for layer, start in find_clips(self._root, self._node, failures):
-            if start < limit:
-                yield layer
-
 
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
     """Find the layers of sound of a node, whole or damaged.
 
-    Parameters
-    ----------
-    root : Path
-    node : str
-    failures : list of OSError
-        Errors of folders that cannot be read are appended.
+    Errors of folders that cannot be read are appended to `failures`.
 
     Yields
     ------

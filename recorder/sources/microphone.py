@@ -26,15 +26,7 @@ _STEP_SECONDS = 0.25
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
-    Parameters
-    ----------
-    device : str
-        As `hearthlog devices` lists it, or empty for the default one.
-
-    Attributes
-    ----------
-    device : str
-        Name of the microphone that was opened.
+    `device` is as `hearthlog devices` lists it, or empty for the default one.
 
     Raises
     ------

@@ -56,8 +56,8 @@ _DAY = (
     (70, "coughing"),  # night
 )
 
-Event = tuple[int, int, str]  # first sample, sample after the last, label
-Span = tuple[float, float, str]  # the same in seconds
+PlannedSound = tuple[int, int, str]  # first sample, sample after the last, label
+LabelledSpan = tuple[float, float, str]  # the same in seconds
 
 
 def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
@@ -108,7 +108,7 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
     return manifest
 
 
-def write_day(path: Path, minutes: float, seed: int) -> list[Span]:
+def write_day(path: Path, minutes: float, seed: int) -> list[LabelledSpan]:
     """Write a day in the life of a person living alone, hurried into some minutes.
 
     From night to night the sounds come in a plausible order and last as long as they would;
@@ -152,13 +152,13 @@ def write_day(path: Path, minutes: float, seed: int) -> list[Span]:
     return truth
 
 
-def _plan_day(minutes: float, seed: int) -> list[Event]:
+def _plan_day(minutes: float, seed: int) -> list[PlannedSound]:
     total = round(minutes * 60.0 * SAMPLE_RATE) if 0 < minutes <= _MAX_MINUTES else 0
     if total < 1:
         raise SimulationError(f"a day lasts more than 0 and at most 1440 minutes, not {minutes}")
     rng = generator(seed)
     share = total / SAMPLE_RATE / sum(seconds for seconds, _ in _DAY)
-    events: list[Event] = []
+    events: list[PlannedSound] = []
     part_start = 0.0
     for seconds, sounds in _DAY:
         for start, length, label in _plan_part(rng, seconds * share, sounds.split()):
@@ -169,7 +169,7 @@ def _plan_day(minutes: float, seed: int) -> list[Event]:
     return [*events, (_end(events), total, SILENCE)]
 
 
-def _end(events: list[Event]) -> int:
+def _end(events: list[PlannedSound]) -> int:
     return events[-1][1] if events else 0
 
 
@@ -190,7 +190,7 @@ def _plan_part(
     ]
 
 
-def _perform(events: list[Event], seed: int) -> Iterator[Float64]:
+def _perform(events: list[PlannedSound], seed: int) -> Iterator[Float64]:
     """Yield the samples, one sound or at most 10 s of silence at a time."""
     # From 1: a seed (s, 0) gives the numbers of the seed s, which planned the day.
     room = RoomTone(generator(seed, 1))
