@@ -21,21 +21,11 @@ _Content = bytes | tuple[bytes, ...]  # a whole message, or one field after the 
 
 @dataclass
 class ReplayComparison:
-    """Counts of recorded labels and segments, and of how many came out again.
+    """Counts of recorded labels and segments, and of how many came out again."""
 
-    Attributes
-    ----------
-    labels, segments : int
-        Number that were recorded.
-    same_labels : int
-        Came out with the same class for the same frame.
-    identical_labels, identical_segments : int
-        Came out bit for bit, in the fields that were recorded.
-    """
-
-    labels: int = 0
-    same_labels: int = 0
-    identical_labels: int = 0
+    labels: int = 0  # recorded ones
+    same_labels: int = 0  # came out with the same class for the same frame
+    identical_labels: int = 0  # came out bit for bit, in the fields that were recorded
     segments: int = 0
     identical_segments: int = 0
     _unmatched: set[tuple[int, _Absent | None, _Content]] = field(default_factory=set, repr=False)

@@ -13,19 +13,10 @@ _NEVER = (1 << 63) - 1
 
 
 class LogSet:
-    """Logs of one microphone, in the order of their first messages.
+    """Logs of one microphone, in the order of their first messages, without layers among them.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Layers and empty logs among them are left out.
-    kind : str
-        What is replayed: "features", or "audio" for clips.
-
-    Attributes
-    ----------
-    first, last : int
-        Log times of the first and the last message, in nanoseconds of UTC.
+    `kind` is that of `ReplayOptions`; `first` and `last` are the log times of the first and the
+    last message (ns of UTC).
 
     Raises
     ------
@@ -50,13 +41,7 @@ class LogSet:
         return start, min(start + round(options.duration * NANOSECONDS), _NEVER)
 
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
-        """Return the logs to replay, at least one.
-
-        Raises
-        ------
-        LogError
-            If there is none, and as `between`.
-        """
+        """Return the logs to replay, at least one; raises LogError as `between`."""
         infos = self.between(*self.span(options))
         if not infos:
             raise self.nothing()

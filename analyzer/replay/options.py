@@ -27,33 +27,19 @@ class ReplayOptions:
 class Replay:
     """What came of a replay.
 
-    Attributes
-    ----------
-    sources : list of Path
-        Logs that were replayed.
-    logs : list of Path
-        Logs that were written.
-    frames, labels, segments, gaps : int
-    compared : ReplayComparison
-        With the recorded labels and segments.
-    missing : list of int
-        Times (nanoseconds of UTC) before which the logs lack sound that was recorded: the labels
-        of the first second there, and the open segment, cannot be as recorded.
-    unfinished : list of Path
-        Logs that end in the middle, and were replayed up to there.
-    interrupted : bool
-        Whether it was stopped before the end.
+    `missing` are times (ns of UTC) before which the logs lack sound that was recorded: the labels
+    of the first second there, and the open segment, cannot be as recorded.
     """
 
-    sources: list[Path]
-    logs: list[Path] = field(default_factory=list)
+    sources: list[Path]  # logs that were replayed
+    logs: list[Path] = field(default_factory=list)  # that were written
     frames: int = 0
     labels: int = 0
     segments: int = 0
     gaps: int = 0
     compared: ReplayComparison = field(default_factory=ReplayComparison)
     missing: list[int] = field(default_factory=list)
-    unfinished: list[Path] = field(default_factory=list)
+    unfinished: list[Path] = field(default_factory=list)  # cut off, and replayed up to there
     interrupted: bool = False
 
     @property

@@ -1,5 +1,6 @@
 """Recorded features or clips, given to a pipeline again, and a new log of what it makes of them."""
 
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,7 +9,6 @@ from threading import Event as Flag
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
 from hearthlog.analyzer.replay.description import describe
 from hearthlog.analyzer.replay.options import Replay, ReplayOptions
-from hearthlog.analyzer.replay.pace import Pace
 from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
@@ -20,6 +20,7 @@ from hearthlog.recorder.pipeline import EncodedMessage, Pipeline
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
@@ -29,16 +30,8 @@ _LOST = "the log that was replayed does not have it"
 class Player:
     """Gives what recorders recorded to pipelines, one run of a recorder after the other.
 
-    Parameters
-    ----------
-    options : ReplayOptions
-    start : int
-        Log time before which messages are left out.
-    result : Replay
-        Is added to.
-    stop : threading.Event
-    progress : callable
-        Told the time (nanoseconds of UTC) up to which frames were replayed.
+    Messages with log times before `start` are left out; `progress` is told the time (ns of UTC) up
+    to which frames were replayed.
 
     Attributes
     ----------
@@ -62,7 +55,7 @@ class Player:
         self._result = result
         self._stop = stop
         self._progress = progress
-        self._pace = Pace(options.rate)
+        self._pace = _Pace(options.rate)
         self._info: RecorderInfo | None = None  # of the first log of this run of a recorder
         self._opened: Path | None = None
         self._log: RollingLog | None = None
@@ -248,6 +241,27 @@ class Player:
             self._log.finish(messages)
             self._result.logs += self._log.finished
             self._log = None
+
+
+class _Pace:
+    """Waits until the time of a sound has come; `rate` is that of `ReplayOptions`."""
+
+    def __init__(self, rate: float | None) -> None:
+        self._rate = rate
+        self._last: int | None = None
+        self._anchor = 0.0, 0  # a time of the clock, and the time of the sound then
+
+    def wait(self, start: int, end: int, stop: Flag) -> None:
+        """Wait until the end of frames from `start` to `end` (ns of UTC), or until stopped."""
+        if self._rate is None:
+            return
+        if self._last is None or start < self._last:  # the clock was set back
+            self._anchor = time.monotonic(), start
+        self._last = start
+        began, first = self._anchor
+        due = began + (end - first) / NANOSECONDS / self._rate
+        while (left := due - time.monotonic()) > 0 and not stop.wait(min(left, 1.0)):
+            pass
 
 
 def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool:

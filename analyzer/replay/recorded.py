@@ -35,16 +35,7 @@ _RawByType = dict[str, list[RawMessages]]
 
 
 class Features(NamedTuple):
-    """Features of successive frames, as `Pipeline.push_features` takes them.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first frame.
-    values : np.ndarray [shape=(n, d)], float32
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    """
+    """Features of successive frames, as `Pipeline.push_features` takes them."""
 
     first: int
     values: Float32
@@ -52,15 +43,7 @@ class Features(NamedTuple):
 
 
 class RecordedBatch(NamedTuple):
-    """The messages of one span of time of a log.
-
-    Attributes
-    ----------
-    events : list of Features, Gap or SourceHealth
-        In the order in which they were written.
-    labels, segments : list of RawMessages
-        Recorded ones.
-    """
+    """The messages of one span of time of a log; events are in the order of the log."""
 
     events: list[Features | Gap | SourceHealth]
     labels: list[RawMessages]
