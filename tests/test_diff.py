@@ -15,7 +15,7 @@ from spliced import record_logs, run
 from stores import put
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.difference import compare_sides
+from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -125,9 +125,9 @@ def test_agreement_is_that_of_scikit_learn_on_every_frame(pairs):
     both = [(i, *pair) for i, pair in enumerate(pairs) if all(pair)]
     if not both:
         with pytest.raises(DataError, match="no time in common"):
-            compare_sides(frames("live", a), frames("relabel/two", b))
+            compare_labellings(frames("live", a), frames("relabel/two", b))
         return
-    found = compare_sides(frames("live", a), frames("relabel/two", b))
+    found = compare_labellings(frames("live", a), frames("relabel/two", b))
     _, true, said = zip(*both, strict=True)
     minutes = FRAME_NANOSECONDS / (60 * NANOSECONDS)
     expected = confusion_matrix(true, said, labels=CLASSES)
@@ -145,7 +145,9 @@ def test_agreement_is_that_of_scikit_learn_on_every_frame(pairs):
 
 @given(st.lists(st.tuples(*[st.sampled_from(CLASSES)] * 2), min_size=1, max_size=60))
 def test_successive_disagreements_of_one_pair_are_one_span_and_the_longest_comes_first(pairs):
-    found = compare_sides(*(frames(n, [p[i] for p in pairs]) for i, n in enumerate(("live", "b"))))
+    found = compare_labellings(
+        *(frames(n, [p[i] for p in pairs]) for i, n in enumerate(("live", "b")))
+    )
     expected = []
     for i, pair in enumerate(pairs):
         if pair[0] != pair[1]:
@@ -170,7 +172,7 @@ def test_minutes_are_divided_at_midnight_and_an_event_is_of_the_day_it_begins_in
             (MIDNIGHT - minute, MIDNIGHT + 5 * minute, "speech"),
         ],
     )
-    found = compare_sides(a, b)
+    found = compare_labellings(a, b)
     before, after = found.days["2026-03-01"], found.days["2026-03-02"]
     assert (before.minutes, after.minutes) == (2.0, 1.0)
     assert (before.agreement, after.agreement) == (0.5, 1.0)
@@ -187,7 +189,7 @@ def test_minutes_are_divided_at_midnight_and_an_event_is_of_the_day_it_begins_in
 def test_classes_that_only_one_side_knows_are_named():
     a = side("live", [(0, NANOSECONDS, "speech")], ("speech", "music"))
     b = side("relabel/two", [(0, NANOSECONDS, "tap_water")], ("speech", "tap_water"))
-    found = compare_sides(a, b)
+    found = compare_labellings(a, b)
     assert (found.only_a, found.only_b) == (["music"], ["tap_water"])
     assert found.classes == ["speech", "music", "tap_water"]
 
@@ -201,7 +203,7 @@ def test_another_name_for_a_class_is_no_difference():
         (2 * second, 3 * second, "yell"),
     ]
     b = side("relabel/two", rows, ("crying_sobbing", "speech", "shout", "yell"))
-    found = compare_sides(a, b)
+    found = compare_labellings(a, b)
     assert found.classes == ["crying", "speech", "shout", "yell"]
     assert (found.only_a, found.only_b) == ([], ["shout", "yell"]), "b tells these apart"
     assert found.total.per_class["crying"].minutes_both == pytest.approx(1 / 60)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.evaluate_log import compare
+from hearthlog.analyzer.evaluation.evaluate_log import evaluate_labelling
 from hearthlog.analyzer.evaluation.event_scores import (
     Events,
     event_based,
@@ -290,7 +290,7 @@ def test_frames_are_counted_as_if_each_were_looked_at(seed):
     names = np.array([*CLASSES, "doorbell"], object)[rng.integers(0, 4, 11)]
     names[0] = "speech"
     reference = Labelling(times[:-1], times[1:], names)
-    result = compare(reference, found, CLASSES)
+    result = evaluate_labelling(reference, found, CLASSES)
     start = max(found.starts[0], reference.starts[0])
     end = min(found.ends[-1], reference.ends[-1])
     middles = start + FRAME // 2 + FRAME * np.arange((end - start + FRAME // 2 - 1) // FRAME)
@@ -305,7 +305,7 @@ def test_frames_are_counted_as_if_each_were_looked_at(seed):
 
 def test_time_that_only_one_of_them_labels_is_not_evaluated():
     found = labelling((10, 20, "speech"), (20, 30, "silence"))
-    result = compare(labelling((0, 15, "speech"), (25, 100, "silence")), found, CLASSES)
+    result = evaluate_labelling(labelling((0, 15, "speech"), (25, 100, "silence")), found, CLASSES)
     assert (result.reference_seconds, result.evaluated_seconds) == (90.0, 10.0)
     assert result.scores.segments == 200
     assert result.scores.macro_f1 == result.detections.event_based.f1 == 1.0
@@ -313,31 +313,31 @@ def test_time_that_only_one_of_them_labels_is_not_evaluated():
 
 def test_two_labels_at_a_time_are_left_out_of_the_frames_and_said():
     reference = labelling((0, 10, "speech"), (4, 6, "coughing"))
-    result = compare(reference, labelling((0, 10, "speech")), CLASSES)
+    result = evaluate_labelling(reference, labelling((0, 10, "speech")), CLASSES)
     assert (result.ambiguous_seconds, result.scores.segments) == (2.0, 160)
     assert result.detections.segment_based.per_class["coughing"].recall == 0.0
 
 
 def test_labels_that_the_log_does_not_know_are_said():
     reference = labelling((0, 10, "speech"), (10, 14, "doorbell"))
-    result = compare(reference, labelling((0, 14, "speech")), CLASSES)
+    result = evaluate_labelling(reference, labelling((0, 14, "speech")), CLASSES)
     assert result.unknown_labels == {"doorbell": 4.0}
     assert result.scores.segments == 200
     with pytest.raises(DataError, match="none of the labels of the log"):
-        compare(labelling((0, 9, "doorbell")), labelling((0, 14, "speech")), CLASSES)
+        evaluate_labelling(labelling((0, 9, "doorbell")), labelling((0, 14, "speech")), CLASSES)
 
 
 def test_a_reference_may_have_other_names_for_the_classes():
     found = labelling((0, 10, "speech"), (10, 14, "coughing"))
-    ours = compare(labelling((0, 9, "speech"), (9, 14, "coughing")), found, CLASSES)
-    others = compare(labelling((0, 9, "Speech"), (9, 14, "cough")), found, CLASSES)
+    ours = evaluate_labelling(labelling((0, 9, "speech"), (9, 14, "coughing")), found, CLASSES)
+    others = evaluate_labelling(labelling((0, 9, "Speech"), (9, 14, "cough")), found, CLASSES)
     assert others == ours
     assert others.unknown_labels == {}
 
 
 def test_a_reference_of_another_time_is_refused():
     with pytest.raises(DataError, match="have no time in common"):
-        compare(labelling((100, 110, "speech")), labelling((0, 14, "speech")), CLASSES)
+        evaluate_labelling(labelling((100, 110, "speech")), labelling((0, 14, "speech")), CLASSES)
 
 
 # The command

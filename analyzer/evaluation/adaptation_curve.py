@@ -25,7 +25,7 @@ _FEWEST_SEGMENTS = max(CORRECTED)  # to correct, and as many to be tried on
 _SHUFFLES = 3
 
 
-class Curve(NamedTuple):
+class AdaptationCurve(NamedTuple):
     """Macro F1 against the number of corrected segments."""
 
     corrected: tuple[int, ...]
@@ -34,7 +34,7 @@ class Curve(NamedTuple):
     mean: list[float]
 
 
-def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve:
+def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> AdaptationCurve:
     """Leave each collection out in turn and adapt to ever more of it.
 
     Parameters
@@ -63,7 +63,7 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Curve
         progress((place + 1) / len(splits))
     each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
     curves = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
-    return Curve(CORRECTED, curves, each.mean(axis=0).tolist())
+    return AdaptationCurve(CORRECTED, curves, each.mean(axis=0).tolist())
 
 
 def _is_like_a_home(data: Dataset, number: int) -> bool:

@@ -19,7 +19,7 @@ DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
 
 
-class Runs(NamedTuple):
+class LabelRuns(NamedTuple):
     """Time in which both labels stay what they are."""
 
     starts: Int64  # shape (n,)
@@ -27,9 +27,9 @@ class Runs(NamedTuple):
     a: Int64  # shape (n,), indices of classes
     b: Int64
 
-    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Runs":
+    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "LabelRuns":
         """Return some of them."""
-        return Runs(*(column[which] for column in self))
+        return LabelRuns(*(column[which] for column in self))
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,10 @@ class Difference:
     total: Amounts
     confusion: list[list[float]]  # minutes; the classes of a in rows, those of b in columns
     days: dict[str, Amounts]  # by UTC day; an event belongs to the day it begins in
-    disagreements: Runs  # where they differ, longest first
+    disagreements: LabelRuns  # where they differ, longest first
 
 
-def compare_sides(a: NamedLabelling, b: NamedLabelling) -> Difference:
+def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> Difference:
     """Compare two labellings where both have a label.
 
     What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
@@ -107,7 +107,7 @@ def compare_sides(a: NamedLabelling, b: NamedLabelling) -> Difference:
     )
 
 
-def runs_of(pieces: Overlay, a: Events, b: Events) -> Runs:
+def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
     """Join successive pieces whose labels are the same; they may be a frame apart."""
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)
@@ -117,7 +117,7 @@ def runs_of(pieces: Overlay, a: Events, b: Events) -> Runs:
         | (pieces.starts[1:] - pieces.ends[:-1] > FRAME_NANOSECONDS)
     )
     last = np.append(new[1:], True)
-    return Runs(pieces.starts[new], pieces.ends[last], label_a[new], label_b[new])
+    return LabelRuns(pieces.starts[new], pieces.ends[last], label_a[new], label_b[new])
 
 
 class _Counts:

@@ -33,7 +33,7 @@ _LATEST = 1 << 62  # nanoseconds
 
 
 @dataclass(frozen=True)
-class Comparison:
+class LogEvaluation:
     """How a labelled log fits a reference."""
 
     # of frames of 50 ms; the groups are blocks of five minutes, or more in long references
@@ -48,7 +48,9 @@ class Comparison:
     unknown_labels: Mapping[str, float]
 
 
-def compare(reference: Labelling, predicted: Labelling, classes: Sequence[str]) -> Comparison:
+def evaluate_labelling(
+    reference: Labelling, predicted: Labelling, classes: Sequence[str]
+) -> LogEvaluation:
     """Compare labels where both the reference and the log have some.
 
     Parameters
@@ -89,7 +91,7 @@ def compare(reference: Labelling, predicted: Labelling, classes: Sequence[str]) 
             f"have time in common, but {', '.join(unknown)[:200]}"
         )
     scores, ambiguous = _frames(target, output, classes)
-    return Comparison(
+    return LogEvaluation(
         scores=scores,
         detections=detect(named, output, classes, spans.length),
         reference_seconds=_seconds(covered.length),

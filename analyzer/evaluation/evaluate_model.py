@@ -21,7 +21,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class ModelEvaluation:
     """How good a model is on labelled clips."""
 
     scores: Scores  # of segments of a second; the groups are the source groups
@@ -37,7 +37,7 @@ class Evaluation:
 
 def evaluate_model(
     model: Model, clips: Sequence[LabelledClip], scenario: Scenario, progress: Progress
-) -> Evaluation:
+) -> ModelEvaluation:
     """Run a model on clips, and compare what it says with their labels.
 
     Parameters
@@ -68,7 +68,7 @@ def evaluate_model(
         raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
     probabilities = classifier.probabilities(classifier.inputs.of_windows(data.windows))
     scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
-    return Evaluation(
+    return ModelEvaluation(
         scores=scores,
         expected_calibration_error=calibration_error(probabilities, data.target),
         reliability=reliability(probabilities, data.target),

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces, runs
+from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces, ranges
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -168,7 +168,7 @@ def _matches(reference: Events, predicted: Events) -> int:
     count = np.searchsorted(predicted.starts, reference.starts + COLLAR, "right") - first
     if count.sum() > _MOST_PAIRS:
         raise DataError("too many events start within 0.2 s of each other; this is no labelling")
-    row, column = runs(first, count)
+    row, column = ranges(first, count)
     tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
     near = np.abs(reference.ends[row] - predicted.ends[column]) <= tolerance[row]
     if not near.any():

@@ -10,14 +10,14 @@ from hearthlog.analyzer.training.train import check_varied
 from hearthlog.schemas.progress import Progress
 
 
-class Tried(NamedTuple):
+class GridPoint(NamedTuple):
     """A method and how good it was on segments that it had not learned from."""
 
     method: Method
     scores: Scores
 
 
-def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -> list[Tried]:
+def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -> list[GridPoint]:
     """Cross-validate methods that differ in their parameters, all on the same folds.
 
     Parameters
@@ -29,7 +29,7 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
 
     Returns
     -------
-    list of Tried
+    list of GridPoint
         The best macro F1 first. It is optimistic, since the same folds chose it.
 
     Raises
@@ -41,7 +41,7 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
     folds, examples = divide(data, by), prepare(methods[0], data)
     decisions = cross_validate(methods, examples, len(data.classes), folds, progress)
     tried = [
-        Tried(method, score(data.target, decided.argmax(axis=1), data.group, data.classes))
+        GridPoint(method, score(data.target, decided.argmax(axis=1), data.group, data.classes))
         for method, decided in zip(methods, decisions, strict=True)
     ]
     return sorted(tried, key=lambda one: -one.scores.macro_f1)

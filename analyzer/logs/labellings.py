@@ -38,7 +38,7 @@ LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
 _EVER = 1 << 62  # nanoseconds
 
 
-class LabelledLog(NamedTuple):
+class LogContents(NamedTuple):
     """A log or a layer, and what labels it has."""
 
     path: Path
@@ -67,7 +67,7 @@ class NamedLabelling(NamedTuple):
 class Labellings:
     """The labellings of a log, or of a folder of logs."""
 
-    logs: Sequence[LabelledLog]  # with their layers, in the order of time
+    logs: Sequence[LogContents]  # with their layers, in the order of time
     losses: list[str] = field(default_factory=list)  # what could not be used, and why
 
     def microphone(self, name: str | None) -> str:
@@ -155,7 +155,7 @@ class Labellings:
 
     def with_topic(
         self, topic: str, start: int | None = None, end: int | None = None
-    ) -> list[LabelledLog]:
+    ) -> list[LogContents]:
         """List the logs that have a topic, and messages at a span of time."""
         return [
             log
@@ -219,14 +219,14 @@ def find_labellings(*paths: Path) -> Labellings:
         If there is no log, or none that can be read.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
-    logs = [log for log in opened if isinstance(log, LabelledLog)]
+    logs = [log for log in opened if isinstance(log, LogContents)]
     losses = [str(error) for error in opened if isinstance(error, LogError)]
     if not logs:
         raise LogError(losses[0] if losses else f"{paths[0]}: there is no message in these logs")
     return Labellings(sorted(logs, key=lambda log: log.first), losses)
 
 
-def _opened(path: Path) -> LabelledLog | LogError | None:
+def _opened(path: Path) -> LogContents | LogError | None:
     """Look into a log; None if it is sound, and empty."""
     try:
         selection = select([path])
@@ -239,7 +239,7 @@ def _opened(path: Path) -> LabelledLog | LogError | None:
     return None if complete else LogError(f"{path}: unfinished, and nothing of it is whole")
 
 
-def _log(path: Path, selection: Selection) -> LabelledLog:
+def _log(path: Path, selection: Selection) -> LogContents:
     classes = {
         topic: [
             name
@@ -249,4 +249,4 @@ def _log(path: Path, selection: Selection) -> LabelledLog:
         for topic in selection.topics_of(message_types.LABEL, LABEL_FIELDS)
     }
     segments = frozenset(selection.topics_of(message_types.SEGMENT, FIELDS))
-    return LabelledLog(path, *selection.span, not selection.unfinished, segments, classes)
+    return LogContents(path, *selection.span, not selection.unfinished, segments, classes)

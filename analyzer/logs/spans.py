@@ -74,7 +74,7 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
     return Spans(starts[firsts], np.maximum.reduceat(ends, firsts)) if len(firsts) else NONE
 
 
-def runs(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
+def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
     """Count up from each of some numbers.
 
     Returns
@@ -98,7 +98,7 @@ def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
     """
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
-    of_a, of_b = runs(low, np.maximum(high - low, 0))
+    of_a, of_b = ranges(low, np.maximum(high - low, 0))
     starts = np.maximum(a.starts[of_a], b.starts[of_b])
     return Spans(starts, np.minimum(a.ends[of_a], b.ends[of_b])), of_a, of_b
 

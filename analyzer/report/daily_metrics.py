@@ -37,18 +37,18 @@ MOST = 0.75  # of a day and of its night, for its figures to be compared
 _BIN, _BUSY = 10 * _MINUTE, _MINUTE
 
 
-class Events(NamedTuple):
+class CountedEvents(NamedTuple):
     """What happened, by when it began."""
 
     starts: Int64  # shape (n,), in nanoseconds of UTC; they ascend
     chances: NDArray[np.float64]  # shape (n,), of each that it happened
 
-    def between(self, spans: Spans) -> "Events":
+    def between(self, spans: Spans) -> "CountedEvents":
         """Leave those that began in some spans of time."""
         of = np.searchsorted(spans.starts, self.starts, side="right") - 1
         inside = of >= 0
         inside[inside] = self.starts[inside] < spans.ends[of[inside]]
-        return Events(self.starts[inside], self.chances[inside])
+        return CountedEvents(self.starts[inside], self.chances[inside])
 
     @property
     def number(self) -> Count:
@@ -59,7 +59,7 @@ class Events(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Home:
+class HomeMetrics:
     """What was heard in a home, by all its microphones together."""
 
     classes: list[str]
@@ -69,11 +69,11 @@ class Home:
     spans: dict[str, Spans]  # by class: when at least one of them heard it
     # by class, but silence; spans with no more than ten seconds between them are one event, and
     # so are those of two microphones at one time
-    events: dict[str, Events]
+    events: dict[str, CountedEvents]
 
-    def between(self, start: int, end: int) -> "Home":
+    def between(self, start: int, end: int) -> "HomeMetrics":
         """Leave what was heard in a span of time."""
-        return Home(
+        return HomeMetrics(
             self.classes,
             cut(self.coverage, start, end),
             {name: cut(spans, start, end) for name, spans in self.listened.items()},
@@ -83,7 +83,7 @@ class Home:
         )
 
 
-def whole_home(data: HomeData) -> Home:
+def whole_home(data: HomeData) -> HomeMetrics:
     """Put together what the microphones heard."""
     parts = list(data.segments.values())
     starts, ends, labels, chances = (
@@ -106,16 +106,16 @@ def whole_home(data: HomeData) -> Home:
     if SILENCE in spans:
         spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
         del events[SILENCE]
-    return Home(classes, everything, listened, sound, spans, events)
+    return HomeMetrics(classes, everything, listened, sound, spans, events)
 
 
-def _events(starts: Int64, ends: Int64, chances: NDArray[np.float64]) -> Events:
+def _events(starts: Int64, ends: Int64, chances: NDArray[np.float64]) -> CountedEvents:
     """Make events of segments; of each the surest segment counts."""
     order = np.argsort(starts, kind="stable")
     starts, ends, chances = starts[order], ends[order], chances[order]
     firsts = first_of_groups(starts, ends, _EVENT_PAUSE)
     best = np.maximum.reduceat(chances, firsts) if len(firsts) else chances
-    return Events(starts[firsts], best)
+    return CountedEvents(starts[firsts], best)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Day:
     """The figures of one day, and of the night that ends on it."""
 
     day: date
-    home: Home
+    home: HomeMetrics
     zone: tzinfo
     span: Spans  # a single span, as the night is
     night: Spans
@@ -156,11 +156,11 @@ class Day:
             return None
         return _minutes(common(self.home.spans.get(name, NONE), self.span))
 
-    def events(self, name: str) -> Events:
+    def events(self, name: str) -> CountedEvents:
         """Events of a class that began on this day."""
         return _of(self.home, name).between(self.span)
 
-    def night_events(self, name: str) -> Events:
+    def night_events(self, name: str) -> CountedEvents:
         """Events of a class that began in the night."""
         return _of(self.home, name).between(self.night)
 
@@ -242,7 +242,7 @@ class Day:
         return Clock(60 * local.hour + local.minute)
 
 
-def day_of(home: Home, day: date, zone: tzinfo) -> Day:
+def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
     """Look at one day of a home."""
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
@@ -251,8 +251,8 @@ def day_of(home: Home, day: date, zone: tzinfo) -> Day:
     return Day(day, near, zone, span, night, common(near.coverage, span))
 
 
-def _of(home: Home, name: str) -> Events:
-    return home.events.get(name, Events(NONE.starts, np.empty(0)))
+def _of(home: HomeMetrics, name: str) -> CountedEvents:
+    return home.events.get(name, CountedEvents(NONE.starts, np.empty(0)))
 
 
 def _minutes(spans: Spans) -> Minutes:

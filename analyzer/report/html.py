@@ -17,18 +17,18 @@ class Cell(NamedTuple):
     whole: bool = False
 
 
-class Row(NamedTuple):
+class TableRow(NamedTuple):
     """A row of a table, whose first cell is its head."""
 
     cells: Sequence[Cell]
     kind: str = ""
 
 
-class Table(NamedTuple):
+class PageTable(NamedTuple):
     """A table and its class in the style."""
 
     heads: Sequence[str]
-    rows: Sequence[Row]
+    rows: Sequence[TableRow]
     kind: str = ""
 
 

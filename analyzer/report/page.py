@@ -15,9 +15,15 @@ from hearthlog.analyzer.report.class_words import (
     times_in_words,
 )
 from hearthlog.analyzer.report.daily_metrics import Day
-from hearthlog.analyzer.report.html import Cell, Row, Table, fill_page
+from hearthlog.analyzer.report.html import Cell, PageTable, TableRow, fill_page
 from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.sections import Figure, Section, events_of, minutes_of, sections
+from hearthlog.analyzer.report.sections import (
+    Figure,
+    FigureSection,
+    events_of,
+    minutes_of,
+    sections,
+)
 from hearthlog.analyzer.report.summary_text import (
     gist_of_day,
     gist_of_week,
@@ -37,8 +43,8 @@ _PARTLY = 0.95
 class Part(NamedTuple):
     """A section of the page: its table, and what is remarked on it."""
 
-    section: Section
-    table: Table
+    section: FigureSection
+    table: PageTable
     remarks: Sequence[str] = ()
 
 
@@ -95,7 +101,7 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
     )
 
 
-def _sounds(account: Account, day: Day) -> Table:
+def _sounds(account: Account, day: Day) -> PageTable:
     """Tell minutes and events of each class but those that were not heard at all."""
     tested = any(name in account.precisions for name in account.classes)
     usually = ["Usually"] * account.comparable
@@ -109,8 +115,8 @@ def _sounds(account: Account, day: Day) -> Table:
             cells += [Cell("")] * (1 + account.comparable)
         else:
             cells += _cells(account, events_of(name), day)
-        rows.append(Row(cells + [Cell(_tenths(account.precisions.get(name)))] * tested))
-    return Table(heads, rows)
+        rows.append(TableRow(cells + [Cell(_tenths(account.precisions.get(name)))] * tested))
+    return PageTable(heads, rows)
 
 
 def _was_heard(account: Account, name: str) -> bool:
@@ -133,13 +139,13 @@ def _text(value: Value | None) -> str:
     return "not known" if value is None else value.text
 
 
-def _part(account: Account, section: Section, day: Day) -> Part:
+def _part(account: Account, section: FigureSection, day: Day) -> Part:
     heads = ["", "This day", *["Usually"] * account.comparable]
-    rows = [Row([Cell(f.title), *_cells(account, f, day)]) for f in section.figures]
-    return Part(section, Table(heads, rows), list(_remarks(section, day)))
+    rows = [TableRow([Cell(f.title), *_cells(account, f, day)]) for f in section.figures]
+    return Part(section, PageTable(heads, rows), list(_remarks(section, day)))
 
 
-def _remarks(section: Section, day: Day) -> Iterator[str]:
+def _remarks(section: FigureSection, day: Day) -> Iterator[str]:
     share = _share(section.figures, day)
     if share < _PARTLY * day.share:
         yield f"These sounds could be heard for {percent(share)} of the day only."
@@ -165,7 +171,7 @@ def _coughing(day: Day) -> str:
     return f"Coughing as marked: {', '.join(each)}. About {rate:.1f} an hour."
 
 
-def _week(account: Account, figures: Sequence[Figure]) -> Table:
+def _week(account: Account, figures: Sequence[Figure]) -> PageTable:
     """Tell figures of seven days, their total, and what is usual on a day."""
     rows = []
     for day in account.days:
@@ -178,11 +184,11 @@ def _week(account: Account, figures: Sequence[Figure]) -> Table:
     if account.comparable:
         usually = (_dense(account.usually(figure)) for figure in figures)
         rows.append(_row("Usual day", "", *usually, kind="usual"))
-    return Table(["Day", "Heard", *(figure.short for figure in figures)], rows, "wide")
+    return PageTable(["Day", "Heard", *(figure.short for figure in figures)], rows, "wide")
 
 
-def _row(*texts: str, kind: str = "") -> Row:
-    return Row([Cell(text) for text in texts], kind)
+def _row(*texts: str, kind: str = "") -> TableRow:
+    return TableRow([Cell(text) for text in texts], kind)
 
 
 def _share(figures: Sequence[Figure], day: Day) -> float:
@@ -213,7 +219,7 @@ def _sum(values: Sequence[Value]) -> Count | Minutes | None:
     return sum(counts, Count()) if counts else sum(minutes, Minutes())
 
 
-def _interrai(account: Account, days: Sequence[Day]) -> Table:
+def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
     """Tell what sound can say to an assessment."""
     rows = []
     for item in interrai.ITEMS:
@@ -221,7 +227,7 @@ def _interrai(account: Account, days: Sequence[Day]) -> Table:
         values = [value for day in days if (value := item.value(day)) is not None]
         text = _text(_sum(values)) if audible else "this model does not know the sound"
         rows.append(_row(item.topic, item.heard, text, item.limits))
-    return Table(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
+    return PageTable(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
 
 
 def _tenths(share: float | None) -> str:

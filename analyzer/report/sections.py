@@ -21,7 +21,7 @@ class Figure(NamedTuple):
     sums: bool = True  # whether a total over days means something
 
 
-class Section(NamedTuple):
+class FigureSection(NamedTuple):
     """Figures that belong together; `missing` says why there are none."""
 
     title: str
@@ -30,12 +30,14 @@ class Section(NamedTuple):
     missing: str = ""
 
 
-def sections(classes: Sequence[str]) -> list[Section]:
+def sections(classes: Sequence[str]) -> list[FigureSection]:
     """Return the tables, for the classes that the model of a home knows."""
     return [
-        Section("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)),
-        Section("Night", list(_night(classes)), _NIGHT_NOTE),
-        Section("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
+        FigureSection(
+            "Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)
+        ),
+        FigureSection("Night", list(_night(classes)), _NIGHT_NOTE),
+        FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
     ]
 
 

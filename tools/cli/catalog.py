@@ -15,7 +15,7 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog.catalog import Catalog
-    from hearthlog.analyzer.logs.catalog.fleet import Home, LabelAmount
+    from hearthlog.analyzer.logs.catalog.fleet import HomeSummary, LabelAmount
 
 _HOMES_SHOWN = 40  # that is a page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
@@ -84,13 +84,13 @@ def _write(folder: Path) -> "Catalog":
         raise
 
 
-def _home(home: "Home") -> dict[str, object]:
+def _home(home: "HomeSummary") -> dict[str, object]:
     times = {"start": moment(home.start), "end": moment(home.end)}
     return asdict(home) | times | {"hours": home.hours}
 
 
 def _print(
-    homes: Sequence["Home"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
+    homes: Sequence["HomeSummary"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
 ) -> None:
     print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
     if len(homes) > _HOMES_SHOWN:
@@ -99,14 +99,14 @@ def _print(
     print_lines(first_of("unfinished", unfinished))
 
 
-def _home_rows(homes: Sequence["Home"]) -> Iterator[Sequence[str]]:
+def _home_rows(homes: Sequence["HomeSummary"]) -> Iterator[Sequence[str]]:
     for home in homes[:_HOMES_SHOWN]:
         yield _home_row(home.home or "-", [home])
     if len(homes) > 1:
         yield _home_row(number(len(homes), "home"), homes)
 
 
-def _home_row(name: str, homes: Sequence["Home"]) -> Sequence[str]:
+def _home_row(name: str, homes: Sequence["HomeSummary"]) -> Sequence[str]:
     starts = [home.start for home in homes if home.start is not None]
     ends = [home.end for home in homes if home.end is not None]
     return [

@@ -88,10 +88,10 @@ class _Result(NamedTuple):
 
 
 def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
-    from hearthlog.analyzer.evaluation.difference import compare_sides
+    from hearthlog.analyzer.evaluation.difference import compare_labellings
     from hearthlog.analyzer.review.queue.review_list import disagreements
 
-    difference = compare_sides(*sides)
+    difference = compare_labellings(*sides)
     figures = {"microphone": microphone, **asdict(difference)}
     figures["disagreements"] = len(difference.disagreements.starts)
     spans = partial(disagreements, difference, microphone)  # there may be a hundred thousand

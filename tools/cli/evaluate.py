@@ -30,7 +30,7 @@ from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
-    from hearthlog.analyzer.evaluation.evaluate_model import Evaluation
+    from hearthlog.analyzer.evaluation.evaluate_model import ModelEvaluation
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
@@ -87,13 +87,13 @@ def evaluate_log(
 
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
-    from hearthlog.analyzer.evaluation.evaluate_log import compare, read_reference
+    from hearthlog.analyzer.evaluation.evaluate_log import evaluate_labelling, read_reference
     from hearthlog.analyzer.logs.labelling import read_labelling
 
     check_output("--plot", plot, ".png", "a picture")
     labelled = read_labelling(log, topic)
     true = read_reference(reference, log, labelled.microphone)
-    result = compare(true, labelled.labelling, labelled.classes)
+    result = evaluate_labelling(true, labelled.labelling, labelled.classes)
     _save_plot(plot, f"{labelled.topic} of {log} against {reference}", result.scores)
     if as_json:
         scores = asdict(result.scores)
@@ -290,7 +290,7 @@ def _learning(
             yield method, segments, progress
 
 
-def _calibration(result: "CrossValidation | Evaluation") -> dict[str, Any]:
+def _calibration(result: "CrossValidation | ModelEvaluation") -> dict[str, Any]:
     return {
         "expected_calibration_error": result.expected_calibration_error,
         "reliability": [asdict(one) for one in result.reliability],

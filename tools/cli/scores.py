@@ -8,7 +8,7 @@ from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.event_scores import Detections
-    from hearthlog.analyzer.evaluation.grid_search import Tried
+    from hearthlog.analyzer.evaluation.grid_search import GridPoint
     from hearthlog.analyzer.training.scores import Bin, Interval, Scores
 
 _CLASS = ("class", "support", "precision", "recall", "F1", "95 %")
@@ -59,7 +59,7 @@ def print_reliability(bins: "Sequence[Bin]", error: float) -> None:
     print_table(("sure", "right", "segments"), rows, words=0)
 
 
-def print_search(tried: "Sequence[Tried]") -> None:
+def print_search(tried: "Sequence[GridPoint]") -> None:
     """Print the scores of each method that was tried."""
     rows = [
         (

@@ -35,7 +35,7 @@ _NEVER = -1
 
 
 @dataclass(frozen=True)
-class Row:
+class CatalogRow:
     """What a catalogue says of one file; docs/catalog.md explains the columns.
 
     Times are nanoseconds of UTC. What a file does not say is None, or empty.
@@ -95,7 +95,7 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.table)
 
-    def current(self, path: Path) -> Row | None:
+    def current(self, path: Path) -> CatalogRow | None:
         """Return what is said of a file; None if nothing is, or the file was changed since."""
         number = self.find(path)
         return None if number is None else next(self.rows(number, 1))
@@ -118,13 +118,13 @@ class Catalog:
             return None
         return number
 
-    def rows(self, first: int = 0, count: int | None = None) -> Iterator[Row]:
+    def rows(self, first: int = 0, count: int | None = None) -> Iterator[CatalogRow]:
         """Go through rows, by default all."""
         for batch in self._plain.slice(first, count).to_batches(_BATCH):
             for values in batch.to_pylist():
-                yield Row(**values)
+                yield CatalogRow(**values)
 
-    def of_state(self, state: str) -> list[Row]:
+    def of_state(self, state: str) -> list[CatalogRow]:
         """Return the rows of files of one state."""
         states = self.table["state"].to_pylist()
         return [row for n, same in enumerate(states) if same == state for row in self.rows(n, 1)]
@@ -181,7 +181,7 @@ def write_catalog(
     logs = find_logs(folder)
     kept, new = _divided(logs, before)
     tables = [SCHEMA.empty_table() if before is None else before.table.take(kept)]
-    rows: list[Row] = []
+    rows: list[CatalogRow] = []
     interrupt: KeyboardInterrupt | None = None
     with replaced_file(folder / CATALOG) as temporary, temporary.open("wb") as stream:
         try:
@@ -216,7 +216,7 @@ def _divided(logs: Sequence[Path], before: Catalog | None) -> tuple[list[int], l
     return kept, new
 
 
-def _read_row(folder: Path, path: Path) -> list[Row]:
+def _read_row(folder: Path, path: Path) -> list[CatalogRow]:
     """Make the row of a file; none if the file has gone."""
     name = log_name(path)
     kind = name.layer.partition("-")[0]
@@ -227,7 +227,7 @@ def _read_row(folder: Path, path: Path) -> list[Row]:
         size, mtime = _size_and_time(path)
     except LogError:
         return []
-    row = Row(
+    row = CatalogRow(
         path=_relative(path, folder),
         home="" if home is None else home[1] or "",
         node=name.node or None,
@@ -244,7 +244,7 @@ def _read_row(folder: Path, path: Path) -> list[Row]:
         return [replace(row, error=str(error).removeprefix(f"{path}: "))]
 
 
-def _filled(row: Row, contents: Contents) -> Row:
+def _filled(row: CatalogRow, contents: Contents) -> CatalogRow:
     """Add what was found in a file to its row."""
     record = {name: value for name, value in contents.record.items() if value}
     start, end = contents.span or (None, None)

@@ -17,7 +17,7 @@ _LABELLING = ("home", "kind", "model")
 
 
 @dataclass(frozen=True)
-class Home:
+class HomeSummary:
     """The files of one home."""
 
     home: str
@@ -50,7 +50,7 @@ class LabelAmount:
     segments: int
 
 
-def homes(catalog: Catalog) -> list[Home]:
+def homes(catalog: Catalog) -> list[HomeSummary]:
     """Sum up the files of each home."""
     table = catalog.table
     logs = pc.equal(table["kind"], LOG)
@@ -70,7 +70,7 @@ def homes(catalog: Catalog) -> list[Home]:
         }
     )
     functions = [(name, _FUNCTIONS.get(name, "sum")) for name in counted.column_names[1:]]
-    return [Home(**row) for row in _grouped(counted, ["home"], functions)]
+    return [HomeSummary(**row) for row in _grouped(counted, ["home"], functions)]
 
 
 def label_amounts(catalog: Catalog) -> list[LabelAmount]:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events
-from hearthlog.analyzer.logs.spans import Spans, overlay, remains, runs
+from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -74,7 +74,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     parts = np.where(ends - starts < SHORTEST, 0, -(-(ends - starts) // LONGEST))
     if parts.sum() > _MOST:
         raise DataError("too much to rank at once: choose a part with --start and --end")
-    source, part = runs(np.zeros(len(first), np.int64), parts)
+    source, part = ranges(np.zeros(len(first), np.int64), parts)
     begins, stops = (
         starts[source] + (ends - starts)[source] * number // parts[source]
         for number in (part, part + 1)
