@@ -1,4 +1,4 @@
-"""What a source of sound hands on: frames, gaps between them, and the state of the source."""
+"""The events of a source of sound: frames, gaps between them, and the state of the source."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

@@ -142,7 +142,7 @@ class Pipeline:
         return messages
 
     def finish(self) -> list[EncodedMessage]:
-        """Close the open segment at the end of the sound."""
+        """End the open segment where the sound ends."""
         return self._close(self._end)
 
     def change_model(

@@ -1,1 +1,1 @@
-"""Training: labelled sound, ways to learn, and what becomes of them."""
+"""Training: labelled sound, methods to learn from it, transitions and scores."""

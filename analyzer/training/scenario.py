@@ -21,7 +21,7 @@ LABELS = frozenset(row.name for row in sound.CLASSES) - {sound.OTHER, sound.UNKN
 
 @dataclass(frozen=True)
 class Scenario:
-    """What a model is to tell apart.
+    """The classes of a model, and the labels of each.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Scores of classified segments, how sure they are, and how far two models differ."""
+"""Scores of classified segments with confidence intervals, calibration, and model comparison."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class ClassScores:
-    """Scores of one class; None where they have no meaning, as recall of what never occurs.
+    """Scores of one class; None where they are undefined, as the recall of an absent class.
 
     Attributes
     ----------
@@ -111,17 +111,17 @@ def score(
     classes: Sequence[str],
     weight: Counts | None = None,
 ) -> Scores:
-    """Score predicted classes.
+    """Compute the scores of predicted classes.
 
     Parameters
     ----------
     target, predicted : np.ndarray [shape=(n,)]
-        Integers of classes.
+        Indices of classes.
     group : np.ndarray [shape=(n,)]
-        Numbers of the sources, which are resampled as a whole for the intervals.
+        Numbers of the source groups, which are resampled as a whole for the intervals.
     classes : sequence of str
     weight : np.ndarray [shape=(n,)], int64, optional
-        For how many segments a row stands; for one by default.
+        How many segments a row stands for; one by default.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def difference(
     Parameters
     ----------
     target : np.ndarray [shape=(n,)]
-        Integers of classes.
+        Indices of classes.
     probabilities_a, probabilities_b : np.ndarray [shape=(n, C)]
     group : np.ndarray [shape=(n,)]
         Numbers of the sources.
@@ -209,7 +209,7 @@ def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> 
 
 
 def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[Bin]:
-    """Compare how sure a model is with how often it is right; empty bins are left out.
+    """Compare the confidence of a model with its accuracy, by bins; empty bins are left out.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def _confusions(
     classes: int,
     weight: Counts | None = None,
 ) -> Float64:
-    """Confusion matrix of each group, shape (G, C, C)."""
+    """Return the confusion matrix of each group, shape (G, C, C)."""
     if not len(target):
         raise DataError("there is nothing to score")
     names, number = np.unique(group, return_inverse=True)
@@ -263,7 +263,7 @@ def _resamples(confusions: Float64) -> Iterator[Float64]:
 
 
 def _rates(confusion: Float64) -> tuple[Float64, Float64, Float64]:
-    """Precision, recall and F1 of each class of matrices (..., C, C).
+    """Return precision, recall and F1 of each class of matrices (..., C, C).
 
     Recall and F1 are NaN where the class does not occur, precision where it is not predicted
     either; where it occurs and is not predicted, precision is 0.
@@ -278,7 +278,7 @@ def _rates(confusion: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 def _macro(f1: Float64) -> Float64:
-    """Mean over the classes that occur; every resample has at least one."""
+    """Return the mean over the classes that occur; every resample has at least one."""
     return np.nanmean(f1, axis=-1)
 
 

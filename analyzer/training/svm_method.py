@@ -1,4 +1,4 @@
-"""Learning support vector machines, through scikit-learn."""
+"""Methods that learn support vector machines, with scikit-learn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -106,7 +106,7 @@ class LearnedSvm:
         self._home_target = home_target
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Decide as `SvmMachine` of `svm_rbf` does; see `Learned.decide`."""
+        """Return decision values, as `SvmMachine` gives them; see `Learned.decide`."""
         values = self.machine.decision_function(inputs.astype(np.float64))
         pairs = -values[:, np.newaxis] if values.ndim == 1 else values
         decision = np.full((len(inputs), classes), -np.inf)

@@ -1,1 +1,1 @@
-"""Clips: which sound may be kept, keeping it, forgetting it."""
+"""Clips: choosing, writing and deleting sound that is kept."""

@@ -40,7 +40,7 @@ class CaptureFormat:
 
 
 def main() -> None:
-    """Capture from the device named by the argument until killed or left alone.
+    """Capture from the device named by the argument, until killed or without a parent.
 
     Without an argument, list the devices.
     """

@@ -1,1 +1,1 @@
-"""A simulated home, for those who have no microphone at hand."""
+"""A simulated home, to try everything without a microphone."""

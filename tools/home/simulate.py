@@ -109,12 +109,11 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
 
 
 def write_day(path: Path, minutes: float, seed: int) -> list[LabelledSpan]:
-    """Write a day in the life of a person living alone, hurried into some minutes.
+    """Write a day in the life of a person living alone, compressed into some minutes.
 
-    From night to night the sounds come in a plausible order and last as long as they would;
-    what shrinks is the silence between them and, when that is used up, their number (10 minutes
-    hold about three quarters of what 24 do). Beside the audio stands the truth, a label track that
-    Audacity imports (same stem, `.txt`).
+    The sounds come in a plausible order and have their natural lengths; a shorter day has less
+    silence between them, and then fewer of them (10 minutes hold about three quarters of what 24
+    do). The true labels are written beside the audio, as a label track for Audacity (`.txt`).
 
     Parameters
     ----------
@@ -128,7 +127,7 @@ def write_day(path: Path, minutes: float, seed: int) -> list[LabelledSpan]:
     Returns
     -------
     list of (start_seconds, end_seconds, label)
-        What is heard when, silence included: each begins where the one before ends.
+        The sounds, silence included, without gaps between them.
 
     Raises
     ------
@@ -176,7 +175,7 @@ def _end(events: list[PlannedSound]) -> int:
 def _plan_part(
     rng: np.random.Generator, seconds: float, labels: list[str]
 ) -> list[tuple[float, float, str]]:
-    """Place the sounds that fit, in their order; chance divides the silence among them."""
+    """Place the sounds that fit, in their order, with random silences between them."""
     chosen, left = [], seconds - _MIN_SILENCE
     for label in labels:
         length = rng.uniform(*_EVENT_SECONDS[label])
@@ -205,7 +204,7 @@ def _perform(events: list[PlannedSound], seed: int) -> Iterator[Float64]:
 
 @contextmanager
 def _reported(path: Path) -> Iterator[None]:
-    """Turn what the file system and the encoder refuse into one line."""
+    """Turn errors of the file system and of the encoder into one line."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
-"""Sounds of a simulated home, so that everything can be tried without a microphone.
+"""Sounds of a simulated home.
 
-They are caricatures: right in rhythm, pitch and colour, so that a model can learn to tell them
-apart, and never twice the same. A model trained on them knows nothing of real homes.
+They are caricatures: rhythm, pitch and colour are right, so that a model can tell them apart, and
+no two are the same. A model trained on them is useless in a real home.
 """
 
 from collections.abc import Callable
@@ -85,7 +85,7 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
 
 
 def generator(*seed: int) -> np.random.Generator:
-    """Return the random numbers of a seed; more integers tell its uses apart."""
+    """Return the random generator of a seed; further integers tell its uses apart."""
     if min(seed) < 0:
         raise SimulationError(f"a seed is a whole number from 0, not {min(seed)}")
     return np.random.default_rng(seed)

@@ -1,7 +1,4 @@
-"""What the sounds of the simulated home are built of: rhythms, voices, ringing, noise.
-
-Everything works on whole sounds at 16 kHz.
-"""
+"""Building blocks of the simulated sounds: rhythms, voices, ringing, noise; all at 16 kHz."""
 
 import numpy as np
 from scipy.signal import butter, lfilter, sosfilt
@@ -49,19 +46,19 @@ class Train:
         self.count = len(self.starts)
 
     def ends(self) -> Indices:
-        """Return the samples at which they end, inside the sound."""
+        """Return the samples at which the elements end, inside the sound."""
         ends = (self.starts + self.lengths).astype(np.intp)
         return ends[ends < self._samples]
 
     def envelope(self, gains: Float64, attack: float, release: float) -> Float64:
-        """Rise and fall of each, as shares of its length."""
+        """Return rises and falls; attack and release are shares of the lengths of the elements."""
         corners = np.array([0.0, attack, 1.0 - release, 1.0])
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * corners
         height = gains[:, np.newaxis] * np.array([0.0, 1.0, 0.8, 0.0])
         return np.interp(np.arange(self._samples), at.ravel(), height.ravel())
 
     def position(self) -> Float64:
-        """Return how much of each has passed, 0 to 1."""
+        """Return the position in each element, 0 to 1."""
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * np.array([0.0, 1.0])
         return np.interp(np.arange(self._samples), at.ravel(), np.tile([0.0, 1.0], self.count))
 
@@ -75,7 +72,7 @@ def voiced(  # noqa: PLR0913 - a voice is these
     tract: float,
     breath: float = 0.05,
 ) -> Float64:
-    """Glottal source through formants that glide from one syllable's vowel to the next's."""
+    """Pass a glottal source through formants that glide from vowel to vowel."""
     samples = len(pitch)
     source = sawtooth(pitch) + breath * rng.standard_normal(samples)
     tract *= rng.uniform(0.92, 1.08)
@@ -93,7 +90,7 @@ def voiced(  # noqa: PLR0913 - a voice is these
 
 
 def sawtooth(pitch: Float64) -> Float64:
-    """Sawtooth of a varying pitch, its edges rounded (polyBLEP) against aliases."""
+    """Return a sawtooth of a varying pitch, its edges rounded (polyBLEP) against aliases."""
     step = pitch / SAMPLE_RATE
     phase = np.cumsum(step) % 1.0
     after, before = phase / step, (phase - 1.0) / step
@@ -108,7 +105,7 @@ def _resonance(frequency: float, bandwidth: float) -> tuple[float, float]:
 
 
 def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
-    """Let a struck object ring: decaying sines of amplitude 1."""
+    """Return decaying sines of amplitude 1, as of struck objects."""
     if frequency >= SAMPLE_RATE / 2:
         return np.zeros(len(hits))
     a1, a2 = _resonance(frequency, 1.0 / (np.pi * seconds))
@@ -130,7 +127,7 @@ def decays(samples: int, at: Indices, seconds: float, gains: Float64 | None = No
 
 
 def band_noise(rng: np.random.Generator, samples: int, low: float, high: float) -> Float64:
-    """Noise between two frequencies, of about power 1."""
+    """Return noise between two frequencies, of about power 1."""
     sos = butter(2, (low, high), "bandpass", fs=SAMPLE_RATE, output="sos")
     return sosfilt(sos, rng.standard_normal(samples)) * np.sqrt(SAMPLE_RATE / 2 / (high - low))
 
