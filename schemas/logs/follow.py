@@ -137,20 +137,16 @@ class _Growing:
         self, topics: Collection[str] | None, start: int | None, damaged: Damaged
     ) -> Iterator[list[RawMessages]]:
         """Read what was written since the last time."""
+        # Replaced by a recorder that was started again: asked first, so nothing comes in between.
+        self._replaced = not any(self.file.is_at(name) for name in _names(self.file.path))
         try:
-            yield from self._read(topics, start)
+            for batch in read_in_batches(self.file, self.file.scan_new(), topics):
+                messages = [m for m in (raw.between(start, None) for raw in batch) if len(m)]
+                if messages:
+                    yield messages
         except LogError as error:
             self._is_damaged = True
             damaged(error)
-
-    def _read(
-        self, topics: Collection[str] | None, start: int | None
-    ) -> Iterator[list[RawMessages]]:
-        self._replaced = self._is_replaced()  # asked first, so that nothing comes in between
-        for batch in read_in_batches(self.file, self.file.scan_new(), topics):
-            messages = [m for m in (raw.between(start, None) for raw in batch) if len(m)]
-            if messages:
-                yield messages
 
     def is_open(self) -> bool:
         """Tell whether more may come; if not, close the log."""
@@ -158,10 +154,6 @@ class _Growing:
             self.file.close()
             return False
         return True
-
-    def _is_replaced(self) -> bool:
-        """Tell whether a recorder that was started again completed this log in its place."""
-        return not any(self.file.is_at(name) for name in _names(self.file.path))
 
 
 def _names(path: Path) -> tuple[Path, Path]:

@@ -56,26 +56,12 @@ class Damage:
         return f"{where}: lost up to byte {self.end}: {', '.join([*lost, *self.others])}{span}"
 
 
-@dataclass
-class Unnamed:
-    """Whole messages of one channel that is nowhere defined."""
-
-    messages: int
-    times: tuple[int, int]  # first and last log time, in nanoseconds
-    place: tuple[int, int]  # first byte of the file, and the one behind
-
-    def add(self, messages: int, times: tuple[int, int], place: tuple[int, int]) -> None:
-        """Add some more."""
-        self.messages += messages
-        self.times = min(self.times[0], times[0]), max(self.times[1], times[1])
-        self.place = self.place[0], place[1]
-
-
 class DamageList:
     """The damages of a file, and its whole messages of channels that are nowhere defined."""
 
     def __init__(self) -> None:
-        self.unnamed: dict[int, Unnamed] = {}  # by channel
+        # By channel: messages, first and last log time, and the bytes of the file between them.
+        self.unnamed: dict[int, tuple[int, tuple[int, int], tuple[int, int]]] = {}
         self._damages: list[tuple[Damage, dict[int, int]]] = []
 
     def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
@@ -91,8 +77,9 @@ class DamageList:
         self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
     ) -> None:
         """Add messages of a channel that is not defined so far, and the record they are in."""
-        place = whole.offset, whole.end
-        self.unnamed.setdefault(channel, Unnamed(0, times, place)).add(messages, times, place)
+        count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))
+        span = min(span[0], times[0]), max(span[1], times[1])
+        self.unnamed[channel] = count + messages, span, (start, whole.end)
 
     def resolve(self, definitions: Definitions) -> list[Damage]:
         """List the damages by offset, then the unnamed messages, with the names of topics."""
@@ -103,10 +90,10 @@ class DamageList:
                 topic = definitions.topic(channel)
                 messages[topic] = messages.get(topic, 0) + count
             damages.append(replace(damage, messages=messages))
-        for channel, some in self.unnamed.items():
+        for channel, (count, times, place) in self.unnamed.items():
             why = f"nothing that is left says what channel {channel} is"
-            messages = {definitions.topic(channel): some.messages}
-            damages.append(Damage(*some.place, why, messages, times=some.times))
+            messages = {definitions.topic(channel): count}
+            damages.append(Damage(*place, why, messages, times=times))
         return damages
 
 

@@ -30,13 +30,8 @@ SHORTEST = np.full(256, UNKNOWN)  # bytes of the shortest content, by opcode
 for _opcode, _fields in FIELDS.items():
     SHORTEST[_opcode] = sum(f if isinstance(f, int) else f.size for f in _fields)
 SHORTEST[Opcode.MESSAGE] = MESSAGE_FIXED
-_SMALL = 16 << 20  # bytes; a record that is neither chunk, message nor attachment has fewer
-_LARGEST: dict[int, int] = {Opcode.ATTACHMENT: LIMIT, Opcode.MESSAGE_INDEX: LIMIT}
-
-
-def longest(opcode: int) -> int:
-    """Return the most bytes that a record may have, opcode and length included."""
-    return _LARGEST.get(opcode, _SMALL)
+LARGEST = np.full(256, 16 << 20)  # bytes of the largest record that is read, by opcode
+LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
 
 
 def find_record_heads(window: bytes) -> list[int]:

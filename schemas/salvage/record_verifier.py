@@ -17,7 +17,7 @@ from hearthlog.schemas.mcap.chunk_records import index_messages
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES, MAGIC, MESSAGE_INDEX, UINT64
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
-from hearthlog.schemas.salvage.record_sizes import FIELDS, SHORTEST, UNKNOWN, longest
+from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import (
     WholeChunk,
     WholeRecord,
@@ -109,7 +109,7 @@ class RecordVerifier:
             return self._message(offset, chained)
         outer, inner = self.ends(offset)
         wrong = "" if inner == outer else "the length of a record"
-        if inner - offset > longest(opcode):
+        if inner - offset > LARGEST[opcode]:
             raise McapError("a record claims to be too large")
         if inner > self.end:
             raise McapError("a record claims to be longer than the file")

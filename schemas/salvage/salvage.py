@@ -79,6 +79,7 @@ class Salvage:
         except OSError as error:
             raise LogError(f"{path}: cannot be read ({error.strerror})") from error
         self.size = os.fstat(self._descriptor).st_size
+        self.offset = 0  # bytes that have been passed
         self._reader = RecordVerifier(self._descriptor, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
@@ -103,11 +104,6 @@ class Salvage:
     def __exit__(self, *_: object) -> None:
         os.close(self._descriptor)
 
-    @property
-    def offset(self) -> int:
-        """Bytes that have been passed."""
-        return self._offset
-
     def damages(self) -> list[Damage]:
         """List the damages met so far, by offset, and then the messages of undefined channels."""
         return self._damages.resolve(self.definitions)
@@ -119,19 +115,19 @@ class Salvage:
         should have. They hold no messages of undefined channels: where there are such, the other
         messages come one by one.
         """
-        self._offset = len(MAGIC) if self.is_mcap else 0
-        while self._offset < self._reader.end:
-            offset = self._offset
+        self.offset = len(MAGIC) if self.is_mcap else 0
+        while self.offset < self._reader.end:
+            offset = self.offset
             try:
                 whole = self._at(offset)
             except McapError as error:
                 if self._ended and MAGIC.startswith(self._reader.read(offset, len(MAGIC) + 1)):
                     return
-                self._offset = self._pass(offset, str(error))
+                self.offset = self._pass(offset, str(error))
                 continue
             if whole.corrected:
                 self._damages.add(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
-            self._offset = whole.end
+            self.offset = whole.end
             yield from self._take(whole)
             del whole  # before the next is read, which may be as large
 

@@ -107,13 +107,7 @@ def read_message(raw: bytes) -> records.Message:
     _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
     if log_time >= 1 << 63:
         raise McapError("a log time is out of range")
-    return records.Message(
-        channel_id=channel,
-        log_time=log_time,
-        data=raw[MESSAGE.size :],
-        publish_time=publish_time,
-        sequence=sequence,
-    )
+    return records.Message(channel, log_time, raw[MESSAGE.size :], publish_time, sequence)
 
 
 def read_attachment(raw: bytes) -> WholeAttachment:
@@ -128,15 +122,7 @@ def read_attachment(raw: bytes) -> WholeAttachment:
     log_time, create_time, name = ATTACHMENT.unpack_from(record, HEAD.size)
     first = HEAD.size + ATTACHMENT.size + name
     (media,) = UINT32.unpack_from(record, first)
-    return WholeAttachment(
-        raw,
-        records.AttachmentIndex(
-            offset=0,
-            length=0,
-            log_time=log_time,
-            create_time=create_time,
-            data_size=UINT64.unpack_from(record, first + 4 + media)[0],
-            name=str(record[first - name : first], "utf-8"),
-            media_type=str(record[first + 4 : first + 4 + media], "utf-8"),
-        ),
-    )
+    texts = str(record[first - name : first], "utf-8"), str(record[first + 4 :][:media], "utf-8")
+    (size,) = UINT64.unpack_from(record, first + 4 + media)
+    index = records.AttachmentIndex(0, 0, log_time, create_time, size, *texts)
+    return WholeAttachment(raw, index)

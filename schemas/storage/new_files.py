@@ -45,7 +45,11 @@ def check_new(path: Path) -> None:
     Whether a store lets us write is known only when we do.
     """
     if not is_local(path):
-        _check_new_stored(path)
+        stored: Any = path
+        with store_errors(path):
+            exists = stored.fs.exists(stored.path)
+        if exists:
+            raise _exists(path)
         return
     if os.path.lexists(path):
         raise _exists(path)
@@ -53,13 +57,6 @@ def check_new(path: Path) -> None:
         raise LogError(f"{path}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK):
         raise LogError(f"{path}: the folder cannot be written to")
-
-
-def _check_new_stored(path: Any) -> None:
-    with store_errors(path):
-        exists = path.fs.exists(path.path)
-    if exists:
-        raise _exists(path)
 
 
 def _exists(path: Path) -> LogError:

@@ -150,7 +150,9 @@ class DataSection:
             self.header = self.header or content
             self.definitions.profile = self.header.profile
         elif isinstance(content, Metadata):
-            self._add_metadata(content, record)
+            index = encode(MetadataIndex(record.offset, record.length, content.name))
+            self._expect_index(Opcode.METADATA_INDEX, record.offset, index)
+            self._keep(self.metadata, content.name, content.metadata, record)
         elif isinstance(content, Attachment):
             self._add_attachment(content, record)
         elif isinstance(content, DataEnd):
@@ -161,25 +163,15 @@ class DataSection:
         else:
             self.whole = False
 
-    def _add_metadata(self, metadata: Metadata, record: Record) -> None:
-        index = encode(MetadataIndex(record.offset, record.length, metadata.name))
-        self._expect_index(Opcode.METADATA_INDEX, record.offset, index)
-        self._keep(self.metadata, metadata.name, metadata.metadata, record)
-
     def _add_attachment(self, attachment: Attachment, record: Record) -> None:
-        index = AttachmentIndex(
-            record.offset,
-            record.length,
-            attachment.log_time,
-            attachment.create_time,
-            len(attachment.data),
-            attachment.name,
-            attachment.media_type,
-        )
+        times = attachment.log_time, attachment.create_time
+        names = attachment.name, attachment.media_type
+        size = len(attachment.data)
+        index = AttachmentIndex(record.offset, record.length, *times, size, *names)
         self._expect_index(Opcode.ATTACHMENT_INDEX, record.offset, encode(index))
         self._keep(self.attachments, attachment.name, attachment.data, record)
-        texts = len(attachment.name.encode()) + len(attachment.media_type.encode())
-        end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + len(attachment.data)
+        texts = sum(len(name.encode()) for name in names)
+        end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + size
         (crc,) = UINT32.unpack_from(record.content, end)
         if crc and zlib.crc32(record.content[:end]) != crc:
             what = f"attachment {attachment.name} has another checksum than it claims"
