@@ -70,7 +70,9 @@ class LogStreamWriter:
                 schemas[topic.type] = self._writer.register_schema(
                     topic.type, SCHEMA_ENCODING, definition(topic.type).encode()
                 )
-            channel_metadata = _channel_metadata(topic)
+            names = {f"{key}_names": json.dumps([*n]) for key, n in topic.array_names.items()}
+            ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
+            channel_metadata = ros | names
             self._counts[topic.name] = rosbag2.TopicCount(topic.type, channel_metadata)
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, ENCODING, schemas[topic.type], channel_metadata
@@ -129,9 +131,3 @@ class LogStreamWriter:
         self._counts[topic].messages += messages
         start, end = self._span or (first, last)
         self._span = min(start, first), max(end, last)
-
-
-def _channel_metadata(topic: Topic) -> dict[str, str]:
-    names = {f"{key}_names": json.dumps(list(value)) for key, value in topic.array_names.items()}
-    ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
-    return ros | names

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, Protocol, Self, TypeVar
 
@@ -58,10 +59,10 @@ class _Log:
         self._position = 0
 
     @property
-    def start(self) -> int | None:
-        """Start of the next chunk; None at the end."""
+    def start(self) -> int:
+        """Start of the next chunk; `_LAST` at the end."""
         if self._position == len(self.chunks):
-            return None
+            return _LAST
         return int(self.chunks["start"][self._position])
 
     def next_chunks(self, until: int, size: int) -> NDArray[np.void]:
@@ -215,7 +216,7 @@ class _Queue:
     @property
     def start(self) -> int:
         """No chunk that is still to come starts earlier."""
-        return min((_start(log) for log in self._open), default=_LAST)
+        return min((log.start for log in self._open), default=_LAST)
 
     def batches(self) -> Iterator["_Batch"]:
         """Hand out the chunks, a few megabytes at a time."""
@@ -223,8 +224,8 @@ class _Queue:
             picked: dict[LogFile, list[NDArray[np.void]]] = {}
             size = 0
             while self._open and size < _BATCH:
-                log = min(self._open, key=_start)
-                others = [_start(other) for other in self._open if other is not log]
+                log = min(self._open, key=attrgetter("start"))
+                others = [other.start for other in self._open if other is not log]
                 until = min([*others, *(first for first, _ in self._closed[-1:])], default=_LAST)
                 chunks = log.next_chunks(until, _BATCH - size)
                 picked.setdefault(log.file, []).append(chunks)
@@ -242,16 +243,12 @@ class _Queue:
 
     def _open_next(self) -> None:
         """Open the logs that may have the next chunk, and put aside those that have no more."""
-        self._finished += [log.file for log in self._open if log.start is None]
-        self._open = [log for log in self._open if log.start is not None]
+        self._finished += [log.file for log in self._open if log.start == _LAST]
+        self._open = [log for log in self._open if log.start < _LAST]
         while self._closed and (not self._open or self._closed[-1][0] <= self.start):
             log = _Log(self._closed.pop()[1], self._query)
             self._files.add(log.file)
-            if log.start is None:
+            if log.start == _LAST:
                 self._finished.append(log.file)
             else:
                 self._open.append(log)
-
-
-def _start(log: _Log) -> int:
-    return _LAST if log.start is None else log.start
