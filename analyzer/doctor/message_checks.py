@@ -38,19 +38,11 @@ _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
 
 
 class MessageChecks:
-    """Follows the messages of one file.
-
-    Attributes
-    ----------
-    infos : dict of str to dict
-        By microphone: the `AudioStreamInfo`, field by field.
-    frames : dict of str to FrameSequence
-        By microphone.
-    """
+    """Follows the messages of one file."""
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
-        self.infos: dict[str, dict[str, Any]] = {}
-        self.frames: dict[str, FrameSequence] = {}
+        self.infos: dict[str, dict[str, Any]] = {}  # the `AudioStreamInfo` of each microphone
+        self.frames: dict[str, FrameSequence] = {}  # by microphone
         self._data = data
         self._findings = findings
         self._last: int | None = None

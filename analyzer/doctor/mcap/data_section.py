@@ -44,29 +44,9 @@ class DataSection:
     Parameters
     ----------
     names : collection of str
-        Names of the metadata records and attachments that are kept.
+        Of metadata records and attachments, the first two of each are kept if they are not large.
     ours : bool
         Whether hearthlog made this file.
-
-    Attributes
-    ----------
-    metadata : dict of str to list of dict
-        By name: the first two records of the names to keep, if they are not too large.
-    attachments : dict of str to list of bytes
-        Likewise.
-    counts : Counter of int
-        Messages by channel.
-    span : tuple of int, or None
-        First and last log time.
-    expected_indexes : dict of int to dict of int to bytes
-        By the opcode of the index, and by offset: what the index should say of a chunk, an
-        attachment or a metadata record.
-    whole : bool
-        Whether everything could be read.
-    loose : bool
-        Whether there are messages outside of chunks.
-    ended : bool
-        Whether there was a Data End.
     """
 
     def __init__(self, findings: Findings, names: Collection[str], *, ours: bool) -> None:
@@ -74,16 +54,17 @@ class DataSection:
         self.header: Header | None = None
         self.metadata: dict[str, list[dict[str, str]]] = {}
         self.attachments: dict[str, list[bytes]] = {}
-        self.counts: Counter[int] = Counter()
-        self.span: tuple[int, int] | None = None
+        self.counts: Counter[int] = Counter()  # messages by channel
+        self.span: tuple[int, int] | None = None  # first and last log time
+        # By the opcode of the index and by offset: what the index should say.
         self.expected_indexes: dict[int, dict[int, bytes]] = {
             Opcode.CHUNK_INDEX: {},
             Opcode.ATTACHMENT_INDEX: {},
             Opcode.METADATA_INDEX: {},
         }
-        self.whole = True
-        self.loose = False
-        self.ended = False
+        self.whole = True  # everything could be read
+        self.loose = False  # there are messages outside of chunks
+        self.ended = False  # there was a Data End
         self.findings = findings
         self._names = names
         self._chunk: Chunk | None = None
