@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 from typing import Generic, Protocol, TypeVar
 
 from hearthlog.models.errors import ModelError
+from hearthlog.schemas.errors import HearthlogError
 
 
 class Named(Protocol):
@@ -31,11 +32,24 @@ class Extensions(Generic[T]):
         whose `name` is the name of the entry point.
     kind : type
         Class of the objects.
+    word : str
+        What to call one in messages.
     ours : sequence of T
+    missing : type of HearthlogError
+        Raised if there is none of a name.
     """
 
-    def __init__(self, group: str, kind: type[T], ours: Sequence[T]) -> None:
+    def __init__(
+        self,
+        group: str,
+        kind: type[T],
+        word: str,
+        ours: Sequence[T],
+        missing: type[HearthlogError] = ModelError,
+    ) -> None:
         self._group = group
+        self._word = word
+        self._missing = missing
         self._kind = kind
         self._ours = {one.name: one for one in ours}
         self._loaded = dict(self._ours)
@@ -45,8 +59,14 @@ class Extensions(Generic[T]):
         theirs = {point.name for point in entry_points(group=self._group)}
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
-    def get(self, name: str) -> T | None:
-        """Return an object by its name, or None; raises ModelError if it cannot be imported."""
+    def get(self, name: str) -> T:
+        """Return an object by its name.
+
+        Raises
+        ------
+        HearthlogError
+            The type `missing` if there is none; ModelError if it cannot be imported.
+        """
         if name not in self._loaded:
             for point in entry_points(group=self._group, name=name):
                 try:
@@ -57,4 +77,9 @@ class Extensions(Generic[T]):
                     what = f"no {self._kind.__name__} of the name {name!r}"
                     raise ModelError(f"{point.value} is {what}; see docs/extending.md")
                 self._loaded[name] = loaded
-        return self._loaded.get(name)
+        if name not in self._loaded:
+            installed = ", ".join(self.names())
+            raise self._missing(
+                f"{self._word} {name[:64]!r} is not installed; there is {installed}"
+            )
+        return self._loaded[name]

@@ -13,31 +13,16 @@ _MOST_EARLIER = 24  # logs: within so many a model forgets what was before them
 
 
 class Job(NamedTuple):
-    """A log to label.
-
-    Attributes
-    ----------
-    log, layer : Path
-    earlier : tuple of Path
-        Logs before it, the last first.
-    next_log : Path or None
-        The log after it.
-    model : Path
-    model_sha256 : str
-    replaces : bool
-        Whether there is a layer that may be replaced.
-    continues_layer : bool
-        Whether the open segment at the start of the log is taken from the layer before.
-    """
+    """A log to label."""
 
     log: Path
     layer: Path
-    earlier: tuple[Path, ...]
+    earlier: tuple[Path, ...]  # logs before it, the last first
     next_log: Path | None
     model: Path
     model_sha256: str
-    replaces: bool
-    continues_layer: bool
+    replaces: bool  # whether there is a layer that may be replaced
+    continues_layer: bool  # whether the open segment at the start is taken from the layer before
 
 
 def make_job(

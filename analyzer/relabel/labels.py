@@ -48,40 +48,22 @@ from hearthlog.schemas.storage.new_files import new_file, replaced_file
 class UnfinishedLayer(NamedTuple):
     """The labels of a log, and its segments as far as they are known without other layers.
 
-    Attributes
-    ----------
-    part : Path
-        The unfinished layer, with the labels.
-    writer : LogStreamWriter
-        That has written it.
-    inputs : LayerInputs
-    microphone, node : str
-    provenance : mapping of str to str
-        The `hearthlog` record of the log.
-    segments : list of Segment
-    open_at_start, open_at_end : Run or None
-        The segment that is open when the log begins, and when it ends.
-    lacks_start : bool
-        Whether a segment is open when the log begins whose earlier frames, counted in the layer
-        before, are still to be added; `open_at_start` is None until then.
-    frames : int
-        Number of labels.
-    loss : str
-        What could not be read of the log.
+    `lacks_start` tells whether a segment is open when the log begins whose earlier frames, counted
+    in the layer before, are still to be added; `open_at_start` is None until then.
     """
 
-    part: Path
-    writer: LogStreamWriter
+    part: Path  # the unfinished file, with the labels
+    writer: LogStreamWriter  # that has written it
     inputs: LayerInputs
     microphone: str
     node: str
-    provenance: Mapping[str, str]
+    provenance: Mapping[str, str]  # the `hearthlog` record of the log
     segments: list[Segment]
     open_at_start: Run | None
     open_at_end: Run | None
     lacks_start: bool
-    frames: int
-    loss: str
+    frames: int  # that are labelled
+    loss: str  # what could not be read of the log
 
     def with_start(self, open_at_start: Run | None) -> "UnfinishedLayer":
         """Add the open segment with which the layer before ends, where it is lacking."""

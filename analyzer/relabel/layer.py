@@ -24,40 +24,24 @@ _RUN = ("label", "start", "frames", "confidence")
 class LayerInputs(NamedTuple):
     """What a layer is made from; equal inputs give equal labels and segments.
 
-    Attributes
-    ----------
-    model, model_sha256 : str
-        Name of the model, and SHA-256 of its file.
-    input_sha256 : str
-        `log_digest` of the log.
-    before, behind : str
-        Stems of the logs before and after it; empty where there is none, or where it was not
-        decided yet whether the sound goes on there.
+    `before` and `behind` are stems of the logs before and after; empty where there is none, or
+    where it was not decided yet whether the sound goes on there.
     """
 
     model: str
-    model_sha256: str
-    input_sha256: str
+    model_sha256: str  # of the model file
+    input_sha256: str  # `log_digest` of the log
     before: str
     behind: str
 
 
 class LayerMetadata(NamedTuple):
-    """What the `hearthlog` record of a layer says.
-
-    Attributes
-    ----------
-    inputs : LayerInputs
-    open_at_start, open_at_end : Run or None
-        The segment that was open when the log began, and when it ended.
-    loss : str
-        What could not be read of the log.
-    """
+    """What the `hearthlog` record of a layer says."""
 
     inputs: LayerInputs
-    open_at_start: Run | None
+    open_at_start: Run | None  # the segment that was open when the log began
     open_at_end: Run | None
-    loss: str
+    loss: str  # what could not be read of the log
 
 
 def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:

@@ -24,12 +24,7 @@ _LONGEST_LOSS_TEXT = 1000  # characters
 
 
 class UnreadableError(LogError):
-    """A log, or a part of it, is damaged.
-
-    Attributes
-    ----------
-    log : Path
-    """
+    """A log, or a part of it, is damaged."""
 
     def __init__(self, log: Path, what: object) -> None:
         super().__init__(str(what))
@@ -42,10 +37,7 @@ class UnreadableError(LogError):
 def recorder_info(path: Path) -> RecorderInfo | None:
     """Read what a log says of its recorder; None if it has no features.
 
-    Raises
-    ------
-    UnreadableError
-        If it is damaged.
+    A damaged log raises UnreadableError.
     """
     try:
         return read_recorder_info(path, "features")
@@ -54,12 +46,9 @@ def recorder_info(path: Path) -> RecorderInfo | None:
 
 
 def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
-    """Read the features and gaps of a log from a time on, in nanoseconds of UTC.
+    """Read the features and gaps of a log from a time on (ns of UTC).
 
-    Raises
-    ------
-    UnreadableError
-        If it is damaged.
+    A damaged log raises UnreadableError.
     """
     try:
         for batch in read_recorded(info, start, _NEVER, sound_only=True):

@@ -29,30 +29,14 @@ from hearthlog.schemas.storage.byte_ranges import map_logs
 
 @dataclass
 class Relabelled:
-    """What became of the logs.
+    """What became of the logs."""
 
-    Attributes
-    ----------
-    layers : list of Path
-        Layers that were written.
-    frames : int
-        Number of frames that were labelled.
-    current : list of Path
-        Layers that were up to date already.
-    active : list of Path
-        Logs that are still being written.
-    lost : dict of Path to str
-        What could not be read of logs that were relabelled.
-    failed : dict of Path to str
-        Logs that were not relabelled, and why.
-    """
-
-    layers: list[Path] = field(default_factory=list)
-    frames: int = 0
-    current: list[Path] = field(default_factory=list)
-    active: list[Path] = field(default_factory=list)
-    lost: dict[Path, str] = field(default_factory=dict)
-    failed: dict[Path, str] = field(default_factory=dict)
+    layers: list[Path] = field(default_factory=list)  # that were written
+    frames: int = 0  # that were labelled
+    current: list[Path] = field(default_factory=list)  # layers that were up to date already
+    active: list[Path] = field(default_factory=list)  # logs that are still being written
+    lost: dict[Path, str] = field(default_factory=dict)  # what could not be read of relabelled logs
+    failed: dict[Path, str] = field(default_factory=dict)  # why logs were not relabelled
 
     @property
     def logs(self) -> int:

@@ -6,7 +6,7 @@ from hearthlog.analyzer.training.svm_method import BANDS, PAPER
 from hearthlog.models.extensions import Extensions
 
 DEFAULT = BANDS
-METHODS = Extensions("hearthlog.methods", Method, [BANDS, PAPER])  # type: ignore[type-abstract]
+_METHODS = Extensions("hearthlog.methods", Method, "method", [BANDS, PAPER], DataError)  # type: ignore[type-abstract]
 
 
 def method_named(name: str) -> Method:
@@ -19,8 +19,4 @@ def method_named(name: str) -> Method:
     ModelError
         If it cannot be imported.
     """
-    method = METHODS.get(name)
-    if method is None:
-        installed = ", ".join(METHODS.names())
-        raise DataError(f"method {name[:64]!r} is not installed; there is {installed}")
-    return method
+    return _METHODS.get(name)

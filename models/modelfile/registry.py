@@ -24,26 +24,13 @@ _KEPT = 100  # earlier champions
 
 @dataclass(frozen=True, eq=False)
 class ModelEntry:
-    """One model file of the folder.
-
-    Attributes
-    ----------
-    name : str
-    aliases : tuple of str
-        Aliases that point to it.
-    size : int
-        Bytes.
-    model : Model or None
-        None if the file cannot be used.
-    problem : str
-        Why not.
-    """
+    """One model file of the folder."""
 
     name: str
-    aliases: tuple[str, ...]
-    size: int
+    aliases: tuple[str, ...]  # that point to it
+    size: int  # bytes
     model: Model | None
-    problem: str = ""
+    problem: str = ""  # why the file cannot be used
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
