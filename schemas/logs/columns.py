@@ -143,7 +143,10 @@ def iterate_columns(
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
     """Decode messages, those of one topic, type, fields and metadata together.
 
-    Raise LogError if they are not of the type that their channel says, or not encoded as CDR.
+    Raises
+    ------
+    LogError
+        If they are not of the type that their channel says, or not encoded as CDR.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -181,7 +184,10 @@ def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
 def join(parts: Sequence[Columns]) -> Columns:
     """Put pieces of one topic one after the other; fields that not all of them have are left out.
 
-    Raise LogError if they are of different types.
+    Raises
+    ------
+    LogError
+        If they are of different types.
     """
     builder = _ColumnBuilder()
     for part in parts:

@@ -39,7 +39,12 @@ def time_spans(
 ) -> list[tuple[int, int, Path]]:
     """Return first and last log time of each log that has messages, in the order of time.
 
-    `span_of` finds out those of one log, or None. Raise LogError if a log is damaged.
+    `span_of` finds out those of one log, or None.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)

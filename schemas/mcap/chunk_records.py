@@ -22,7 +22,10 @@ def iterate_records(
 ) -> Iterator[tuple[int, int, int]]:
     """Go from record to record in the content of a chunk: yield opcode, start and end of each.
 
-    Raise McapError if the last one is cut, or claims to be longer than the content.
+    Raises
+    ------
+    McapError
+        If the last one is cut, or claims to be longer than the content.
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from

@@ -66,7 +66,10 @@ class ChunkRow:
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Describe a chunk, or a message outside of chunks, from the beginning of its record.
 
-    Raise McapError if it is too short, or a number in it is out of range.
+    Raises
+    ------
+    McapError
+        If it is too short, or a number in it is out of range.
     """
     opcode, offset, length = location
     try:

@@ -83,7 +83,10 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
 def read_definitions(file: LogFile) -> None:
     """Add the schemas and channels to a file that only its chunks define.
 
-    Raise LogError if one of these chunks is damaged.
+    Raises
+    ------
+    LogError
+        If one of these chunks is damaged.
     """
     for number, channels in enumerate(file.chunks["channels"].tolist()):
         identities = file.channel_sets[channels]

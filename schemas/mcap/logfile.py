@@ -114,7 +114,10 @@ class LogFile:
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages.
 
-        Raise LogError if it is too large, or damaged.
+        Raises
+        ------
+        LogError
+            If it is too large, or damaged.
         """
         if location.length > LIMIT:
             raise self.damaged(location.offset, "a record claims to be too large")

@@ -50,7 +50,12 @@ class _Content(ReadDataStream):
 def parse(opcode: int, content: bytes) -> McapRecord | None:
     """Parse a record that holds no messages; None if this is not one of them.
 
-    Raise McapError, or UnicodeDecodeError, if it is too short for what it claims to hold.
+    Raises
+    ------
+    McapError
+        If it is too short for what it claims to hold.
+    UnicodeDecodeError
+        If a text in it is not UTF-8.
     """
     kind = _CLASSES.get(opcode)
     return None if kind is None else kind.read(_Content(BytesIO(content)))
@@ -77,7 +82,10 @@ class ChunkHead(NamedTuple):
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from its content.
 
-    Raise McapError if it contradicts itself, or claims to be larger than `LIMIT`.
+    Raises
+    ------
+    McapError
+        If it contradicts itself, or claims to be larger than `LIMIT`.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
@@ -95,10 +103,20 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = False) -> bytes:
-    """Decompress the records of a chunk, given the content of its record.
+    """Decompress the records of a chunk.
 
-    `check` compares them with their checksum, which takes longer than to decompress. Raise
-    McapError if the data are damaged.
+    Parameters
+    ----------
+    head : ChunkHead
+    content : bytes-like
+        The chunk's record, without opcode and length.
+    check : bool
+        Whether to compare with the checksum, which takes longer than to decompress.
+
+    Raises
+    ------
+    McapError
+        If the data are damaged.
     """
     out = bytearray(head.size)
     decompress_into(memoryview(out), head, content, check=check)

@@ -22,7 +22,10 @@ _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 def time_span(path: Path) -> tuple[int, int] | None:
     """Return the first and the last log time of a log in nanoseconds; None without messages.
 
-    Raise LogError if it is no MCAP file, or is damaged.
+    Raises
+    ------
+    LogError
+        If it is no MCAP file, or is damaged.
     """
     try:
         with closing(open_file(path)) as file:

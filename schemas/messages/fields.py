@@ -41,7 +41,10 @@ class Field(NamedTuple):
 def fields_of(kind: MessageType) -> dict[str, Field]:
     """List the fields of a message type by path, those of messages in it among them.
 
-    Raise LogError if it contains itself, or is too large.
+    Raises
+    ------
+    LogError
+        If it contains itself, or is too large.
     """
     return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
 
@@ -156,7 +159,10 @@ def _base(details: tuple[str, int]) -> str:
 def type_hash_of(kind: MessageType) -> str:
     """Return the RIHS01 hash of a type as a file defines it.
 
-    Raise LogError if it cannot be understood.
+    Raises
+    ------
+    LogError
+        If it cannot be understood.
     """
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})

@@ -52,7 +52,10 @@ class MessageType:
     def layout_of(self, payload: memoryview) -> Layout:
         """Find the layout of an encoded message.
 
-        Raise LogError if its bytes are not of this type.
+        Raises
+        ------
+        LogError
+            If its bytes are not of this type.
         """
         order = ORDERS.get(bytes(payload[:2]))
         if order is None or len(payload) < START:
@@ -92,7 +95,10 @@ class MessageType:
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
     """Read a type's definition; without a text it is one of ROS 2's or ours.
 
-    Raise LogError if it cannot be understood.
+    Raises
+    ------
+    LogError
+        If it cannot be understood.
     """
     ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
     if not encoding or (name in ours and text == definition(name).encode()):

@@ -17,16 +17,9 @@ from hearthlog.schemas.mcap.chunk_records import index_messages
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES, MAGIC, MESSAGE_INDEX, UINT64
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, decompress, parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
+from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
-from hearthlog.schemas.salvage.whole_records import (
-    WholeChunk,
-    WholeRecord,
-    read_attachment,
-    read_definitions,
-    read_message,
-    span_of,
-    split_content,
-)
+from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
 
 
 class RecordVerifier:
@@ -97,8 +90,14 @@ class RecordVerifier:
         """Read the record that begins here, if it is whole.
 
         A message outside of chunks has nothing else to be known by than the plausible records that
-        must follow it: so many as `chained`. Raise McapError, or UnicodeDecodeError, if the record
-        is not whole, or this is none.
+        must follow it: so many as `chained`.
+
+        Raises
+        ------
+        McapError
+            If the record is not whole, or this is none.
+        UnicodeDecodeError
+            If a text in it is not UTF-8.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -121,13 +120,18 @@ class RecordVerifier:
         if wrong:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         if opcode == Opcode.ATTACHMENT:
-            return WholeRecord(offset, inner, read_attachment(raw), wrong)
+            return WholeRecord(offset, inner, whole_records.read_attachment(raw), wrong)
         return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
 
     def chunk(self, offset: int) -> WholeRecord:
         """Read a chunk that should begin here, if its content is proved, whatever its head says.
 
-        Raise McapError, or UnicodeDecodeError, if it is not.
+        Raises
+        ------
+        McapError
+            If it is not.
+        UnicodeDecodeError
+            If a text in it is not UTF-8.
         """
         name = HEAD.size + CHUNK.size  # where that of the compression begins
         head = self.read(offset, name + 4 + UINT64.size)
@@ -158,11 +162,11 @@ class RecordVerifier:
                     raise
                 continue
             break
-        messages, others = split_content(content)
+        messages, others = whole_records.split_content(content)
         self.inner += len(messages) + len(others)
-        definitions = read_definitions(content, others)
+        definitions = whole_records.read_definitions(content, others)
         entries = index_messages(content, messages)
-        span = span_of(entries)
+        span = whole_records.span_of(entries)
         wrong = "" if exact and (not entries or span == (start, end)) else "the head of a chunk"
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         return WholeRecord(offset, offset + first + number, WholeChunk(chunk, definitions), wrong)
@@ -202,12 +206,15 @@ class RecordVerifier:
                 break
             follower += HEAD.size + length
         raw = self.read(offset, end - offset)
-        return WholeRecord(offset, end, read_message(raw))
+        return WholeRecord(offset, end, whole_records.read_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index: its channel, its entries, and where it ends.
 
-        Raise McapError if there is none.
+        Raises
+        ------
+        McapError
+            If there is none.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")

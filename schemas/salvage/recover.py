@@ -74,8 +74,17 @@ def recover_log(
 def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
     """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
 
-    Return its name, without `.active`. Raise LogError as `recover_log` does, or if the log is being
-    written, or there is a file of a name needed here.
+    Returns
+    -------
+    path : Path
+        Name of the log, without `.active`.
+    recovery : Recovery
+        What was saved, and what was lost.
+
+    Raises
+    ------
+    LogError
+        As `recover_log`, or if the log is being written, or there is a file of a name needed here.
     """
     path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")
@@ -111,7 +120,10 @@ def _keep(log: Path, name: Path) -> None:
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     """Read a recovered log with all its checksums, and count its messages.
 
-    Raise LogError if it is damaged, or does not hold the messages that were recovered.
+    Raises
+    ------
+    LogError
+        If it is damaged, or does not hold the messages that were recovered.
     """
     expected = Counter({name: topic.messages for name, topic in topics.items() if topic.messages})
     counts: Counter[str] = Counter()

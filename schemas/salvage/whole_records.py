@@ -48,7 +48,10 @@ class WholeRecord(NamedTuple):
 def split_content(content: bytes) -> tuple[Int64, Int64]:
     """Go through the records of a chunk, and return where messages and definitions begin.
 
-    Raise McapError if a record is damaged, or of a kind that no chunk holds.
+    Raises
+    ------
+    McapError
+        If a record is damaged, or of a kind that no chunk holds.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
@@ -67,7 +70,12 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
     """Read the schemas and channels that begin at some bytes of a chunk.
 
-    Raise McapError, or UnicodeDecodeError, if one is damaged, or they are too many.
+    Raises
+    ------
+    McapError
+        If one is damaged, or they are too many.
+    UnicodeDecodeError
+        If a text in it is not UTF-8.
     """
     if len(starts) > _DEFINITIONS_LIMIT:
         raise McapError("a chunk holds more definitions than can be kept")
@@ -83,7 +91,10 @@ def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
 def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
     """Return the first and last log time of a message index; 0 and 0 if it is empty.
 
-    Raise McapError if a log time is out of range.
+    Raises
+    ------
+    McapError
+        If a log time is out of range.
     """
     if not entries:
         return 0, 0
@@ -113,7 +124,12 @@ def read_message(raw: bytes) -> records.Message:
 def read_attachment(raw: bytes) -> WholeAttachment:
     """Read an attachment from its record, whose lengths add up.
 
-    Raise McapError, or UnicodeDecodeError, if its checksum is wrong.
+    Raises
+    ------
+    McapError
+        If its checksum is wrong.
+    UnicodeDecodeError
+        If a text in it is not UTF-8.
     """
     record = memoryview(raw)
     (crc,) = UINT32.unpack(record[-UINT32.size :])

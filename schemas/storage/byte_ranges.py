@@ -97,7 +97,10 @@ class LocalFile:
 class StoredFile:
     """A file of a store, as it is when this is made; may be read from several threads.
 
-    Raise LogError if it cannot be read, or is another one by now.
+    Raises
+    ------
+    LogError
+        If it cannot be read, or is another one by now.
     """
 
     def __init__(self, path: Path) -> None:

@@ -87,7 +87,10 @@ def new_file(path: Path) -> Iterator[Path]:
 def replaced_file(path: Path) -> Iterator[Path]:
     """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
 
-    Raise LogError if it cannot be written.
+    Raises
+    ------
+    LogError
+        If it cannot be written.
     """
     put = _put_in_place if is_local(path) else _put_in_store
     with put(path, new=False) as temporary:

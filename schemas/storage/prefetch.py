@@ -14,8 +14,13 @@ def prefetch(
 ) -> Generator[Result, None, None]:
     """Apply a function to items in threads, few ahead of the consumer; yield results in order.
 
-    The function should spend its time where the interpreter is not needed: reading, decompressing,
-    numpy. One item more than there are workers is worked on, or waits for the consumer.
+    Parameters
+    ----------
+    function : callable
+        Should spend its time where the interpreter is not needed: reading, decompressing, numpy.
+    items : iterable
+    workers : int
+        Threads; one item more than these is worked on, or waits for the consumer.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()

@@ -9,7 +9,10 @@ from pathlib import Path
 def open_regular(path: Path) -> int:
     """Open a file of this machine for reading, and return its descriptor.
 
-    Raise OSError if it cannot be opened, or is no regular file.
+    Raises
+    ------
+    OSError
+        If it cannot be opened, or is no regular file.
     """
     mode = os.stat(path).st_mode  # noqa: PTH116  goes with what follows
     if stat.S_ISDIR(mode):

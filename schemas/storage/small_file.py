@@ -16,8 +16,15 @@ _DEEPEST = 100  # parts of a dotted key, for which the parser takes the cube of 
 def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
     """Read a regular file of this machine, or a file of a store.
 
-    Raise `error` if there is none, it cannot be read, or has more bytes than the limit; `what` says
-    in the message what it should be.
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What it should be, for the message.
+    limit : int
+        Bytes, at most.
+    error : type of HearthlogError
+        Raised if there is no such file, or it is larger or cannot be read.
     """
     try:
         if not path.exists():
