@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from hearthlog.recorder.clock import SampleClock
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.recorder.sources.framing import Framer, SampleBlock
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
@@ -146,3 +147,11 @@ def test_setting_the_wall_clock_is_a_gap_of_the_step_in_which_hardly_a_frame_is_
     assert gap.frames_lost <= 1
     assert gap.end - gap.start == pytest.approx(hour, abs=50e6)
     assert int(frames.stamps[0]) == gap.end
+
+
+@pytest.mark.parametrize("size", [1, 799, 800, 801, 5000])
+def test_samples_in_pieces_of_any_size_are_cut_into_the_same_frames(size):
+    samples = np.arange(12_345, dtype=np.float32)
+    cutter = FrameCutter()
+    pieces = [cutter.push(samples[start : start + size]) for start in range(0, 12_345, size)]
+    assert np.concatenate(pieces).tolist() == samples[:12_000].reshape(15, 800).tolist()
