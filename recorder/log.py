@@ -25,17 +25,13 @@ _NEVER = (1 << 63) - 1
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What every file of a recording says of itself.
+    """What every file of a recording says of itself."""
 
-    `infos` are the `AudioStreamInfo` of each microphone, without stamps; `metadata` is the
-    `hearthlog` record.
-    """
-
-    root: Path
+    root: Path  # folder of the logs
     node: str
     topics: Sequence[Topic]
-    infos: Sequence[Any]
-    metadata: Mapping[str, str]
+    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone, without stamps
+    metadata: Mapping[str, str]  # the `hearthlog` record
     attachments: Sequence[Attachment]
 
 
@@ -150,7 +146,20 @@ class RollingLog:
         return self._begun[0][1], until
 
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
-        """Complete the file as `finish` does; the next message begins one of this description."""
+        """Complete the open file, and let the next message begin one of another description.
+
+        Parameters
+        ----------
+        description : LogDescription
+            Of the files to come.
+        messages : sequence of EncodedMessage
+            The last ones of the open file.
+
+        Raises
+        ------
+        LogError
+            As `finish` does.
+        """
         self.finish(messages)
         self._description = description
         self._until = 0

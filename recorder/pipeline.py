@@ -175,7 +175,16 @@ class Pipeline:
         return closing, self.report("model", stamp, notice)
 
     def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
-        """Turn a notice about the "model" or the "clips" into messages."""
+        """Turn a notice into messages.
+
+        Parameters
+        ----------
+        subject : str
+            What it is about: "model" or "clips".
+        stamp : int
+            In nanoseconds of UTC.
+        notice : Notice
+        """
         name = f"hearthlog: {self.microphone} {subject}"
         return [
             self._diagnostics(stamp, notice.level, name, notice.text, {}),

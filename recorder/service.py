@@ -150,7 +150,22 @@ def record(
 
 
 class RecordingSession:
-    """The recording of one source: its log, the clips beside it, and the models that label it."""
+    """The recording of one source: its log, the clips beside it, and the models that label it.
+
+    Parameters
+    ----------
+    settings : Settings
+    microphone : str
+        Its name.
+    device : str
+        Name of the source.
+    watch : ModelWatch or None
+        Gives the models, one after the other; None for no labels.
+
+    Attributes
+    ----------
+    summary : RecordingSummary
+    """
 
     def __init__(
         self, settings: Settings, microphone: str, device: str, watch: ModelWatch | None
@@ -235,7 +250,17 @@ def _configured_features(settings: Settings, classifier: Classifier | None) -> F
 def describe_log(
     settings: Settings, info: Any, features: FeatureSet, model: Model | None
 ) -> LogDescription:
-    """Return the description of the logs of a recording with this `AudioStreamInfo`."""
+    """Return the description of the logs of a recording.
+
+    Parameters
+    ----------
+    settings : Settings
+    info : message
+        `AudioStreamInfo` of the logs.
+    features : FeatureSet
+    model : Model or None
+        That labels the sound.
+    """
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)
     attachments = [Attachment("configuration.json", "application/json", configuration)]

@@ -28,7 +28,19 @@ class Job(NamedTuple):
 def make_job(
     chain: Chain, place: int, model: Model, model_path: Path, *, continues_layer: bool
 ) -> Job:
-    """Make the job of the log at a place in a chain, as if it had no layer."""
+    """Make the job of one log of a chain, as if it had no layer.
+
+    Parameters
+    ----------
+    chain : Chain
+    place : int
+        Index of the log in the chain.
+    model : Model
+    model_path : Path
+        Where workers find the model.
+    continues_layer : bool
+        As in `Job`.
+    """
     log = chain.logs[place]
     first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
     return Job(
@@ -45,6 +57,14 @@ def make_job(
 
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
     """Tell whether a layer is what would be made again, apart from its open segment at the start.
+
+    Parameters
+    ----------
+    job : Job
+    metadata : LayerMetadata
+        Of the layer.
+    log_sha256 : str
+        `log_digest` of the log.
 
     Raises
     ------

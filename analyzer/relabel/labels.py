@@ -108,7 +108,13 @@ def label_log(job: Job) -> UnfinishedLayer:
 
 
 def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
-    """Add the segments, which lack no start, to the labels, and give the layer its name.
+    """Add the segments to the labels, and give the layer its name.
+
+    Parameters
+    ----------
+    job : Job
+    labelled : UnfinishedLayer
+        That does not lack its start any more.
 
     Raises
     ------

@@ -105,7 +105,17 @@ def delete_parts(layer: Path) -> None:
 def layer_record(
     metadata: LayerMetadata, log: str, node: str, more: Mapping[str, str]
 ) -> dict[str, str]:
-    """Make the `hearthlog` record of a layer of this log; `more` are further entries."""
+    """Make the `hearthlog` record of a layer.
+
+    Parameters
+    ----------
+    metadata : LayerMetadata
+    log : str
+        Name of the log's file.
+    node : str
+    more : mapping of str to str
+        Further entries.
+    """
     return provenance(
         node,
         log=log,

@@ -37,7 +37,10 @@ class UnreadableError(LogError):
 def recorder_info(path: Path) -> RecorderInfo | None:
     """Read what a log says of its recorder; None if it has no features.
 
-    A damaged log raises UnreadableError.
+    Raises
+    ------
+    UnreadableError
+        If it is damaged.
     """
     try:
         return read_recorder_info(path, "features")
@@ -46,9 +49,19 @@ def recorder_info(path: Path) -> RecorderInfo | None:
 
 
 def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
-    """Read the features and gaps of a log from a time on (ns of UTC).
+    """Read the features and gaps of a log from a time on.
 
-    A damaged log raises UnreadableError.
+    Parameters
+    ----------
+    info : RecorderInfo
+        Of the log.
+    start : int
+        In nanoseconds of UTC.
+
+    Raises
+    ------
+    UnreadableError
+        If it is damaged.
     """
     try:
         for batch in read_recorded(info, start, _NEVER, sound_only=True):
@@ -87,10 +100,23 @@ def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
 def warm_up(
     info: RecorderInfo, earlier: Sequence[Path], classifier: Classifier, *, states_only: bool
 ) -> StreamLabeller:
-    """Label as much of the earlier logs, the last first, as the first labels of a log depend on.
+    """Label as much before a log as its first labels depend on.
 
-    With `states_only` it suffices that the states have converged; the open segment may then lack
-    its beginning.
+    Parameters
+    ----------
+    info : RecorderInfo
+        Of the log.
+    earlier : sequence of Path
+        Logs before it, the last first.
+    classifier : Classifier
+    states_only : bool
+        Whether it suffices that the states have converged: the open segment may then lack its
+        beginning.
+
+    Returns
+    -------
+    StreamLabeller
+        Ready for the first frame of the log.
     """
     first, seconds_back = info.first_frame, _WARM_UP
     while first is not None and earlier:

@@ -38,7 +38,15 @@ class ReplayComparison:
     def add_labels(
         self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
-        """Count the labels of one span of time; from `end` on (ns of UTC) none were replayed."""
+        """Count the labels of one span of time.
+
+        Parameters
+        ----------
+        recorded : sequence of RawMessages
+        replayed : sequence of EncodedMessage
+        end : int
+            Time from which on nothing was replayed, in nanoseconds of UTC.
+        """
         for absent, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, absent) if time < end}
             new = dict(_replayed(replayed, message_types.LABEL, absent))
@@ -54,8 +62,13 @@ class ReplayComparison:
     ) -> None:
         """Count the segments of one span of time.
 
-        A segment that closes at a gap is recorded earlier than it is replayed, but none is replayed
-        after `end`, that of the last replayed frame (ns of UTC).
+        Parameters
+        ----------
+        recorded : sequence of RawMessages
+        replayed : sequence of EncodedMessage
+            A segment that closes at a gap is recorded earlier than it is replayed.
+        end : int
+            End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
         """
         for absent, same in _by_version(recorded).items():
             self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))

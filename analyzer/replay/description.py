@@ -23,7 +23,17 @@ def describe(
 ) -> LogDescription:
     """Describe a new log as the recorder described the old one.
 
-    `replayed` are further entries of its `hearthlog` record.
+    Parameters
+    ----------
+    recorded : RecorderInfo
+        Of the old log.
+    features : FeatureSet
+    model : Model or None
+        That labels the new log.
+    output : Path
+        Folder of the new log.
+    replayed : mapping of str to str
+        Further entries of the `hearthlog` record.
     """
     if model is not None and model.sha256 == recorded.model_sha256:
         model = replace(model, name=recorded.model)  # whatever its file is called here

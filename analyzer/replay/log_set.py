@@ -13,10 +13,19 @@ _NEVER = (1 << 63) - 1
 
 
 class LogSet:
-    """Logs of one microphone, in the order of their first messages, without layers among them.
+    """Logs of one microphone, in the order of their first messages.
 
-    `kind` is that of `ReplayOptions`; `first` and `last` are the log times of the first and the
-    last message (ns of UTC).
+    Parameters
+    ----------
+    paths : sequence of Path
+        Layers and empty logs among them are left out.
+    kind : str
+        As in `ReplayOptions`.
+
+    Attributes
+    ----------
+    first, last : int
+        Log times of the first and the last message, in nanoseconds of UTC.
 
     Raises
     ------
@@ -41,7 +50,13 @@ class LogSet:
         return start, min(start + round(options.duration * NANOSECONDS), _NEVER)
 
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
-        """Return the logs to replay, at least one; raises LogError as `between`."""
+        """Return the logs to replay.
+
+        Raises
+        ------
+        LogError
+            If there is none, and as `between`.
+        """
         infos = self.between(*self.span(options))
         if not infos:
             raise self.nothing()

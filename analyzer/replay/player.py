@@ -30,8 +30,16 @@ _LOST = "the log that was replayed does not have it"
 class Player:
     """Gives what recorders recorded to pipelines, one run of a recorder after the other.
 
-    Messages with log times before `start` are left out; `progress` is told the time (ns of UTC) up
-    to which frames were replayed.
+    Parameters
+    ----------
+    options : ReplayOptions
+    start : int
+        Log time before which messages are left out, in nanoseconds of UTC.
+    result : Replay
+        Is added to.
+    stop : threading.Event
+    progress : callable
+        Told the time (nanoseconds of UTC) up to which frames were replayed.
 
     Attributes
     ----------
@@ -99,7 +107,13 @@ class Player:
         self._result.compared.add_segments(batch.segments, segments, end)
 
     def finish(self, *, cut: bool) -> None:
-        """Complete the log and the comparison; if cut, the last segment is not as recorded."""
+        """Complete the log and the comparison.
+
+        Parameters
+        ----------
+        cut : bool
+            Whether the recorded sound goes on: the last segment is then not as recorded.
+        """
         self._close()
         if not cut and self._options.kind == "features":
             self.compare(RecordedBatch([], [], []))

@@ -35,7 +35,16 @@ _RawByType = dict[str, list[RawMessages]]
 
 
 class Features(NamedTuple):
-    """Features of successive frames, as `Pipeline.push_features` takes them."""
+    """Features of successive frames, as `Pipeline.push_features` takes them.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first frame.
+    values : np.ndarray [shape=(n, d)], float32
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    """
 
     first: int
     values: Float32

@@ -49,7 +49,17 @@ class FrameLabels(NamedTuple):
 
 
 class Labeller:
-    """Labels one stream of frames, and divides it into segments."""
+    """Labels one stream of frames, and divides it into segments.
+
+    Parameters
+    ----------
+    classifier : Classifier
+
+    Attributes
+    ----------
+    classes : tuple of str
+    segmenter : Segmenter
+    """
 
     def __init__(self, classifier: Classifier) -> None:
         self.classes = classifier.classes
@@ -97,7 +107,15 @@ class Labeller:
 def segment_columns(
     segments: Sequence[Segment], classes: Sequence[str], microphone: str
 ) -> dict[str, Column]:
-    """Return the fields of one `AudioSegment` a segment."""
+    """Return the fields of one `AudioSegment` a segment.
+
+    Parameters
+    ----------
+    segments : sequence of Segment
+    classes : sequence of str
+        Names behind the labels of the segments.
+    microphone : str
+    """
     starts = np.array([segment.start for segment in segments], np.int64)
     ends = np.array([segment.end for segment in segments], np.int64)
     return {

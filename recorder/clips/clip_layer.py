@@ -37,8 +37,15 @@ CLIPS_AGAIN = Notice(OK, "clips are kept again")
 class ClipWriter:
     """Writes sound into layers, as long as the day's minutes and the disk allow.
 
-    Whatever happens here, the logs go on: errors become notices and are not raised. `file_at` is
-    that of `RollingLog`.
+    Whatever happens here, the logs go on: errors become notices and are not raised.
+
+    Parameters
+    ----------
+    settings : Settings
+    microphone : str
+        Its name.
+    file_at : callable
+        Returns the log that contains a time, and the end of that log; see `RollingLog.file_at`.
     """
 
     def __init__(
@@ -71,7 +78,13 @@ class ClipWriter:
         return notices
 
     def tick(self, now: int) -> list[Notice]:
-        """Complete the layer of a log that has ended, once no sound of it is held back."""
+        """Complete the layer of a log that has ended, once no sound of it is held back.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
         if self._writer is None or self._file_at(now)[0] == self._log:
             self._rolled = None
         elif self._rolled is None:

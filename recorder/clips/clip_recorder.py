@@ -18,6 +18,14 @@ from hearthlog.schemas.times import NANOSECONDS
 class ClipRecorder:
     """Keeps the clips of one recording, if that is configured, and always deletes old ones.
 
+    Parameters
+    ----------
+    settings : Settings
+    pipeline : Pipeline
+        Of the microphone whose sound it is.
+    file_at : callable
+        Returns the log that contains a time, and the end of that log; see `RollingLog.file_at`.
+
     Raises
     ------
     ConfigurationError
@@ -52,7 +60,14 @@ class ClipRecorder:
         return []
 
     def after(self, event: Event, labels: FrameLabels | None) -> list[Notice]:
-        """Keep the sound of an event that was logged; the labels are those of its last frames."""
+        """Keep the sound of an event that was logged.
+
+        Parameters
+        ----------
+        event : Event
+        labels : FrameLabels or None
+            Of its last frames, if they are labelled.
+        """
         now = event_time(event)
         notices = self._retention.tick(now)
         if self._keep == "off":

@@ -16,9 +16,16 @@ _TIME = "%Y%m%dT%H%M%SZ"
 
 
 class ClipRetention:
-    """Deletes the clips of a node whose logs began `days` ago, once an hour of sound.
+    """Deletes the old clips of a recorder once an hour, by the time of the sound.
 
-    Links in the folder are not followed.
+    Parameters
+    ----------
+    root : Path
+        Folder of logs; links in it are not followed.
+    node : str
+        Node whose clips they are.
+    days : int
+        Age at which a layer is deleted, counted from the start of its log.
     """
 
     def __init__(self, root: Path, node: str, days: int) -> None:
@@ -28,7 +35,13 @@ class ClipRetention:
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
-        """Delete what is old now (ns of UTC), unless that was done less than an hour ago."""
+        """Delete what is old, unless that was done less than an hour ago.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
         self._last = now
@@ -57,7 +70,13 @@ class ClipRetention:
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
     """Find the layers of sound of a node, whole or damaged.
 
-    Errors of folders that cannot be read are appended to `failures`.
+    Parameters
+    ----------
+    root : Path
+        Folder of logs.
+    node : str
+    failures : list of OSError
+        Errors of folders that cannot be read are appended.
 
     Yields
     ------

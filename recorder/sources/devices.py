@@ -72,7 +72,13 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 
 
 def find_device(devices: list[Device], name: str) -> Device:
-    """Choose a microphone by its name or a part of it; an empty name is the default one.
+    """Choose a microphone.
+
+    Parameters
+    ----------
+    devices : list of Device
+    name : str
+        A name or a part of one; empty for the default microphone.
 
     Raises
     ------

@@ -8,7 +8,13 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 
 class FrameCutter:
-    """Resamples one sound to 16 kHz and cuts it into frames."""
+    """Resamples one sound to 16 kHz and cuts it into frames.
+
+    Parameters
+    ----------
+    rate : float
+        Samples per second of the sound.
+    """
 
     def __init__(self, rate: float = SAMPLE_RATE) -> None:
         self._held = np.empty(0, np.float32)
@@ -17,7 +23,19 @@ class FrameCutter:
             self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, 1, dtype="float32")
 
     def push(self, samples: Float32, *, last: bool = False) -> Float32:
-        """Add samples and return the frames that they complete, shape (n, 800)."""
+        """Add samples and return the frames that they complete.
+
+        Parameters
+        ----------
+        samples : np.ndarray [shape=(m,)], float32
+        last : bool
+            Whether the sound ends with these samples.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, 800)], float32
+            At 16 kHz.
+        """
         if self._resampler is not None:
             samples = self._resampler.resample_chunk(samples, last=last)
         self._held = np.concatenate([self._held, samples])

@@ -105,7 +105,15 @@ class Framer:
         self._wall_offset = wall_offset
 
     def step_clock(self, wall_offset: int, reason: str) -> None:
-        """Change the time of day; only the samples of the unfinished frame are lost."""
+        """Change the time of day; only the samples of the unfinished frame are lost.
+
+        Parameters
+        ----------
+        wall_offset : int
+            CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
+        reason : str
+            Why the clock changed.
+        """
         self._restart(self._expected + self._lost, reason)
         self._wall_offset = wall_offset
 

@@ -26,7 +26,10 @@ _STEP_SECONDS = 0.25
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
-    `device` is as `hearthlog devices` lists it, or empty for the default one.
+    Parameters
+    ----------
+    device : str
+        As `hearthlog devices` lists it, or empty for the default one.
 
     Raises
     ------

@@ -82,7 +82,18 @@ class CaptureProcess:
             raise
 
     def blocks(self, timeout: float) -> list[SampleBlock] | None:
-        """Wait some seconds and return the blocks that have come; None if the process ended."""
+        """Return the blocks that have arrived.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds to wait for the first one.
+
+        Returns
+        -------
+        list of SampleBlock or None
+            None if the process has ended.
+        """
         if not self._wait(timeout):
             return []
         data = self._read()
