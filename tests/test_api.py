@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -84,6 +85,11 @@ def test_the_methods_of_logs_say_it_too():
         if not name.startswith("_")
     ]
     assert {test.name.partition(".")[2] for test in examples_of("Logs")} == set(methods)
+
+
+def test_every_public_name_is_on_the_page_of_the_api():
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text("utf-8")
+    assert set(re.findall(r"^\.\. auto\w+:: (\w+)$", page, re.MULTILINE)) == set(PUBLIC)
 
 
 def test_importing_it_imports_nothing_that_is_heavy():
