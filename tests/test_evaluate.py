@@ -355,8 +355,8 @@ def test_no_line_of_a_table_is_too_wide(capsys):
     assert lines[-1].startswith("confusion: too many classes")
 
 
-def test_a_model_is_scored_on_real_household_sound(household, model_file, tmp_path, hearthlog):
-    picture, words = tmp_path / "scores.png", (model_file, "--data", household)
+def test_a_model_is_scored_on_real_household_sound(all_household, model_file, tmp_path, hearthlog):
+    picture, words = tmp_path / "scores.png", (model_file, "--data", all_household)
     options = ("--scenario", "general", "--json", "--plot", picture)
     result = hearthlog("evaluate", "model", *words, *options)
     assert result.returncode == 0, result.stderr
@@ -426,8 +426,8 @@ def test_bad_references_are_one_line(recorded, tmp_path, hearthlog):
     assert "doorbell (4.0 s)" in result.stderr
 
 
-def test_a_model_of_another_scenario_is_refused(household, model_file, hearthlog):
-    words = (model_file, "--data", household, "--scenario", "bathroom")
+def test_a_model_of_another_scenario_is_refused(all_household, model_file, hearthlog):
+    words = (model_file, "--data", all_household, "--scenario", "bathroom")
     result = hearthlog("evaluate", "model", *words)
     assert result.returncode == 1
     assert "the model lacks flushing_water" in result.stderr

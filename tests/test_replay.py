@@ -16,7 +16,7 @@ import pytest
 import soundfile
 import typer
 from blobs import blobs
-from conftest import HEARTHLOG
+from conftest import HEARTHLOG, spread_files
 from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
@@ -122,7 +122,7 @@ def test_with_its_model_a_recording_comes_out_again_message_for_message(
 
 
 def test_so_does_real_sound(household, model_file, tmp_path):
-    files = sorted(household.glob("*/*.flac"))[::40]
+    files = spread_files(household, 26)
     settings = Settings(output=tmp_path / "recorded", model=model_file, max_bag_duration=60)
     record(settings, settings.microphone[0], LossySource(FileSource(files, START), LOST), Flag())
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HEARTHLOG
+from conftest import HEARTHLOG, spread_files
 from logreader import LogReader
 from spliced import raw_messages, run
 from stores import account, put
@@ -39,11 +39,11 @@ START = 1_772_352_000 * NANOSECONDS
 
 
 @pytest.fixture(scope="module")
-def logs(household, model_file, tmp_path_factory) -> Path:
+def logs(all_household, model_file, tmp_path_factory) -> Path:
     """Eleven minutes of real sound, in logs of five."""
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=300)
-    sounds = sorted(household.glob("*/*.flac"))[::6]
+    sounds = spread_files(all_household, 175)
     record(settings, settings.microphone[0], FileSource(sounds, START), threading.Event())
     assert len(find_logs(folder)) > 2
     return folder

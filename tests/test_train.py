@@ -288,11 +288,11 @@ def test_wrong_use_of_the_command_is_one_line(tmp_path, words):
     assert result.stderr.count("\n") == 1
 
 
-def test_household_sounds_are_told_apart_across_sources(household):
+def test_household_sounds_are_told_apart_across_sources(all_household):
     per_group: dict[tuple[str, str], int] = {}
     labels = ("silence", "coughing", "crying", "yelling", "objects_activity")
     chosen = []
-    for item in read_manifest(household / "manifest.csv", LABELS):
+    for item in read_manifest(all_household / "manifest.csv", LABELS):
         key = (item.label, item.source_group)
         per_group[key] = per_group.get(key, 0) + 1
         groups = len({group for label, group in per_group if label == item.label})

@@ -6,6 +6,7 @@ from operator import itemgetter
 
 import numpy as np
 import pytest
+from conftest import spread_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
@@ -165,7 +166,7 @@ def test_messages_that_were_read_are_written_as_they_were(source, request, tmp_p
     if source == "simulated home":
         audio = [request.getfixturevalue("day")]
     else:
-        audio = sorted(request.getfixturevalue("household").glob("*/*.flac"))[::40]
+        audio = spread_files(request.getfixturevalue("household"), 26)
     model = request.getfixturevalue("model_file")
     done = hearthlog("record", *audio, "-o", tmp_path, "--model", model)
     assert done.returncode == 0, done.stderr
