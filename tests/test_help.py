@@ -111,6 +111,9 @@ def completed(*words):
     [
         (("hearthlog", "re"), ["record", "recover", "review", "report", "replay", "relabel"]),
         (("hearthlog", "models", "pro"), ["promote"]),
+        (("hearthlog", "evaluate", ""), ["log", "model", "method", "search", "adaptation"]),
+        (("hearthlog", "evaluate", "--model", "m", "--he"), ["--help"]),
+        (("hearthlog", "evaluate", "search", "--fo"), ["--folds"]),
         (("hearthlog", "record", "--max"), ["--max-bag-duration"]),
         (("hearthlog", "cat", "--format", ""), ["text", "ndjson", "csv"]),
     ],

@@ -52,7 +52,7 @@ class _Group(TyperGroup):
         """Read the words behind `evaluate`."""
         options = {word.partition("=")[0] for word in args}
         verb = next((verb for option, verb in _MOVED.items() if option in options), None)
-        if verb and args[0] not in self.commands:
+        if verb and args[0] not in self.commands and not ctx.resilient_parsing:
             wrong_use(f"say `hearthlog evaluate {verb} …`; its --help lists the options")
         return super().parse_args(ctx, args)
 
