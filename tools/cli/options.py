@@ -75,7 +75,13 @@ def manifest_path(path: Path) -> Path:
 
 
 def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:
-    """End with the exit status of wrong use unless a new file may have this name."""
+    """End with the exit status of wrong use unless a new file may have this name.
+
+    Raises
+    ------
+    LogError
+        If the file exists.
+    """
     from hearthlog.schemas.storage.new_files import check_new
 
     if path is not None and path.suffix != suffix:
@@ -85,7 +91,13 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
 
 def parse_time(text: str, option: str) -> int:
-    """Read a time, in nanoseconds of UTC."""
+    """Read a time, in nanoseconds of UTC.
+
+    Raises
+    ------
+    typer.BadParameter
+        If the text is not a time.
+    """
     from hearthlog.schemas.times import read_time
 
     try:
@@ -95,7 +107,13 @@ def parse_time(text: str, option: str) -> int:
 
 
 def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | None]:
-    """Read the options --start and --end."""
+    """Read the options --start and --end, in nanoseconds of UTC.
+
+    Raises
+    ------
+    typer.BadParameter
+        If one of them is not a time, or the end is not after the start.
+    """
     first = None if start is None else min(max(parse_time(start, "--start"), 0), _LAST)
     last = None if end is None else min(max(parse_time(end, "--end"), 0), _LAST)
     if first is not None and last is not None and first >= last:

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location
-from hearthlog.tools.cli.text import number, tell
+from hearthlog.tools.cli.text import first_of, number, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.relabel.run import Relabelled
-
-_SHOWN = 20  # of a list
 
 
 def relabel(
@@ -64,14 +62,9 @@ def _print(result: "Relabelled", model: str) -> None:
     if result.active:
         print(f"{number(len(result.active), 'log')} still being written")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
-        for log, why in sorted(logs.items())[:_SHOWN]:
-            tell(f"{what}: {_reason(log, why)}")
-        if len(logs) > _SHOWN:
-            tell(f"{what}: {len(logs) - _SHOWN} more; see --json")
-
-
-def _reason(log: Path, why: str) -> str:
-    return why if str(log.parent) in why else f"{log}: {why}"
+        named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
+        for line in first_of(what, sorted(named)):
+            tell(line)
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:

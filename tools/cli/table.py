@@ -12,9 +12,17 @@ _GAP = 2
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> None:
-    """Print rows of text, if there are any, below their heads, if there are any.
+    """Print rows of text below their heads.
 
-    The first columns are `words`, the others figures, which stand to the right and stay whole.
+    Parameters
+    ----------
+    head : sequence of str
+        Empty for a table without heads.
+    rows : iterable of sequence of str
+        Without rows, nothing is printed.
+    words : int
+        Number of columns, from the left, that are words. The others are figures: aligned to the
+        right, and wrapped only after the words.
     """
     from rich.console import Console
     from rich.table import Table
