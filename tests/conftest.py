@@ -35,7 +35,7 @@ __all__ = [
     "s3_account",
 ]
 
-_HOUSEHOLD = Path("/nonexistent")
+_HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 _CLIPS = Path(__file__).parent / "data" / "household"
 HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
