@@ -3,7 +3,7 @@
 import re
 
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, ROSOUT, parse_topic
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
 TYPES = {
@@ -17,13 +17,14 @@ TYPES = {
 ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
 LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
 SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
-_TOPIC = re.compile(r"/([a-z](?:_?[a-z0-9])*)/(\w+)")
 
 
 def split_topic(topic: str) -> tuple[str, str]:
     """Split a topic into microphone and kind; one of no microphone into nothing and itself."""
-    match = _TOPIC.fullmatch(topic)
-    return ("", topic) if match is None or match[2] not in TYPES else (match[1], match[2])
+    name = parse_topic(topic)
+    if name is None or name.labelling != LIVE or name.kind not in TYPES:
+        return "", topic
+    return name.microphone, name.kind
 
 
 def topic_type(topic: str) -> str | None:
