@@ -42,7 +42,12 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
 
 
 def aligned(weights: Float64) -> Float64:
-    """Copy weights to the start of a cache line: products with them take a third less time."""
+    """Copy weights to the start of a cache line: products with them take a third less time.
+
+    Parameters
+    ----------
+    weights : np.ndarray [shape=(k, m)]
+    """
     room = np.empty(weights.size * weights.itemsize + _LINE, np.uint8)
     start = -room.ctypes.data % _LINE
     copy = room[start : start + weights.size * weights.itemsize].view(np.float64)

@@ -118,7 +118,7 @@ class Pipeline:
         return self._push_health(event)
 
     def push_features(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Turn the features of successive frames into messages, in the order of their log times.
+        """Turn the features of successive frames into messages.
 
         Parameters
         ----------
@@ -127,6 +127,11 @@ class Pipeline:
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of EncodedMessage
+            In the order of their log times.
         """
         mean, std = self._statistics(features)
         frames = np.arange(first, first + len(features))

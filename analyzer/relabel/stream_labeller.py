@@ -12,10 +12,20 @@ _LARGEST_STEP = NANOSECONDS // 5  # by which the time of a sound card may jump b
 
 
 class StreamLabeller:
-    """Labels what one microphone recorded, in the order of time."""
+    """Labels what one microphone recorded, in the order of time.
+
+    Parameters
+    ----------
+    classifier : Classifier
+
+    Attributes
+    ----------
+    segments : list of Segment
+        Those that have ended.
+    """
 
     def __init__(self, classifier: Classifier) -> None:
-        self.segments: list[Segment] = []  # those that have ended
+        self.segments: list[Segment] = []
         self._labeller = Labeller(classifier)
         self._next: int | None = None  # number of the next frame
         self._end = 0  # end of the last frame, in nanoseconds of UTC

@@ -217,7 +217,13 @@ def cut_recordings(
 
 
 def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
-    """Compute the features of a clip, shape (n, d); raises SourceError if it cannot be read."""
+    """Compute the features of a clip, shape (n, d).
+
+    Raises
+    ------
+    SourceError
+        If it cannot be read.
+    """
     extract = features.extractor()
     values = [np.empty((0, features.width), np.float32)]
     cutter = FrameCutter()

@@ -118,7 +118,13 @@ class Method(ABC):
         """
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """Return this method with other parameters; raises DataError for unknown ones."""
+        """Return this method with other parameters.
+
+        Raises
+        ------
+        DataError
+            If it has no such parameter.
+        """
         if values:
             raise DataError(f"method {self.name} has no {min(values)} to choose")
         return self

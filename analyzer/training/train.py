@@ -171,7 +171,10 @@ def check_varied(data: Dataset) -> None:
 def group_folds(data: Dataset) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
 
-    Every fold learns from segments of every class.
+    Returns
+    -------
+    list of Fold
+        Indices of segments to learn from and to test on; every class is among the former.
 
     Raises
     ------

@@ -14,7 +14,17 @@ _SECONDS = 5.0  # expected duration of a class that is not in the table of class
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
-    """Return the transition probabilities of classes, shape (C, C), by their expected durations."""
+    """Return the transition probabilities of classes by their expected durations.
+
+    Parameters
+    ----------
+    classes : sequence of str
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+        As of `transitions_from_durations`.
+    """
     return transitions_from_durations(expected_durations(classes), FRAME_SECONDS)
 
 

@@ -69,7 +69,15 @@ def gone(scheduler: str) -> WorkerError:
 
 
 class Cluster:
-    """Workers of a Dask cluster, through a client of `connected`."""
+    """Workers of a Dask cluster.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        From `connected`.
+    scheduler : str
+        Its address, for messages.
+    """
 
     def __init__(self, client: "Client", scheduler: str) -> None:
         self._client, self._scheduler = client, scheduler

@@ -14,9 +14,12 @@ _MOST_THREADS = 4
 
 
 def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
-    """Yield the results of `joblib.delayed` calls, in their order.
+    """Yield the results of calls, in their order.
 
-    They run in threads, since libsvm releases the lock, or where `joblib.parallel_config` says.
+    Parameters
+    ----------
+    calls : iterable of joblib.delayed
+        They run in threads, since libsvm releases the lock, or where `joblib.parallel_config` says.
     """
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
     return joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)

@@ -32,7 +32,13 @@ T = TypeVar("T")
 
 
 class Processes:
-    """Processes, each with a thread here that gives it one task after the other."""
+    """Processes, each with a thread here that gives it one task after the other.
+
+    Parameters
+    ----------
+    count : int
+        Number of processes.
+    """
 
     def __init__(self, count: int) -> None:
         self.parallel = count

@@ -26,8 +26,11 @@ class Workers(Protocol):
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a task.
 
-        The future raises what the function raises, and WorkerError if the worker was lost three
-        times, the cluster is gone, or a worker has another version of hearthlog.
+        Returns
+        -------
+        concurrent.futures.Future
+            It raises what the function raises, and WorkerError if the worker was lost three times,
+            the cluster is gone, or a worker has another version of hearthlog.
         """
 
 

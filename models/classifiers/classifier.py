@@ -15,7 +15,13 @@ _ROWS_AT_ONCE = 256
 
 
 def classifier_kind(name: str) -> ClassifierKind:
-    """Return a kind of classifier by its name; raises ModelError if it cannot be used."""
+    """Return a kind of classifier by its name.
+
+    Raises
+    ------
+    ModelError
+        If there is none of this name, or it cannot be imported.
+    """
     return CLASSIFIERS.get(name)
 
 

@@ -168,7 +168,13 @@ class _WithMetrics(BaseModel):
 
 
 def class_metrics(text: bytes) -> dict[str, ClassMetrics]:
-    """Read the scores of each class from a description of any format; empty if it has none."""
+    """Read the scores of each class from a description in a log, which may be of any format.
+
+    Returns
+    -------
+    dict of str to ClassMetrics
+        Empty where it has none that can be read.
+    """
     try:
         return _WithMetrics.model_validate_json(text).metrics.classes
     except ValidationError:

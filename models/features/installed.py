@@ -9,5 +9,11 @@ FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
-    """Return a feature set by its name; raises ModelError if it cannot be used."""
+    """Return a feature set by its name.
+
+    Raises
+    ------
+    ModelError
+        If there is none of this name, or it cannot be imported.
+    """
     return FEATURE_SETS.get(name)

@@ -34,7 +34,13 @@ class InputStream(Protocol):
 
 
 class Inputs(Protocol):
-    """Maps windows of features to inputs."""
+    """Maps windows of features to inputs.
+
+    Attributes
+    ----------
+    width : int
+        Number of inputs.
+    """
 
     @property
     def width(self) -> int:
@@ -88,7 +94,17 @@ class WindowStatistics:
         return StatisticsStream(self)
 
     def of_windows(self, windows: Float32) -> Float32:
-        """Compute the inputs of single windows; see `Inputs`."""
+        """Compute the inputs of single windows.
+
+        Parameters
+        ----------
+        windows : np.ndarray [shape=(n, window_frames, d)], float32
+            Features.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, width)], float32
+        """
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
             part = windows[start : start + _FRAMES_AT_ONCE]

@@ -48,7 +48,17 @@ def band_values(features: Float32) -> Float64:
 
 
 def bands_of(cepstra: Float32) -> Float64:
-    """Turn mel cepstra, shape (n, 13), back into smoothed mel bands in dB, shape (n, 32)."""
+    """Turn mel cepstra back into mel bands, smoothed by the cepstra that are left out.
+
+    Parameters
+    ----------
+    cepstra : np.ndarray [shape=(n, 13)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 32)], float64
+        In dB.
+    """
     return rowwise_matmul(cepstra.astype(np.float64), dct_weights().T)
 
 
