@@ -39,6 +39,8 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
 
     Parameters
     ----------
+    data : Dataset
+    method : Method
     progress : callable
         Told the share of the fits that is done.
 

@@ -75,6 +75,8 @@ def compare_models(
 
     Parameters
     ----------
+    a, b : Model
+    recordings : iterable of Recording
     scenario : Scenario
         With the classes of both.
 

@@ -168,6 +168,7 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
         A label file, or `review` for the review layers.
     path : Path
         The log, or folder of logs.
+    microphone : str
 
     Raises
     ------

@@ -40,6 +40,8 @@ def evaluate_method(
 
     Parameters
     ----------
+    data : Dataset
+    method : Method
     kind : str
         What is never on both sides of a fold: a `segment` (the paper's folds, which flatter,
         since segments of one recording are alike), a `source`, or a `collection`, which is what

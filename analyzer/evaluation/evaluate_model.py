@@ -42,6 +42,8 @@ def evaluate_model(
 
     Parameters
     ----------
+    model : Model
+    clips : sequence of LabelledClip
     scenario : Scenario
         With the classes of the model.
     progress : callable

@@ -95,6 +95,7 @@ def detect(
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
+    classes : sequence of str
     duration : int
         Evaluated time in nanoseconds.
 
@@ -115,6 +116,11 @@ def laid_out(events: Events, spans: Spans) -> Events:
 
     Every span begins on a whole second, and at least one second after the end of the last: no
     event is compared with one of another span.
+
+    Parameters
+    ----------
+    events : Events
+    spans : Spans
     """
     seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
@@ -130,6 +136,7 @@ def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) 
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
+    classes : sequence of str
     """
     counts = []
     for label in range(len(classes)):
@@ -148,6 +155,11 @@ def event_based(reference: Events, predicted: Events, classes: Sequence[str]) ->
 
     Two events match if their onsets are at most 0.2 s apart, and their offsets at most 0.2 s or
     half the length of the reference's, whichever is more. As many as possible are matched.
+
+    Parameters
+    ----------
+    reference, predicted : Events
+    classes : sequence of str
 
     Raises
     ------
@@ -185,6 +197,8 @@ def false_alarms_per_day(
 
     Parameters
     ----------
+    reference, predicted : Events
+    classes : sequence of str
     duration : int
         Evaluated time in nanoseconds.
 

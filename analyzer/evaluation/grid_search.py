@@ -22,6 +22,8 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
 
     Parameters
     ----------
+    data : Dataset
+    methods : list of Method
     by : str
         What is never on both sides of a fold: see `analyzer.evaluation.folds.evaluate_method`.
     progress : callable

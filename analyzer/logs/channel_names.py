@@ -25,6 +25,8 @@ def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, 
     ----------
     path : Path
         Of the log, for the message.
+    columns : Columns
+    field : str
 
     Raises
     ------

@@ -68,7 +68,15 @@ def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
 
 
 def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
-    """Yield what was not well: from when it was said to when something else was, or nothing was."""
+    """Yield what was not well: from when it was said to when something else was, or nothing was.
+
+    Parameters
+    ----------
+    statuses : iterable of Status
+        In any order.
+    end : int
+        Nanoseconds of UTC, at which the last trouble ends if it is not over before.
+    """
     for name, same in groupby(sorted(statuses), lambda status: status.name):
         own = list(same)
         texts = [(status.time, status.message if status.level else None) for status in own]
@@ -83,6 +91,7 @@ def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple
     ----------
     texts : sequence of (int, str or None)
         When something was said, in the order of time; None is nothing.
+    end : int
 
     Yields
     ------

@@ -66,6 +66,7 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
 
     Parameters
     ----------
+    path : Path
     topic : str, optional
         By default that of the only microphone.
 

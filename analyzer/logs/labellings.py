@@ -97,6 +97,7 @@ class Labellings:
 
         Parameters
         ----------
+        microphone : str
         text : str
             `live`, `review`, the name of a model, or `relabel` if there is only one.
 
@@ -131,6 +132,7 @@ class Labellings:
             As `microphone` and `find` return them.
         start, end : int, optional
             In nanoseconds: what is before and after is cut off.
+        progress : callable, optional
 
         Raises
         ------

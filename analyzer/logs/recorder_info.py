@@ -70,6 +70,7 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
 
     Parameters
     ----------
+    path : Path
     kind : str
         One of `TYPES`, the sort of topic by which the microphone is known.
 

@@ -59,7 +59,20 @@ def one(start: int, end: int) -> Spans:
 
 
 def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
-    """Find where, in spans by their starts, one begins more than a pause after all before it."""
+    """Find the first of each group of spans no more than a pause apart.
+
+    Parameters
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Nanoseconds; the starts ascend.
+    pause : int
+        Nanoseconds.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], intp
+        Rows of the spans that begin more than a pause after the end of all before them.
+    """
     if not len(starts):
         return np.empty(0, np.intp)
     apart = starts[1:] > np.maximum.accumulate(ends)[:-1] + pause
@@ -67,7 +80,15 @@ def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
 
 
 def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
-    """Join spans, in any order, that overlap or are no more than a pause apart."""
+    """Join spans that overlap or are no more than a pause apart.
+
+    Parameters
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        Nanoseconds, in any order.
+    pause : int, optional
+        Nanoseconds.
+    """
     order = np.argsort(starts, kind="stable")
     starts, ends = starts[order], ends[order]
     firsts = first_of_groups(starts, ends, pause)
@@ -76,6 +97,10 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
 
 def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
     """Count up from each of some numbers.
+
+    Parameters
+    ----------
+    firsts, counts : np.ndarray [shape=(n,)], int
 
     Returns
     -------
@@ -87,7 +112,13 @@ def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Ro
 
 
 def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
-    """Cut spans, which may overlap, to others.
+    """Cut spans to others.
+
+    Parameters
+    ----------
+    a : Spans, or anything with starts and ends
+        They may overlap.
+    b : Spans
 
     Returns
     -------
@@ -122,7 +153,15 @@ def without(a: Spans, b: Spans) -> Spans:
 
 
 def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
-    """Take spans from others; return what is left, and the row of `a` that each is left of."""
+    """Take spans from others.
+
+    Returns
+    -------
+    spans : Spans
+        What is in `a` and not in `b`.
+    of_a : np.ndarray [shape=(n,)]
+        The row each is left of.
+    """
     if not len(a.starts) or not len(b.starts):
         return Spans(a.starts, a.ends), np.arange(len(a.starts))
     first, last = min(a.starts[0], b.starts[0]), max(a.ends[-1], b.ends[-1])
@@ -133,7 +172,18 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
 
 
 def rows_at(spans: Timed, times: Int64) -> Int64:
-    """Find the row of the span that each time lies in; -1 for none."""
+    """Find the span that each time lies in.
+
+    Parameters
+    ----------
+    spans : Spans, or anything with starts and ends
+    times : np.ndarray [shape=(n,)], int64
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+        Rows; -1 for none.
+    """
     if not len(spans.starts):
         return np.full(len(times), -1)
     rows = np.searchsorted(spans.starts, times, side="right") - 1
@@ -160,7 +210,19 @@ def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
 
 
 def lengths(spans: Spans, edges: Int64) -> Int64:
-    """Measure how much of spans is between each two successive edges, in nanoseconds."""
+    """Measure how much of spans is between each two successive edges.
+
+    Parameters
+    ----------
+    spans : Spans
+    edges : np.ndarray [shape=(n + 1,)], int64
+        Ascending.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+        Nanoseconds.
+    """
     sums = np.concatenate([[0], np.cumsum(spans.ends - spans.starts)])
     begun = np.searchsorted(spans.starts, edges, side="right")
     before = sums[np.maximum(begun - 1, 0)]

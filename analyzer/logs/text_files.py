@@ -17,6 +17,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
 
     Parameters
     ----------
+    path : Path
     what : str
         What it should be, for the message.
     size_limit : int

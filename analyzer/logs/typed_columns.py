@@ -32,6 +32,7 @@ def decode_types(
     ----------
     path : Path
         The log they are from.
+    batch : iterable of RawMessages
     types : mapping of str to collection of str
         Paths of the fields to decode, by type; `is_compatible` says which they may be.
 
@@ -82,6 +83,9 @@ def is_compatible(
 
     Parameters
     ----------
+    channel : Channel
+    schema : Schema or None
+    type_ : str
     fields : collection of str
         Paths of the fields that the reader needs.
     """

@@ -72,12 +72,14 @@ def read_home(
 
     Parameters
     ----------
+    logs : HomeLogs
     labelling : str
         `live`, or the model of relabel layers.
     since : int
         From when on segments are wanted, in nanoseconds of UTC.
     close : (int, int)
         The days that are reported: of them gaps and troubles are wanted too.
+    progress : callable, optional
 
     Raises
     ------

@@ -53,10 +53,13 @@ def make_report(
 
     Parameters
     ----------
+    logs : HomeLogs
+    period : Period
     page : Path
         Of the HTML file; the picture is beside it, with the suffix `.png`.
     labelling : str, optional
         `live`, or the model of relabel layers.
+    progress : callable, optional
 
     Raises
     ------

@@ -32,6 +32,7 @@ def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
     ----------
     path : Path
         Of a PNG file.
+    day : Day
     earlier : sequence of Day
         Those that it is compared with.
     """

@@ -78,6 +78,7 @@ class Catalog:
 
     Parameters
     ----------
+    folder : Path
     table : pa.Table
         Of `SCHEMA`.
     """
@@ -166,6 +167,7 @@ def write_catalog(
 
     Parameters
     ----------
+    folder : Path
     before : Catalog, optional
         Files that are as it says are not read again, damaged ones excepted.
     progress : callable, optional

@@ -56,6 +56,7 @@ def read_contents(path: Path, labelling: str) -> Contents:
 
     Parameters
     ----------
+    path : Path
     labelling : str
         `live`, `relabel` or `review`: segments of others are not counted.
 
