@@ -106,7 +106,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(
                 page, "text/html; charset=utf-8", {"Content-Security-Policy": self._policy()}
             )
-        elif name == "about":
+        elif name == "description":
             description = {"data": self._page.data, "keys": list(self._page.relay.keys)}
             self._send(json.dumps(description).encode(), "application/json")
         elif name == "next":
