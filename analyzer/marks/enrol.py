@@ -97,10 +97,18 @@ def enrol_microphone(
     seconds: float = SECONDS,
     listening: Callable[[], None] = lambda: None,
 ) -> list[Enrolled]:
-    """Enrol what a microphone hears now; otherwise as `enrol_file`.
+    """Enrol what a microphone hears now; returns and raises as `enrol_file`.
 
-    `device` is named as `hearthlog devices` lists it, empty for the default one; `listening` is
-    called when it is open.
+    Parameters
+    ----------
+    home : Path
+    label : str
+        As of `enrol_file`.
+    device : str
+        As `hearthlog devices` lists it; empty for the default one.
+    seconds : float
+    listening : callable
+        Is called when the microphone is open.
     """
     _check_label(label)
     with closing(MicrophoneSource(device)) as source:

@@ -77,7 +77,15 @@ def read_labels(
 def read_lines(
     path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
 ) -> list[PlacedMark]:
-    """Read a label file as `read_labels`; labels may overlap, or lie where nothing was recorded."""
+    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
+
+    Parameters and errors are otherwise those of `read_labels`.
+
+    Returns
+    -------
+    list of PlacedMark
+        With their lines, or their places in a file that has none.
+    """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
     if format_ in {AUDACITY, RAVEN}:

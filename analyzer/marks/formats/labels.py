@@ -47,9 +47,22 @@ def place_text(path: Path, place: int | str) -> str:
 def make_mark(
     path: Path, label: FileLabel, coverage: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
-    """Make a mark of a label; `microphone` is that of a label that names none.
+    """Make a mark of a label.
 
-    Raises DataError with file and place, if it is no valid mark.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for errors.
+    label : FileLabel
+    coverage : mapping of str to Coverage
+        Of each microphone.
+    microphone : str or None
+        Of a label that names none; not needed if there is only one.
+
+    Raises
+    ------
+    DataError
+        With file and place, if it is no valid mark.
     """
     where = place_text(path, label.place)
     only = next(iter(coverage)) if len(coverage) == 1 else ""

@@ -27,7 +27,17 @@ _QUIETEST = 1e-10  # of a mean square: -100 dB
 
 
 class FeatureRows(NamedTuple):
-    """Features of n frames, shape (n, k), by name; times are their starts, in ns of UTC."""
+    """Features of n frames.
+
+    Attributes
+    ----------
+    microphone : str
+    names : tuple of str
+        Of the k columns.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float32
+    """
 
     microphone: str
     names: tuple[str, ...]
@@ -36,7 +46,19 @@ class FeatureRows(NamedTuple):
 
 
 class LabelRows(NamedTuple):
-    """Probabilities of classes in frames, shape (n, k), and novelty, NaN where there is none."""
+    """Probabilities of k classes, and novelty, in n frames.
+
+    Attributes
+    ----------
+    microphone, labelling : str
+    names : tuple of str
+        Of the classes.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
+    probabilities : np.ndarray [shape=(n, k)], float32
+    novelty : np.ndarray [shape=(n,)], float32
+        NaN where the model has none.
+    """
 
     microphone: str
     labelling: str

@@ -99,7 +99,14 @@ def changes(spans: LabelledSpans) -> Changes:
 
 
 def timeline_lanes(timeline: Timeline, *, detail: bool) -> Iterator[Lane]:
-    """Make the lanes of a timeline, in `detail` (every segment) or as an `overview`."""
+    """Make the lanes of a timeline, the clock first.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    detail : bool
+        Whether they show every segment, where there are any, or an `overview`.
+    """
     grid = timeline.grid
     hours = clock(grid, home_zone(timeline.zone))
     yield Lane(CLOCK, "", timeline.zone, changes(hours))

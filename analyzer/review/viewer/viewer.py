@@ -99,7 +99,13 @@ class Viewer:
         self._control.process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
-        """Show a timeline, with room for short spans of it if `close_up`.
+        """Show a timeline.
+
+        Parameters
+        ----------
+        timeline : Timeline
+        close_up : bool
+            Whether short spans of it are looked at one after the other.
 
         Raises
         ------

@@ -38,7 +38,12 @@ class Relay:
     def ask(self, request: bytes) -> bytes:
         """Ask the page, and wait for its answer.
 
-        Raises TimeoutError without an answer, ConnectionError if the viewer in the page refused.
+        Raises
+        ------
+        TimeoutError
+            If there is no answer.
+        ConnectionError
+            If the viewer in the page refused.
         """
         self._last += 1
         number, answer = self._last, Future[bytes]()
