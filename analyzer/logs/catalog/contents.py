@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.labelling import MOST_CLASSES
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
@@ -27,7 +28,6 @@ _EVENTS: dict[str, Sequence[str]] = {
 _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
     (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
 )
-_MOST_CLASSES = 100
 _LONGEST = 1000  # characters of what a log says of itself
 
 
@@ -161,8 +161,8 @@ class _Reading:
         ):
             self._contents.segments[label[:_LONGEST]] += count
             self._contents.seconds[label[:_LONGEST]] += length
-        if len(self._contents.segments) > _MOST_CLASSES:
+        if len(self._contents.segments) > MOST_CLASSES:
             raise LogError(
-                f"{self._file.path}: has more than {_MOST_CLASSES} different labels; "
+                f"{self._file.path}: has more than {MOST_CLASSES} different labels; "
                 "no classifier has so many"
             )
