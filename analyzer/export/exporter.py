@@ -35,13 +35,20 @@ class OutputFiles:
 class Exporter(NamedTuple):
     """How a format writes messages.
 
-    `save` raises LogError if a log is damaged, if there is no message, or one that the format has
-    no place for.
+    Attributes
+    ----------
+    save : callable
+        Writes a selection to files; raises LogError if a log is damaged, if there is no message, or
+        one that the format has no place for.
+    type : str
+        The only message type that it takes; empty for any.
+    fields : collection of str
+        Paths of the fields that messages must have.
     """
 
     save: Callable[[Selection, OutputFiles, Progress], None]
-    type: str = ""  # the only message type that it takes; any by default
-    fields: Collection[str] = ()  # that messages must have
+    type: str = ""
+    fields: Collection[str] = ()
 
 
 class TopicWriter(Protocol):

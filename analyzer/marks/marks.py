@@ -37,15 +37,29 @@ _FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_ORIGIN)}
 
 
 class Mark(NamedTuple):
-    """The label of a span of time by a reviewer, in nanoseconds of UTC."""
+    """The label of a span of time by a reviewer.
+
+    Attributes
+    ----------
+    microphone : str
+    start, end : int
+        In nanoseconds of UTC.
+    label : str
+    reviewer : str
+        Empty if unknown.
+    made : int
+        When the mark was made, in nanoseconds of UTC; 0 if unknown.
+    corrects : str
+        The labelling that it corrects: `live`, or the name of a model; empty if unknown.
+    """
 
     microphone: str
     start: int
     end: int
     label: str
-    reviewer: str = ""  # empty if unknown, as what follows
-    made: int = 0  # when the mark was made; 0 if unknown
-    corrects: str = ""  # the labelling that it corrects: `live`, or the name of a model
+    reviewer: str = ""
+    made: int = 0
+    corrects: str = ""
 
 
 class MarkedSpan(NamedTuple):
@@ -57,7 +71,12 @@ class MarkedSpan(NamedTuple):
 
 
 def read_marks(log: Path) -> list[Mark]:
-    """Read the marks of a log, by microphone and time; empty if there is no review layer.
+    """Read the marks of a log.
+
+    Returns
+    -------
+    list of Mark
+        By microphone and time, without overlaps; empty if there is no review layer.
 
     Raises
     ------

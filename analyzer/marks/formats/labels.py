@@ -18,18 +18,35 @@ _LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and the logs of 
 
 
 class FileLabel(NamedTuple):
-    """A label as it is in a file: text, empty where the file has none."""
+    """A label as it is in a file: text, empty where the file has none.
 
-    place: int | str  # the line, or the place in a file without lines
-    start: str  # seconds since `zero`, or ISO 8601
+    Attributes
+    ----------
+    place : int or str
+        The line, or the place in a file without lines.
+    start, end : str
+        Seconds since `zero`, or ISO 8601.
+    label, microphone, reviewer : str
+    made : str
+        When the label was made, ISO 8601.
+    corrects : str
+        The labelling that it corrects.
+    zero : str
+        ISO 8601; by default the first frame of the microphone.
+    length : str
+        Length of the labelled recording, in seconds.
+    """
+
+    place: int | str
+    start: str
     end: str
     label: str
     microphone: str = ""
     reviewer: str = ""
-    made: str = ""  # ISO 8601
+    made: str = ""
     corrects: str = ""
-    zero: str = ""  # ISO 8601; by default the first frame of the microphone
-    length: str = ""  # of the labelled recording, in seconds
+    zero: str = ""
+    length: str = ""
 
 
 class PlacedMark(NamedTuple):
@@ -100,7 +117,13 @@ def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
 
 
 def read_seconds(where: str, text: str) -> Decimal:
-    """Read a number of seconds; raise DataError if it is none."""
+    """Read a number of seconds.
+
+    Raises
+    ------
+    DataError
+        If it is no number.
+    """
     if not _SECONDS.fullmatch(text):
         raise DataError(f"{where}: {text[:64]!r} is no number of seconds")
     return Decimal(text)

@@ -84,7 +84,13 @@ class Marking:
         return self._write(start, end, [])
 
     def undo(self) -> tuple[int, int] | None:
-        """Undo the last change; return its span, or None if there is nothing to undo."""
+        """Undo the last change.
+
+        Returns
+        -------
+        (int, int) or None
+            Its span, in nanoseconds of UTC; None if there is nothing to undo.
+        """
         if not self._done:
             return None
         changes = self._done[-1]

@@ -25,12 +25,22 @@ _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time
 
 
 class ReviewItem(NamedTuple):
-    """A span to be reviewed."""
+    """A span to be reviewed.
 
-    start: int  # in nanoseconds of UTC
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    label : str
+        The label of most of it, which the key `a` accepts.
+    text : str
+        A line for the reviewer.
+    """
+
+    start: int
     end: int
-    label: str  # of most of it; the key `a` accepts it
-    text: str  # for the reviewer
+    label: str
+    text: str
 
 
 class Screen(Protocol):

@@ -66,7 +66,15 @@ TROUBLE = LaneKind(9, _trouble_colours, TROUBLES)
 
 
 class Changes(NamedTuple):
-    """When a lane changes, ascending in ns of UTC, and to which states; None is nothing."""
+    """When a lane changes, and to which states.
+
+    Attributes
+    ----------
+    times : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, ascending.
+    states : list of (str or None)
+        None is no state.
+    """
 
     times: Int64
     states: list[str | None]

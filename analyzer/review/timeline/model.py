@@ -13,7 +13,14 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 
 
 class LabelledSpans(NamedTuple):
-    """Spans of time in their order, in ns of UTC, each with a text: a label, or a reason."""
+    """Spans of time, each with a text: a label, or a reason.
+
+    Attributes
+    ----------
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, in the order of time.
+    texts : np.ndarray [shape=(n,)] of str
+    """
 
     starts: Int64
     ends: Int64
@@ -24,34 +31,70 @@ class LabelledSpans(NamedTuple):
 
 
 class GridSeries(NamedTuple):
-    """Means in the shares of a grid, NaN where nothing was recorded."""
+    """Means on the grid of a timeline.
 
-    names: tuple[str, ...]  # of k columns
-    values: Float64  # shape (count, k)
+    Attributes
+    ----------
+    names : tuple of str
+        Of the columns.
+    values : np.ndarray [shape=(count, k)], float64
+        NaN where nothing was recorded.
+    """
+
+    names: tuple[str, ...]
+    values: Float64
 
 
 class FrameValues(NamedTuple):
-    """Values of successive frames, 20 a second, as they are in a log."""
+    """Values of successive frames, 20 a second, as they are in a log.
 
-    names: tuple[str, ...]  # of k columns
-    times: Int64  # starts, shape (n,), in nanoseconds of UTC
-    values: Float32  # shape (n, k)
+    Attributes
+    ----------
+    names : tuple of str
+        Of the columns.
+    times : np.ndarray [shape=(n,)], int64
+        Starts of the frames, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float32
+    """
+
+    names: tuple[str, ...]
+    times: Int64
+    values: Float32
 
 
 class LogLines(NamedTuple):
-    """Lines that the recorder logged in words, in the order of time."""
+    """Lines that the recorder logged in words, in the order of time.
 
-    times: Int64  # in nanoseconds of UTC
-    levels: NDArray[np.integer]  # of `rcl_interfaces/msg/Log`
+    Attributes
+    ----------
+    times : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    levels : np.ndarray [shape=(n,)], int
+        Those of `rcl_interfaces/msg/Log`.
+    texts : np.ndarray [shape=(n,)] of str
+    """
+
+    times: Int64
+    levels: NDArray[np.integer]
     texts: NDArray[np.object_]
 
 
 class SoundClip(NamedTuple):
-    """Kept sound."""
+    """Kept sound.
 
-    start: int  # in nanoseconds of UTC
-    rate: int  # samples a second
-    samples: Float32  # -1 to 1
+    Attributes
+    ----------
+    start : int
+        In nanoseconds of UTC.
+    rate : int
+        Samples a second.
+    samples : np.ndarray [shape=(n,)], float32
+        -1 to 1.
+    """
+
+    start: int
+    rate: int
+    samples: Float32
 
     @property
     def end(self) -> int:
@@ -61,29 +104,55 @@ class SoundClip(NamedTuple):
 
 @dataclass
 class LabellingTimeline:
-    """The labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`)."""
+    """The labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`).
+
+    Attributes
+    ----------
+    name : str
+    spans : LabelledSpans
+        The segments or marks.
+    probabilities : GridSeries or None
+        A column for each class.
+    novelty : np.ndarray [shape=(count,)], float64, or None
+    frames : list of FrameValues
+        The probabilities, frame by frame.
+    """
 
     name: str
-    spans: LabelledSpans  # segments or marks
-    probabilities: GridSeries | None = None  # a column for each class
-    novelty: Float64 | None = None  # shape (count,)
-    frames: Sequence[FrameValues] = ()  # the probabilities, frame by frame
+    spans: LabelledSpans
+    probabilities: GridSeries | None = None
+    novelty: Float64 | None = None
+    frames: Sequence[FrameValues] = ()
 
 
 @dataclass
 class MicrophoneTimeline:
     """What the logs have of a microphone.
 
-    The level is in dB relative to full scale: 0 for a square wave of full scale.
+    Attributes
+    ----------
+    name : str
+    labellings : list of LabellingTimeline
+        The recorder's first, the reviewer's last.
+    features : GridSeries or None
+    level : np.ndarray [shape=(count,)], float64, or None
+        Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
+    level_frames : list of FrameValues
+        The level, frame by frame.
+    gaps : LabelledSpans
+        Audio that was lost, with the reasons.
+    troubles : LabelledSpans
+        Warnings and errors of the diagnostics.
+    clips : list of SoundClip
     """
 
     name: str
-    labellings: list[LabellingTimeline]  # the recorder's first, the reviewer's last
+    labellings: list[LabellingTimeline]
     features: GridSeries | None
-    level: Float64 | None  # of the mean energy, shape (count,)
+    level: Float64 | None
     level_frames: Sequence[FrameValues]
     gaps: LabelledSpans
-    troubles: LabelledSpans  # warnings and errors of the diagnostics
+    troubles: LabelledSpans
     clips: list[SoundClip]
 
     @property
@@ -98,15 +167,31 @@ class MicrophoneTimeline:
 
 @dataclass
 class Timeline:
-    """What some logs hold, at the resolution of a screen."""
+    """What some logs hold, at the resolution of a screen.
 
-    grid: Grid  # the whole span, in shares that are a pixel or two wide
+    Attributes
+    ----------
+    grid : Grid
+        The whole span, in shares that are a pixel or two wide.
+    microphones : dict of str to MicrophoneTimeline
+    lines : LogLines
+    zone : str
+        IANA name of the home's time zone.
+    coverage : dict of str to Coverage
+        When each microphone was recording, and in which log.
+    every : int
+        One in so many parts of the logs was read.
+    losses : list of str
+        What could not be shown, and why.
+    """
+
+    grid: Grid
     microphones: Mapping[str, MicrophoneTimeline]
     lines: LogLines
-    zone: str  # IANA name of the home's time zone
-    coverage: Mapping[str, Coverage]  # by microphone
-    every: int = 1  # one in so many parts of the logs was read
-    losses: list[str] = field(default_factory=list)  # what could not be shown, and why
+    zone: str
+    coverage: Mapping[str, Coverage]
+    every: int = 1
+    losses: list[str] = field(default_factory=list)
 
 
 def no_spans() -> LabelledSpans:

@@ -51,14 +51,28 @@ PLOTS = (SHARES, LEVEL, NOVELTY, FEATURES)
 
 
 class Plot(NamedTuple):
-    """A plot, or what is new in it: means over spans of time, NaN where nothing was recorded."""
+    """A plot, or what is new in it: means over spans of time.
+
+    Attributes
+    ----------
+    kind : PlotKind
+    microphone : str
+    labelling : str
+        Empty if the plot is of none.
+    names : tuple of str
+        Of the k columns.
+    times : np.ndarray [shape=(n,)], int64
+        Middles of the spans, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float64
+        NaN where nothing was recorded.
+    """
 
     kind: PlotKind
     microphone: str
-    labelling: str  # empty if it is of none
-    names: tuple[str, ...]  # of k columns
-    times: Int64  # middles of the spans, shape (n,), in ns of UTC
-    values: Float64  # shape (n, k)
+    labelling: str
+    names: tuple[str, ...]
+    times: Int64
+    values: Float64
 
 
 def timeline_plots(timeline: Timeline) -> Iterator[Plot]:

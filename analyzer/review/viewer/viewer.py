@@ -29,12 +29,23 @@ Blueprint = dict[str, Any]
 
 
 class ViewerState(NamedTuple):
-    """The state of a viewer, as it reports it."""
+    """The state of a viewer, as it reports it.
+
+    Attributes
+    ----------
+    version : str
+    views : int
+        How many there are.
+    errors : list of str
+        Those that views report.
+    cursor : int or None
+        The time cursor, in nanoseconds of UTC.
+    """
 
     version: str
     views: int
     errors: list[str]
-    cursor: int | None  # of time, in nanoseconds of UTC
+    cursor: int | None
 
 
 class ViewerControl(Protocol):
