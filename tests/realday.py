@@ -16,7 +16,7 @@ from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import SAMPLE_RATE

@@ -14,7 +14,7 @@ from lossy import LossySource
 from mcap.reader import make_reader
 
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter

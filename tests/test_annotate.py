@@ -20,7 +20,7 @@ from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, find_coverage
-from hearthlog.analyzer.marks.formats.table import FORMATS
+from hearthlog.analyzer.marks.formats.formats import FORMATS
 from hearthlog.analyzer.marks.marks import LATEST, Mark, MarkedSpan, read_marks, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, review_path

@@ -16,7 +16,7 @@ import soundfile
 import hearthlog
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import convert_sound, read_audio
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning

@@ -33,7 +33,7 @@ from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs

@@ -183,7 +183,7 @@ def test_recording_with_labels_imports_nothing_of_the_analyzer(day, model_file, 
         [*map(str, command), "-o", str(tmp_path)], capture_output=True, text=True, check=True
     )
     loaded = result.stdout.split()
-    assert "hearthlog.recorder.service" in loaded
+    assert "hearthlog.recorder.recording" in loaded
     assert not any(name.startswith("hearthlog.analyzer") for name in loaded)
     assert not {name.partition(".")[0] for name in loaded} & HEAVY
 

@@ -37,7 +37,7 @@ from hearthlog.recorder.clips.clip_retention import ClipRetention
 from hearthlog.recorder.config import MicrophoneSettings, Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.service import record, record_files
+from hearthlog.recorder.recording import record, record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES

@@ -22,7 +22,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.service import record_files
+from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns

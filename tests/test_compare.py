@@ -20,7 +20,7 @@ from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import adapt_model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.tools.home.simulate import write_day, write_training_set
 

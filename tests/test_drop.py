@@ -10,7 +10,7 @@ from lossy import LossySource
 from viewers import shown, viewer
 
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 
 __all__ = ["viewer"]  # a fixture

@@ -16,8 +16,8 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, Coverage, find_coverage
+from hearthlog.analyzer.marks.formats.formats import FORMATS
 from hearthlog.analyzer.marks.formats.label_files import read_labels, write_labels
-from hearthlog.analyzer.marks.formats.table import FORMATS
 from hearthlog.analyzer.marks.marks import LATEST, Mark, read_marks
 from hearthlog.analyzer.marks.merge_marks import new_marks
 from hearthlog.schemas.logs.files import find_logs

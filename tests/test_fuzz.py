@@ -18,7 +18,7 @@ from mcap.records import Chunk
 from rewriting import HEAD, Raw, as_raw, joined, parsed, split
 
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.times import NANOSECONDS

@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.models.classifiers.description import Collection
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.log_stream import TopicBatch

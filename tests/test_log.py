@@ -8,7 +8,7 @@ from logs import features
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline, stream_info
-from hearthlog.recorder.service import Settings, describe_log
+from hearthlog.recorder.recording import Settings, describe_log
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

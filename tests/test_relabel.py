@@ -28,7 +28,7 @@ from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns

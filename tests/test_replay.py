@@ -31,8 +31,8 @@ from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.recovery import recover_active
-from hearthlog.recorder.service import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogError, LogError

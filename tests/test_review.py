@@ -36,7 +36,7 @@ from hearthlog.analyzer.review.session.sound import sound_of
 from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer

@@ -25,7 +25,7 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.service import record_files
+from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic

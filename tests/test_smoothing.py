@@ -33,7 +33,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES

@@ -23,7 +23,7 @@ from hearthlog.analyzer.logs.locations import location
 from hearthlog.analyzer.logs.recorder_info import read_recorder_info
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import read_columns

@@ -22,7 +22,7 @@ from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.files import active_path, find_logs

@@ -27,7 +27,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.service import RecordingSession
+from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs

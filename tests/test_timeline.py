@@ -39,7 +39,7 @@ from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS

@@ -17,7 +17,8 @@ from hearthlog.analyzer.training.scores import (
     difference,
     score,
 )
-from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32
 

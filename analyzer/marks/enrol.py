@@ -24,7 +24,7 @@ from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.models.features.feature_set import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
-from hearthlog.recorder.service import record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds
 from hearthlog.recorder.sources.microphone import MicrophoneSource

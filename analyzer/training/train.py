@@ -11,6 +11,7 @@ from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.installed import DEFAULT, method_named
 from hearthlog.analyzer.training.method import (
     Fold,
     Learned,
@@ -20,7 +21,6 @@ from hearthlog.analyzer.training.method import (
     prepare,
     softmax,
 )
-from hearthlog.analyzer.training.methods import DEFAULT, method_named
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import calibration_error
 from hearthlog.analyzer.training.transitions import (

@@ -2,27 +2,12 @@
 
 import numpy as np
 
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
-from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32
 
-_GROUP = "hearthlog.classifiers"
-CLASSIFIERS = Extensions(_GROUP, ClassifierKind, "classifier kind", [SVM_RBF])  # type: ignore[type-abstract]
 _ROWS_AT_ONCE = 256
-
-
-def classifier_kind(name: str) -> ClassifierKind:
-    """Return a kind of classifier by its name.
-
-    Raises
-    ------
-    ModelError
-        If there is none of this name, or it cannot be imported.
-    """
-    return CLASSIFIERS.get(name)
 
 
 class Classifier:

@@ -2,7 +2,7 @@
 
 import json
 
-from hearthlog.models.classifiers.classifier import classifier_kind
+from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.logs.log_stream import Attachment
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors.numpy import load, save
 
-from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.description import (
     Description,
     first_problem,
     one_line,
     read_description,
 )
+from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set

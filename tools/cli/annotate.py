@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.analyzer.marks.formats.table import PATTERNS, find_format
+from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
 from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import number, tell, wrong_use

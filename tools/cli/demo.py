@@ -23,7 +23,7 @@ def demo(
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
     from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.service import record_files
+    from hearthlog.recorder.recording import record_files
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info

@@ -124,7 +124,7 @@ def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | No
 def chosen_method(name: str, **parameters: float | None) -> "Method":
     """Return a way to learn, with other parameters where they are given."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.methods import method_named
+    from hearthlog.analyzer.training.installed import method_named
 
     chosen = {key: value for key, value in parameters.items() if value is not None}
     for key, value in chosen.items():

@@ -13,7 +13,7 @@ from hearthlog.tools.cli.options import parse_time
 from hearthlog.tools.cli.text import number, tell
 
 if TYPE_CHECKING:
-    from hearthlog.recorder.service import RecordingSummary
+    from hearthlog.recorder.recording import RecordingSummary
 
 
 def record(
@@ -71,7 +71,7 @@ def record(
     left by an earlier recorder was damaged, or a new model was refused.
     """
     from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.service import record_files, record_microphone
+    from hearthlog.recorder.recording import record_files, record_microphone
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.tools.cli.progress import share_done
 

@@ -139,7 +139,7 @@ def _warn_of_few(segments: "Dataset") -> None:
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
-    from hearthlog.models.classifiers.classifier import classifier_kind
+    from hearthlog.models.classifiers.installed import classifier_kind
 
     description, metrics = model.description, model.description.metrics
     data = description.training_data

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
 from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings
+from hearthlog.analyzer.training.installed import method_named
 from hearthlog.analyzer.training.manifest import read_manifest
-from hearthlog.analyzer.training.methods import method_named
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model

@@ -9,6 +9,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.text_files import read_text
 from hearthlog.analyzer.marks.formats import raven
+from hearthlog.analyzer.marks.formats.formats import AUDACITY, RAVEN, LabelFormat, find_format
 from hearthlog.analyzer.marks.formats.labels import (
     FileLabel,
     PlacedMark,
@@ -16,7 +17,6 @@ from hearthlog.analyzer.marks.formats.labels import (
     make_mark,
     place_text,
 )
-from hearthlog.analyzer.marks.formats.table import AUDACITY, RAVEN, LabelFormat, find_format
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.storage.new_files import new_file
 

@@ -1,0 +1,23 @@
+"""The kinds of classifiers that are installed."""
+
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.extensions import Extensions
+
+CLASSIFIERS = Extensions(
+    "hearthlog.classifiers",
+    ClassifierKind,  # type: ignore[type-abstract]
+    "classifier kind",
+    [SVM_RBF],
+)
+
+
+def classifier_kind(name: str) -> ClassifierKind:
+    """Return a kind of classifier by its name.
+
+    Raises
+    ------
+    ModelError
+        If there is none of this name, or it cannot be imported.
+    """
+    return CLASSIFIERS.get(name)
