@@ -22,7 +22,7 @@ from hearthlog.tools.home.simulate import write_day, write_training_set
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
     path
-    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/*.md")]
+    for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("examples/**/*.md")]
     if not path.is_symlink()
 )
 TEXT = "\n".join(path.read_text("utf-8") for path in PAGES)
