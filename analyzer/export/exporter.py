@@ -13,11 +13,18 @@ from hearthlog.schemas.progress import Progress
 
 
 class OutputFiles:
-    """The files of an export, under temporary names until all are written."""
+    """The files of an export, under temporary names until all are written.
+
+    Attributes
+    ----------
+    path : Path
+        The only file, or the folder.
+    output : Path
+        The name that it gets.
+    """
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
-        self.path = path  # the only file, or the folder
-        self.output = output  # the name that it gets
+        self.path, self.output = path, output
         self._suffix = suffix
         self._names: set[str] = set()
 

@@ -22,7 +22,10 @@ _FILE_LIMIT = 2 << 30  # bytes; WAV has no more than 4 GiB
 class WavFiles:
     """The clips of one topic, those that follow each other without a hole in one file.
 
-    `name` gives the path of the file that begins at a time, in nanoseconds of UTC.
+    Parameters
+    ----------
+    name : callable
+        Gives the path of the file that begins at a time, in nanoseconds of UTC.
     """
 
     def __init__(self, name: Callable[[int], Path]) -> None:

@@ -26,7 +26,15 @@ _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 @dataclass
 class Relay:
-    """Requests to a page, and its answers. Keys are buttons of the page: a key, and its text."""
+    """Requests to a page, and its answers.
+
+    Attributes
+    ----------
+    keys : list of (str, str)
+        Buttons of the page: the key, and what it does.
+    press : callable
+        Takes the key that was pressed in the page.
+    """
 
     keys: Sequence[tuple[str, str]] = ()
     press: Callable[[str], None] = lambda _: None
