@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -14,7 +14,6 @@ from pydantic_settings import (
 )
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
-from hearthlog.recorder.clips.clip_choice import Keep
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.timezone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
@@ -22,6 +21,7 @@ from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name
 from hearthlog.schemas.storage.small_file import read_toml
 
+Keep = Literal["off", "events", "unsure", "always"]  # which sound is kept as clips
 _PREFIX = "HEARTHLOG_"
 
 

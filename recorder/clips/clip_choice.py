@@ -1,19 +1,18 @@
 """Which sound may be kept, and which of it is worth keeping. No I/O."""
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.recorder.config import Keep
 from hearthlog.recorder.events import Frames
 from hearthlog.schemas.arrays import Bool, Float32, Int16, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
-
-Keep = Literal["off", "events", "unsure", "always"]
 
 # Probability of speech in a second of sound: measured, see docs/recorder.md.
 PRIVATE_LIMIT = 0.02

@@ -29,7 +29,7 @@ _DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, MARK, GAP, R
 
 @cache
 def typestore() -> Typestore:
-    """Return the types of ROS 2 and those of `schemas/msg`."""
+    """Return the types of ROS 2 and those of the folder `msg`."""
     store = get_typestore(Stores.ROS2_JAZZY)
     folder = files("hearthlog.schemas.messages") / "msg"
     for name in _DEFINED_HERE:
