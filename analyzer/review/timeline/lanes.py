@@ -23,11 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _HOURS: tuple[Colour, Colour] = ((52, 60, 70), (32, 38, 46))
 _DIFFERENT: Colour = (222, 165, 32)
 _TROUBLE: Colour = (240, 140, 40)
-_TROUBLES: dict[str, Colour] = {
-    "warning": _TROUBLE,
-    "error": (230, 60, 60),
-    "stale": (150, 90, 160),
-}
+_TROUBLES = {"warning": _TROUBLE, "error": (230, 60, 60), "stale": (150, 90, 160)}
 TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnostic status less one
 NOT_HEARD = "not heard"
 _HOUR = 3600

@@ -31,6 +31,7 @@ APPLICATION = "hearthlog"
 # The viewer keeps the range that linked time axes share under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 _HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
+Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its height in relation to others
 
 
@@ -42,16 +43,12 @@ class TimelineBlueprint(rrb.Blueprint):
     rows : sequence of (int, View or Container)
         From above, with their heights in relation to each other.
     panel : rrb.TimePanel
-    start, end : rr.encodings.TimeRangeBoundary
+    start, end : Boundary
         The range.
     """
 
     def __init__(
-        self,
-        rows: Sequence[Row],
-        panel: rrb.TimePanel,
-        start: rr.encodings.TimeRangeBoundary,
-        end: rr.encodings.TimeRangeBoundary,
+        self, rows: Sequence[Row], panel: rrb.TimePanel, start: Boundary, end: Boundary
     ) -> None:
         super().__init__(stack(rows), panel, collapse_panels=True)
         self._range = rr.encodings.TimeRange(start, end)
@@ -122,10 +119,7 @@ def plot_view(
 
 
 def _time_series(
-    name: str,
-    entities: Sequence[str],
-    scale: tuple[float, float] | None,
-    legend: rrb.PlotLegend,
+    name: str, entities: Sequence[str], scale: tuple[float, float] | None, legend: rrb.PlotLegend
 ) -> rrb.View:
     is_one = len(entities) == 1
     return rrb.TimeSeriesView(
@@ -175,8 +169,7 @@ def review_layout(
     panel = rrb.TimePanel(
         state="expanded" if marking else "collapsed", timeline=TIMELINE, play_state="paused"
     )
-    absolute = rr.encodings.TimeRangeBoundary.absolute
-    ends = (absolute(nanos=time) for time in (timeline.grid.start, timeline.grid.end))
+    ends = (Boundary.absolute(nanos=time) for time in (timeline.grid.start, timeline.grid.end))
     return TimelineBlueprint(rows, panel, *ends)
 
 
@@ -242,12 +235,9 @@ def _frame_views(microphone: MicrophoneTimeline) -> list[rrb.View]:
     scales = {one.name: SHARES.scale for one in microphone.labellings if one.frames}
     if microphone.level_frames:
         scales[LEVEL.name] = LEVEL.scale
+    rows = [(name, frames_entity(microphone.name, name), scales[name]) for name in scales]
+    no_legend = rrb.PlotLegend(visible=False)
     return [
-        _time_series(
-            f"{name}, 20 a second: zoom in",
-            [frames_entity(microphone.name, name)],
-            scale,
-            rrb.PlotLegend(visible=False),
-        )
-        for name, scale in scales.items()
+        _time_series(f"{name}, 20 a second: zoom in", [entity], scale, no_legend)
+        for name, entity, scale in rows
     ]

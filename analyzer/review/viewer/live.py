@@ -21,6 +21,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     plot_entity,
 )
 from hearthlog.analyzer.review.viewer.layout import (
+    Boundary,
     Row,
     TimelineBlueprint,
     lanes_height,
@@ -132,8 +133,8 @@ def _layout(plots: Plots, minutes: float) -> TimelineBlueprint:
         (160, lines_view()),
     ]
     panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
-    relative = rr.encodings.TimeRangeBoundary.cursor_relative
-    return TimelineBlueprint(rows, panel, relative(seconds=-60 * minutes), relative(seconds=0.0))
+    ends = (Boundary.cursor_relative(seconds=seconds) for seconds in (-60 * minutes, 0.0))
+    return TimelineBlueprint(rows, panel, *ends)
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
