@@ -13,7 +13,7 @@ from hearthlog.schemas.messages.cdr_layout import (
     Default,
     Layout,
     Leaf,
-    Messages,
+    MessageArray,
     default_rows,
 )
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
@@ -228,7 +228,7 @@ def _decode(
 def _values(leaf: AnyLeaf, block: NDArray[np.void]) -> NDArray[Any]:
     if isinstance(leaf, Default):
         return np.repeat(leaf.row, len(block), axis=0)
-    if isinstance(leaf, Messages):
+    if isinstance(leaf, MessageArray):
         return _messages(leaf, block)
     if leaf.kind == "texts":
         rows = [_texts(block, name) for name in leaf.names]
@@ -263,7 +263,7 @@ def _text(value: np.void, name: str) -> str:
         raise LogError(f"{name}: a string is not UTF-8") from error
 
 
-def _messages(array: Messages, block: NDArray[np.void]) -> NDArray[np.object_]:
+def _messages(array: MessageArray, block: NDArray[np.void]) -> NDArray[np.object_]:
     """Turn an array of messages into one list of dicts a row."""
     elements = []
     for leaves in array.elements:

@@ -39,7 +39,7 @@ class Leaf(NamedTuple):
     names: tuple[str, ...]
 
 
-class Messages(NamedTuple):
+class MessageArray(NamedTuple):
     """One field that is an array of messages, and the leaves of each of them."""
 
     path: str
@@ -53,7 +53,7 @@ class Default(NamedTuple):
     row: NDArray[Any]
 
 
-AnyLeaf = Leaf | Messages | Default
+AnyLeaf = Leaf | MessageArray | Default
 
 
 class Layout(NamedTuple):
@@ -202,10 +202,10 @@ class LayoutWalk:
             count = self._length(path)
         return (self._array(path, element, base, count),)
 
-    def _array(self, path: str, element: Nodetype, base: Any, count: int) -> Leaf | Messages:
+    def _array(self, path: str, element: Nodetype, base: Any, count: int) -> Leaf | MessageArray:
         if element is Nodetype.NAME:
             elements = [self.message(base, f"{path}[{i}].") for i in self._range(path, count)]
-            return Messages(path, tuple(elements))
+            return MessageArray(path, tuple(elements))
         if base[0] == "string":
             names = tuple(f"{path}[{i}]" for i in self._range(path, count))
             for name in names:
