@@ -176,9 +176,9 @@ def _week(account: Account, figures: Sequence[Figure]) -> PageTable:
     rows = []
     for day in account.days:
         share = _share(figures, day)
-        heard = percent(share) if share else "not heard"
+        share_text = percent(share) if share else "not heard"
         values = [figure.value(day) if day.coverage.length else None for figure in figures]
-        rows.append(_row(class_words.short_day(day.day), heard, *map(_short, values)))
+        rows.append(_row(class_words.short_day(day.day), share_text, *map(_short, values)))
     totals = (_total(account.days, figure) for figure in figures)
     rows.append(_row("All days", "", *totals, kind="sum"))
     if account.comparable:

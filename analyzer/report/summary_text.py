@@ -27,8 +27,8 @@ _MINUTE = HOUR // 60
 
 def gist_of_day(account: Account, day: Day) -> Iterator[str]:
     """Say in a few lines what matters."""
-    heard = Minutes(day.coverage.length / _MINUTE).text
-    yield f"Heard: {heard} of the day ({percent(day.share)}). {_loudest(day)}"
+    minutes = Minutes(day.coverage.length / _MINUTE).text
+    yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}"
     yield _changes(account, day)
     if day.night_hours:
         yield _night(day)
@@ -38,13 +38,13 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
 
 def gist_of_week(account: Account) -> Iterator[str]:
     """Say in a few lines what matters."""
-    heard = [day for day in account.days if day.coverage.length]
-    share = sum(day.coverage.length for day in heard) / sum(day.span.length for day in account.days)
-    yield f"Heard: {len(heard)} of {len(account.days)} days, {percent(share)} of the time."
+    days = [day for day in account.days if day.coverage.length]
+    share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
+    yield f"Heard: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
     if not account.comparable:
         yield account.too_few
         return
-    changes = {day.day: list(_changed(account, day)) for day in heard}
+    changes = {day.day: list(_changed(account, day)) for day in days}
     if not any(changes.values()):
         yield f"Nothing was outside of what was heard on the {len(account.earlier)} days before."
         return

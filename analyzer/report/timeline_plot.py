@@ -125,10 +125,10 @@ def _usual_hours(day: Day, earlier: Sequence[Day]) -> list[Usual | None]:
     return hours or [None] * (len(day.hours) - 1)
 
 
-def _unheard(axes: Any, day: Day, heard: Spans, band: tuple[float, float]) -> None:
+def _unheard(axes: Any, day: Day, coverage: Spans, band: tuple[float, float]) -> None:
     """Hatch what was not heard, where that is long enough to be seen."""
     edges = _edges(day, _DAY_BINS)
-    missing = without(day.span, heard)
+    missing = without(day.span, coverage)
     empty = lengths(missing, edges) > np.diff(edges) / 2
     bounds = np.flatnonzero(np.diff(np.concatenate([[False], empty, [False]]).astype(int)))
     hours = _hours_of(day, edges)

@@ -1,6 +1,6 @@
 """Hashes of all that hearthlog makes of real sound, to be compared before and after a change.
 
-    python tools/fingerprint.py CLIPS --command "hearthlog" > before.txt
+    python tests/fingerprint.py CLIPS --command "hearthlog" > before.txt
 
 runs the verbs on a folder of labelled clips and prints one line for every topic of every log and
 layer, array of a model, page and table. It reads them with mcap and rosbags alone, field by field:
@@ -47,7 +47,7 @@ def main() -> None:
         if path.is_file():
             name = path.relative_to(options.folder)
             lines += [f"{value}  {name} {part}" for part, value in parts_of(path)]
-    print("\n".join(lines))
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 def run_verbs(command: list[str], clips: Path, folder: Path) -> dict[str, str]:
@@ -59,7 +59,7 @@ def run_verbs(command: list[str], clips: Path, folder: Path) -> dict[str, str]:
 
     def run(name: str, *arguments: object) -> None:
         words = [*command, *map(str, arguments)]
-        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode not in {0, 3}:
             sys.exit(f"{name}: {done.stderr}")
         texts[name] = f"{done.returncode}\n{done.stdout}"
