@@ -22,8 +22,6 @@ from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32
 
-Bools = NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class ComparedModel:
