@@ -39,7 +39,7 @@ def make_job(
     model_path : Path
         Where workers find the model.
     continues_layer : bool
-        As in `Job`.
+        Whether the open segment at the start is taken from the layer before.
     """
     log = chain.logs[place]
     first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
@@ -65,6 +65,11 @@ def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
         Of the layer.
     log_sha256 : str
         `log_digest` of the log.
+
+    Returns
+    -------
+    bool
+        False if its neighbours are others now, or a part of the log was lost when it was made.
 
     Raises
     ------

@@ -66,7 +66,18 @@ class UnfinishedLayer(NamedTuple):
     loss: str  # what could not be read of the log
 
     def with_start(self, open_at_start: Run | None) -> "UnfinishedLayer":
-        """Add the open segment with which the layer before ends, where it is lacking."""
+        """Add the open segment with which the layer before ends, where it is lacking.
+
+        Parameters
+        ----------
+        open_at_start : Run or None
+            The segment; None if none is open there.
+
+        Returns
+        -------
+        UnfinishedLayer
+            This one, if it does not lack its start; else a new one, which does not.
+        """
         if not self.lacks_start:
             return self
         segments, open_at_end = list(self.segments), self.open_at_end
@@ -87,13 +98,22 @@ def label_log(job: Job) -> UnfinishedLayer:
 
     The whole parts of a damaged log are labelled.
 
+    Parameters
+    ----------
+    job : Job
+
+    Returns
+    -------
+    UnfinishedLayer
+        The labels are in its file `part`, which belongs to the caller.
+
     Raises
     ------
     LogError
         If the log has no features, or those of another set than the model's; if nothing of it is
         whole; if the labels cannot be written.
     ModelError
-        If the file of the model holds another model.
+        If the file of the model is missing or damaged, or holds another model.
     """
     model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:
@@ -114,12 +134,14 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     ----------
     job : Job
     labelled : UnfinishedLayer
-        That does not lack its start any more.
+        That does not lack its start any more. Its file `part` is deleted.
 
     Raises
     ------
     LogError
         If the layer cannot be written, or there is another one that may not be replaced.
+    ModelError
+        If the file of the model is missing or damaged, or holds another model.
     """
     model, classifier = _loaded(job.model, job.model_sha256)
     metadata = LayerMetadata(

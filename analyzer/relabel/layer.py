@@ -45,7 +45,21 @@ class LayerMetadata(NamedTuple):
 
 
 def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
-    """Return the topics of the labels and of the segments."""
+    """Return the topics of a layer.
+
+    Parameters
+    ----------
+    microphone, model : str
+        Their names.
+    classes : sequence of str
+        In the order of the model's probabilities.
+
+    Returns
+    -------
+    labels, segments : Topic
+        `/<microphone>/relabel/<model>/label` and `…/segment`; what a topic cannot hold of the
+        model's name is `_` there.
+    """
     labelling = relabelling(model)
     label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
     return (
@@ -59,6 +73,20 @@ def log_digest(log: Path) -> str:
 
     The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
     recognised without reading all of it.
+
+    Parameters
+    ----------
+    log : Path
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or is no MCAP file.
     """
     with LogFile(log, indexed=False) as file:
         size = file.size
@@ -113,8 +141,14 @@ def layer_record(
     log : str
         Name of the log's file.
     node : str
+        Name of the recorder's node.
     more : mapping of str to str
         Further entries.
+
+    Returns
+    -------
+    dict of str to str
+        Key and text of each entry, with `made`: the time now, or that of SOURCE_DATE_EPOCH.
     """
     return provenance(
         node,

@@ -40,7 +40,7 @@ def recorder_info(path: Path) -> RecorderInfo | None:
     Raises
     ------
     UnreadableError
-        If it is damaged.
+        If it is damaged, of more than one microphone, or says what cannot be.
     """
     try:
         return read_recorder_info(path, "features")
@@ -56,12 +56,17 @@ def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
     info : RecorderInfo
         Of the log.
     start : int
-        In nanoseconds of UTC.
+        Log time, in nanoseconds of UTC.
+
+    Yields
+    ------
+    Features or Gap
+        In the order of the log.
 
     Raises
     ------
     UnreadableError
-        If it is damaged.
+        If it is damaged, or not of a recorder, or its feature set is not installed.
     """
     try:
         for batch in read_recorded(info, start, _NEVER, sound_only=True):
@@ -73,16 +78,22 @@ def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
 def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
     """Save the whole parts of a damaged log to a folder.
 
+    Parameters
+    ----------
+    log : Path
+    folder : Path
+        The copy has the name of the log there.
+
     Returns
     -------
     copy : Path
     loss : str
-        What could not be saved.
+        What could not be saved; empty if nothing is lost.
 
     Raises
     ------
     LogError
-        If nothing can be saved.
+        If nothing can be saved, or the copy cannot be written.
     """
     source, copy = log, folder / log.name
     if not is_local(log):
@@ -116,7 +127,8 @@ def warm_up(
     Returns
     -------
     StreamLabeller
-        Ready for the first frame of the log.
+        Ready for the first frame of the log; without a past where the earlier logs do not lead up
+        to it.
     """
     first, seconds_back = info.first_frame, _WARM_UP
     while first is not None and earlier:
@@ -175,6 +187,14 @@ def _label_readable(
 
 def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
     """Tell whether the sound of a log goes on in the next log.
+
+    Parameters
+    ----------
+    labeller : StreamLabeller
+        That has labelled the log to its end.
+    info : RecorderInfo
+        Of the log.
+    next_log : Path
 
     Returns
     -------

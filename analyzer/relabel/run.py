@@ -64,13 +64,18 @@ def relabel(
     model_path : Path
         Where workers find the model.
     workers : Workers
-    progress : callable
-        Told the share of the logs that is done.
+    progress : callable, optional
+        Told the share of the logs that is done, 0 to 1.
+
+    Returns
+    -------
+    Relabelled
+        What became of each log; a log that fails is noted there, and stops no other.
 
     Raises
     ------
     LogError
-        If there is no such log.
+        If there is no such log, or one is a layer.
     """
     chains = find_chains(paths)
     total = sum(len(chain.asked) for chain in chains)

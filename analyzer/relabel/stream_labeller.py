@@ -51,11 +51,31 @@ class StreamLabeller:
         self._labeller.segmenter.discard_open()
 
     def is_followed_by(self, frame: tuple[int, int]) -> bool:
-        """Tell whether the sound goes on with a frame of this number and time (ns of UTC)."""
+        """Tell whether the sound goes on with a frame: the next one, within 0.2 s of its time.
+
+        Parameters
+        ----------
+        frame : (int, int)
+            Number and start of the frame, in nanoseconds of UTC.
+        """
         return frame[0] == self._next and abs(frame[1] - self._end) <= _LARGEST_STEP
 
     def push(self, event: Features | Gap) -> FrameLabels | None:
-        """Add features or a gap and return the labels of the frames, if there are some."""
+        """Add features or a gap.
+
+        Segments that end are added to `segments`. The open segment ends at a gap, and where the
+        features do not follow the last ones.
+
+        Parameters
+        ----------
+        event : Features or Gap
+            Of at least one frame, in the order of time.
+
+        Returns
+        -------
+        FrameLabels or None
+            Of the frames at which a whole window is complete, perhaps none; None for a gap.
+        """
         if isinstance(event, Gap):
             self.close()
             return None

@@ -43,6 +43,11 @@ class ClipFramer:
         rate : int
             Samples per second.
         samples : np.ndarray [shape=(n,)], float32
+
+        Yields
+        ------
+        Frames or Gap
+            In the order of time: the last frames before a hole, the gap, the frames of this clip.
         """
         if rate != self._rate or abs(start - self._expected()) > _JOINED:
             yield from self.finish()
@@ -56,7 +61,7 @@ class ClipFramer:
         yield from self._events(self._cutter.push(samples))
 
     def finish(self) -> Iterator[Frames | Gap]:
-        """Yield the last frames of the clips that follow each other."""
+        """Yield the last frames of the clips that follow each other, and the gap before them, if any."""
         yield from self._events(self._cutter.push(np.empty(0, np.float32), last=True))
         self._cutter = FrameCutter()
 

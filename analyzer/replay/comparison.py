@@ -43,9 +43,16 @@ class ReplayComparison:
         Parameters
         ----------
         recorded : sequence of RawMessages
+            Labels as the log has them.
         replayed : sequence of EncodedMessage
+            Labels of the same span as they came out again.
         end : int
             Time from which on nothing was replayed, in nanoseconds of UTC.
+
+        Raises
+        ------
+        LogError
+            If a recorded message is not of the type that its channel says.
         """
         for absent, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, absent) if time < end}
@@ -65,10 +72,17 @@ class ReplayComparison:
         Parameters
         ----------
         recorded : sequence of RawMessages
+            Segments as the log has them.
         replayed : sequence of EncodedMessage
-            A segment that closes at a gap is recorded earlier than it is replayed.
+            Segments as they came out again. One that closes at a gap is recorded earlier than it is
+            replayed.
         end : int
             End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
+
+        Raises
+        ------
+        LogError
+            If a recorded message is not of the type that its channel says.
         """
         for absent, same in _by_version(recorded).items():
             self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))
@@ -83,7 +97,14 @@ class ReplayComparison:
         self._unmatched -= matched | missed
 
     def finish(self, *, cut: bool) -> None:
-        """Count the recorded segments that never came out, unless the replay was cut short."""
+        """Count the recorded segments that never came out.
+
+        Parameters
+        ----------
+        cut : bool
+            Whether the replay was cut short: then they are not counted, for they might have come
+            out.
+        """
         if not cut:
             self.segments += len(self._unmatched)
         self._unmatched.clear()

@@ -28,12 +28,13 @@ def describe(
     recorded : RecorderInfo
         Of the old log.
     features : FeatureSet
+        Of the features in the new log.
     model : Model or None
-        That labels the new log.
+        The model that labels the new log; None if there are no labels.
     output : Path
         Folder of the new log.
     replayed : mapping of str to str
-        Further entries of the `hearthlog` record.
+        Further entries of the `hearthlog` record; they replace those of the old log.
     """
     if model is not None and model.sha256 == recorded.model_sha256:
         model = replace(model, name=recorded.model)  # whatever its file is called here

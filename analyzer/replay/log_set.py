@@ -20,7 +20,7 @@ class LogSet:
     paths : sequence of Path
         Layers and empty logs among them are left out.
     kind : str
-        As in `ReplayOptions`.
+        `features` or `audio`, as in `ReplayOptions`.
 
     Attributes
     ----------
@@ -43,7 +43,18 @@ class LogSet:
         self._infos: dict[Path, RecorderInfo | None] = {}
 
     def span(self, options: ReplayOptions) -> tuple[int, int]:
-        """Return the log times at which the replay starts and before which it ends."""
+        """Return the log times at which the replay starts and before which it ends.
+
+        Parameters
+        ----------
+        options : ReplayOptions
+            Their offset and duration count.
+
+        Returns
+        -------
+        start, end : int
+            In nanoseconds of UTC; without a duration the end is the largest number of 64 bits.
+        """
         start = self.first + round(options.start_offset * NANOSECONDS)
         if options.duration is None:
             return start, _NEVER
@@ -51,6 +62,16 @@ class LogSet:
 
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
         """Return the logs to replay.
+
+        Parameters
+        ----------
+        options : ReplayOptions
+            Their offset and duration count.
+
+        Returns
+        -------
+        list of RecorderInfo
+            At least one, in the order of their first messages.
 
         Raises
         ------
@@ -70,6 +91,16 @@ class LogSet:
 
     def between(self, start: int, end: int) -> list[RecorderInfo]:
         """Return the logs that have messages with start <= log time < end.
+
+        Parameters
+        ----------
+        start, end : int
+            Log times, in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of RecorderInfo
+            In the order of their first messages, without logs that have nothing of this kind.
 
         Raises
         ------

@@ -36,8 +36,9 @@ class Player:
     start : int
         Log time before which messages are left out, in nanoseconds of UTC.
     result : Replay
-        Is added to.
+        Counts, and new logs, are added to it.
     stop : threading.Event
+        Once set, no more frames are replayed.
     progress : callable
         Told the time (nanoseconds of UTC) up to which frames were replayed.
 
@@ -73,7 +74,19 @@ class Player:
         self._uncompared: list[EncodedMessage] = []
 
     def open(self, info: RecorderInfo) -> None:
-        """Go on with another log; where it is of another run of a recorder, begin anew."""
+        """Go on with another log; where it is of another run of a recorder, begin anew.
+
+        Parameters
+        ----------
+        info : RecorderInfo
+            Of the log; the log that is open already is no change.
+
+        Raises
+        ------
+        LogError
+            If its feature set is not installed, or not that of the model, or if the new log cannot
+            be written.
+        """
         if info.path == self._opened:
             return
         self._opened = info.path
@@ -84,7 +97,23 @@ class Player:
             self._begin(info)
 
     def push(self, event: Features | Frames | Gap | SourceHealth) -> bool:
-        """Replay an event; return whether to go on."""
+        """Replay an event.
+
+        Parameters
+        ----------
+        event : Features, Frames, Gap or SourceHealth
+            In the order of the log that is open.
+
+        Returns
+        -------
+        bool
+            Whether to go on; False once `stop` is set.
+
+        Raises
+        ------
+        LogError
+            If the new log cannot be written.
+        """
         if isinstance(event, Features):
             self._join(event)
         if isinstance(event, Features | Frames):
@@ -95,7 +124,18 @@ class Player:
         return True
 
     def compare(self, batch: RecordedBatch) -> None:
-        """Compare what was replayed since the last call with what was recorded."""
+        """Compare what was replayed since the last call with what was recorded.
+
+        Parameters
+        ----------
+        batch : RecordedBatch
+            The recorded labels and segments of the same span of time.
+
+        Raises
+        ------
+        LogError
+            If a recorded message is not of the type that its channel says.
+        """
         if self._info is None:
             return
         replayed, self._uncompared = self._uncompared, []
@@ -113,6 +153,11 @@ class Player:
         ----------
         cut : bool
             Whether the recorded sound goes on: the last segment is then not as recorded.
+
+        Raises
+        ------
+        LogError
+            If the new log cannot be written.
         """
         self._close()
         if not cut and self._options.kind == "features":

@@ -69,9 +69,14 @@ def read_recorded(
     info : RecorderInfo
         Of the log.
     start, end : int
-        Log times, in nanoseconds: from `start` on, before `end`.
+        Log times, in nanoseconds of UTC: from `start` on, before `end`.
     sound_only : bool
         Read only features and gaps, and compare the checksums of what is read.
+
+    Yields
+    ------
+    RecordedBatch
+        In the order of time.
 
     Raises
     ------

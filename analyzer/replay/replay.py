@@ -27,7 +27,22 @@ _LONGEST_NAME = 200
 
 
 def find_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
-    """Look in some folders for the model that a log was recorded with."""
+    """Look in some folders for the model that a log was recorded with.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model, which is that of its file without the suffix.
+    sha256 : str
+        Of the model file, as hexadecimal digits.
+    folders : sequence of Path
+        The first that has the model counts.
+
+    Returns
+    -------
+    Model or None
+        None if no folder has it; files that cannot be read are passed over.
+    """
     for folder in folders:
         path = folder / (name + SUFFIX)
         if len(name) > _LONGEST_NAME or path.parent != folder or not path.is_file():
@@ -57,15 +72,20 @@ def replay(
     options : ReplayOptions
     stop : threading.Event
         Once set, the replay ends, and the new log is completed.
-    progress : callable
-        Told the share that was replayed.
+    progress : callable, optional
+        Told the share that was replayed, 0 to 1.
+
+    Returns
+    -------
+    Replay
+        What was replayed, which logs were written, and how they compare with the recording.
 
     Raises
     ------
     LogError
-        If a log is damaged, or the logs are of several microphones, or of another feature set,
-        or hold nothing to replay, or if the new log cannot be written. What was replayed up to
-        there is a complete log.
+        If a log is damaged, or the logs are of several microphones, or of another feature set, or
+        hold nothing to replay, or if the new log cannot be written. What was replayed up to there
+        is a complete log.
     """
     start, end = logs.span(options)
     chosen = logs.chosen(options)

@@ -25,6 +25,16 @@ T = TypeVar("T")
 def connected(scheduler: str) -> Iterator["Client"]:
     """Connect to a Dask cluster whose workers have this version of hearthlog.
 
+    Parameters
+    ----------
+    scheduler : str
+        Address of the scheduler, as `tcp://host:port`.
+
+    Yields
+    ------
+    distributed.Client
+        Open until the block ends.
+
     Raises
     ------
     WorkerError
@@ -64,7 +74,13 @@ def _silence() -> Iterator[None]:
 
 
 def gone(scheduler: str) -> WorkerError:
-    """Make the error that says that the scheduler was lost."""
+    """Make the error that says that the scheduler was lost.
+
+    Parameters
+    ----------
+    scheduler : str
+        Address of the scheduler, as `tcp://host:port`.
+    """
     return WorkerError(f"the Dask scheduler at {scheduler} is gone; start it, and run this again")
 
 
@@ -76,7 +92,7 @@ class Cluster:
     client : distributed.Client
         From `connected`.
     scheduler : str
-        Its address, for messages.
+        Address of the scheduler, for messages.
     """
 
     def __init__(self, client: "Client", scheduler: str) -> None:
@@ -92,7 +108,21 @@ class Cluster:
         return max(sum(self._client.nthreads().values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function of the top level of a module on any worker."""
+        """Run a function on any worker of the cluster.
+
+        Parameters
+        ----------
+        function : callable
+            At the top level of a module, which the worker imports.
+        *args
+            Arguments of the function, which can be pickled.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            It raises what the function raises, and WorkerError if the scheduler is gone, if the
+            task killed its workers, or if the worker has another version of hearthlog.
+        """
         future: Future[T] = Future()
         if self._client.status != "running":
             future.set_exception(gone(self._scheduler))
@@ -123,7 +153,18 @@ class Cluster:
 
 
 def raise_if_killed(error: Exception) -> None:
-    """Raise WorkerError if a task killed its workers."""
+    """Raise WorkerError if an error of Dask says that a task killed its workers.
+
+    Parameters
+    ----------
+    error : Exception
+        Any error of a task or a future; all but `distributed.KilledWorker` are left alone.
+
+    Raises
+    ------
+    WorkerError
+        If the task has lost its worker more often than Dask allows.
+    """
     from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
 
     if isinstance(error, KilledWorker):

@@ -19,7 +19,13 @@ def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
     Parameters
     ----------
     calls : iterable of joblib.delayed
-        They run in threads, since libsvm releases the lock, or where `joblib.parallel_config` says.
+        They run in up to four threads, since libsvm releases the lock, or where
+        `joblib.parallel_config` says.
+
+    Yields
+    ------
+    object
+        What each call returned; the first error of a call is raised.
     """
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
     return joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
@@ -28,6 +34,11 @@ def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
 @contextmanager
 def joblib_on(scheduler: str | None) -> Iterator[None]:
     """Let joblib run calls in this block on a Dask cluster, if one is named.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of the scheduler, as `tcp://host:port`; None changes nothing.
 
     Raises
     ------

@@ -10,12 +10,36 @@ from hearthlog.schemas.errors import HearthlogError
 
 
 def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
-    """Pickle a call; the function must be at the top level of a module."""
+    """Pickle a call.
+
+    Parameters
+    ----------
+    function : callable
+        At the top level of a module, since it is pickled by its name.
+    args : tuple
+        Its positional arguments, which can be pickled.
+
+    Returns
+    -------
+    bytes
+        For `attempt`.
+    """
     return pickle.dumps((function, args))
 
 
 def attempt(call: bytes) -> bytes:
-    """Do a call, and pickle its result or its exception."""
+    """Do a call, and pickle its result or its exception.
+
+    Parameters
+    ----------
+    call : bytes
+        From `pack_call`.
+
+    Returns
+    -------
+    bytes
+        For `read_reply`. An exception that cannot be pickled becomes a WorkerError.
+    """
     try:
         function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
         return pickle.dumps((function(*args), None))
@@ -24,7 +48,20 @@ def attempt(call: bytes) -> bytes:
 
 
 def read_reply(reply: bytes) -> Any:
-    """Return what the call returned, or raise what it raised."""
+    """Return what the call returned, or raise what it raised.
+
+    Parameters
+    ----------
+    reply : bytes
+        From `attempt`.
+
+    Raises
+    ------
+    Exception
+        What the call raised; with its traceback as a note, unless it is an error of hearthlog.
+    WorkerError
+        If the call raised something that cannot be pickled.
+    """
     value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
     if error is not None:
         raise error

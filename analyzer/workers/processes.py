@@ -37,7 +37,7 @@ class Processes:
     Parameters
     ----------
     count : int
-        Number of processes.
+        Number of processes, at least 1.
     """
 
     def __init__(self, count: int) -> None:
@@ -49,7 +49,21 @@ class Processes:
         self._closed = False
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function of the top level of a module, once a process is free."""
+        """Run a function once a process is free.
+
+        Parameters
+        ----------
+        function : callable
+            At the top level of a module, which the process imports.
+        *args
+            Arguments of the function, which can be pickled.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            It raises what the function raises, and WorkerError if the task lost its worker three
+            times, or if the processes were closed.
+        """
         return self._threads.submit(self._run, function, args)
 
     def close(self) -> None:

@@ -26,6 +26,13 @@ class Workers(Protocol):
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a task.
 
+        Parameters
+        ----------
+        function : callable
+            At the top level of a module.
+        *args
+            Arguments of the function, which are small and can be pickled.
+
         Returns
         -------
         concurrent.futures.Future
@@ -41,14 +48,20 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
     Parameters
     ----------
     count : int
-        Number of processes; 1 runs each task in this process, when it is submitted.
+        Number of processes, at least 1; with 1 each task runs in this process, when it is
+        submitted.
     scheduler : str, optional
-        Address of a running Dask cluster, as `tcp://host:port`, instead.
+        Address of a running Dask cluster, as `tcp://host:port`; its workers are used instead.
+
+    Yields
+    ------
+    Workers
 
     Raises
     ------
     WorkerError
-        If there is no such scheduler, it has no workers, or one of another version.
+        If Dask is not installed, there is no such scheduler, it has no workers, or one of another
+        version.
     """
     if scheduler is not None:
         with connected(scheduler) as client:
@@ -66,7 +79,19 @@ class InlineWorkers:
     parallel = 1
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a function at once."""
+        """Run a function at once.
+
+        Parameters
+        ----------
+        function : callable
+        *args, **kwargs
+            Arguments of the function.
+
+        Returns
+        -------
+        concurrent.futures.Future
+            Done; it raises what the function raised.
+        """
         future: Future[T] = Future()
         try:
             future.set_result(function(*args, **kwargs))
