@@ -61,7 +61,7 @@ class ClipFramer:
         yield from self._events(self._cutter.push(samples))
 
     def finish(self) -> Iterator[Frames | Gap]:
-        """Yield the last frames of the clips that follow each other, and the gap before them, if any."""
+        """Yield the last frames of the clips that follow each other, and a gap before them."""
         yield from self._events(self._cutter.push(np.empty(0, np.float32), last=True))
         self._cutter = FrameCutter()
 
