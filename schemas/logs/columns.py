@@ -62,14 +62,26 @@ class Columns:
             raise LogError(f"{self.topic}: {self.type} has no field {path!r}") from None
 
     def between(self, start: int | None, end: int | None) -> "Columns":
-        """Return the messages with start <= log time < end."""
+        """Return the messages with start <= log time < end.
+
+        Parameters
+        ----------
+        start, end : int or None
+            Log times, in nanoseconds of UTC; None for no limit on that side.
+        """
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
         return self.take(rows)
 
     def take(self, rows: slice | NDArray[np.intp]) -> "Columns":
-        """Return some of the messages."""
+        """Return some of the messages.
+
+        Parameters
+        ----------
+        rows : slice or np.ndarray [shape=(m,)], intp
+            Their indices; log times must still ascend.
+        """
         return replace(
             self,
             log_times=self.log_times[rows],
@@ -92,9 +104,9 @@ def read_columns(
     ----------
     logs : iterable of Path
     topics : collection of str, optional
-        All by default.
+        Names of the topics; all by default.
     start, end : int, optional
-        Log times, in nanoseconds: from `start` on, before `end`.
+        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
 
@@ -107,8 +119,8 @@ def read_columns(
     Raises
     ------
     LogError
-        If a log is damaged, if its messages are not of the type that it says, or if two logs
-        have different types on one topic.
+        If a log cannot be read or is damaged, if its messages are not of the type that it says, or
+        if two logs have different types on one topic.
     """
     logs = list(logs)
     whole = start is None and end is None
@@ -128,25 +140,52 @@ def iterate_columns(
     end: int | None = None,
     fields: Collection[str] | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read topics of some logs piece by piece; parameters and errors as of `read_columns`.
+    """Read topics of some logs piece by piece.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+    topics : collection of str, optional
+        Names of the topics; all by default.
+    start, end : int, optional
+        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
+    fields : collection of str, optional
+        Paths of the fields to read; all by default.
 
     Yields
     ------
     list of Columns
         The next span of time: one for each topic that speaks in it, or more where its channels
         differ in type, fields or metadata. Nothing is older than what was yielded before.
+
+    Raises
+    ------
+    LogError
+        If a log cannot be read or is damaged, or if its messages are not of the type that it says.
     """
     pieces = iterate_pieces(logs, topics, start, end, partial(decode, fields=fields))
     return map(_joined, pieces)
 
 
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
-    """Decode messages, those of one topic, type, fields and metadata together.
+    """Decode messages into one `Columns` for each topic, type, set of fields and metadata.
+
+    Parameters
+    ----------
+    messages : iterable of RawMessages
+    fields : collection of str, optional
+        Paths of the fields to read; all by default.
+
+    Returns
+    -------
+    list of Columns
+        In the order of their first messages in `messages`.
 
     Raises
     ------
     LogError
-        If they are not of the type that their channel says, or not encoded as CDR.
+        If they are not of the type that their channel says, or not encoded as CDR, or if the
+        definition of that type cannot be understood.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -182,7 +221,12 @@ def _decode(raw: RawMessages, fields: Collection[str] | None) -> Columns:
 
 
 def join(parts: Sequence[Columns]) -> Columns:
-    """Put pieces of one topic one after the other; fields that not all of them have are left out.
+    """Put pieces of one topic one after the other, with the fields that all of them have.
+
+    Parameters
+    ----------
+    parts : sequence of Columns
+        At least one, in the order of time.
 
     Raises
     ------

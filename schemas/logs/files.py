@@ -25,7 +25,18 @@ ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a hom
 
 
 def check_node_name(name: str) -> str:
-    """Return the name if it can begin a file name everywhere."""
+    """Return the name of a node if a file name can begin with it everywhere.
+
+    Parameters
+    ----------
+    name : str
+        At most 64 letters, digits, '-' and '_'; the first is a letter or a digit.
+
+    Raises
+    ------
+    LogError
+        If the name has another form.
+    """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
         raise LogError(
             f"node name {name!r} cannot be part of a file name: use at most 64 letters, digits, "
@@ -35,13 +46,34 @@ def check_node_name(name: str) -> str:
 
 
 def log_path(root: Path, node: str, start: int) -> Path:
-    """Name the log that starts at `start` (nanoseconds, UTC)."""
+    """Name the log of a node that begins at a time.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the logs.
+    node : str
+        Name of the node.
+    start : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    Path
+        `<root>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`.
+    """
     moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
     return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
 
 
 def active_path(path: Path) -> Path:
-    """Name a log while it is being written."""
+    """Name a log while it is being written.
+
+    Parameters
+    ----------
+    path : Path
+        Name of the finished log.
+    """
     return path.with_name(path.name.removesuffix(SUFFIX) + ACTIVE_SUFFIX)
 
 
@@ -65,7 +97,13 @@ class LogName(NamedTuple):
 
 
 def log_name(path: Path) -> LogName:
-    """Take the name of a log or a layer apart."""
+    """Split the name of a log or a layer into its parts.
+
+    Parameters
+    ----------
+    path : Path
+        Of a log or a layer, finished or not.
+    """
     parts = _NAME.fullmatch(stem(path))
     if parts is None:  # nothing but a suffix
         return LogName("", "", "", "")
@@ -75,27 +113,59 @@ def log_name(path: Path) -> LogName:
 
 
 def audio_path(log: Path) -> Path:
-    """Name the layer of a log that has its clips of sound."""
+    """Name the layer of a log that has its clips of sound.
+
+    Parameters
+    ----------
+    log : Path
+        Finished or not.
+    """
     return log.with_name(stem(log) + AUDIO_SUFFIX)
 
 
 def review_path(log: Path) -> Path:
-    """Name the review layer of a log, finished or not."""
+    """Name the review layer of a log.
+
+    Parameters
+    ----------
+    log : Path
+        Finished or not.
+    """
     return log.with_name(f"{stem(log)}.{REVIEW_LAYER}{SUFFIX}")
 
 
 def relabel_path(log: Path, model: str) -> Path:
-    """Name the layer of a log that has the labels of a model."""
+    """Name the layer of a log that has the labels of a model.
+
+    Parameters
+    ----------
+    log : Path
+        Finished or not.
+    model : str
+        Name of the model.
+    """
     return log.with_name(f"{stem(log)}.{RELABEL_LAYER}{model}{SUFFIX}")
 
 
 def log_of_layer(layer: Path) -> Path:
-    """Name the finished log that a layer speaks of."""
+    """Name the finished log to which a layer belongs.
+
+    Parameters
+    ----------
+    layer : Path
+        Finished or not.
+    """
     return layer.with_name(log_name(layer).log + SUFFIX)
 
 
 def stem(log: Path) -> str:
-    """Name a log without its suffix, finished or not."""
+    """Return the file name of a log without its suffix.
+
+    Parameters
+    ----------
+    log : Path
+        Finished or not.
+    """
     return log.name.removesuffix(ACTIVE_SUFFIX).removesuffix(SUFFIX)
 
 
@@ -105,29 +175,39 @@ def is_active(path: Path) -> bool:
 
 
 def is_layer(path: Path) -> bool:
-    """Tell by its name whether a log is a layer, which speaks of another log."""
+    """Tell by its name whether a log is a layer, which belongs to another log."""
     return bool(log_name(path).layer)
 
 
 def is_log(path: Path) -> bool:
-    """Tell whether this is a log by its name, and a file; in a store there is nothing else."""
+    """Tell whether a path is a regular file with the name of a log or a layer.
+
+    In a store only the name is looked at.
+    """
     named = path.name.endswith((SUFFIX, ACTIVE_SUFFIX))
     return named and (not is_local(path) or may_be_regular(path))
 
 
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
-    """List the logs in a folder, or the log itself; those still being written come too.
+    """List the logs in a folder, or the log itself, with those still being written.
 
     Parameters
     ----------
     path : Path
+        A folder, in which logs may lie at any depth, or one log.
     enrolled : bool
-        Whether the sounds in folders `enrolled` of it come too, which are no time of the home.
+        Whether to list the sounds in folders `enrolled` too, which are no time of the home.
+
+    Returns
+    -------
+    list of Path
+        Logs and layers, by name.
 
     Raises
     ------
     LogError
-        If there is none, or the path is that of a pipe, a socket or a device.
+        If there is no log, if the path is that of a pipe, a socket or a device, or if the store of
+        the path cannot be used.
     """
     every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)

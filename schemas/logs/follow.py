@@ -36,14 +36,14 @@ def follow(
         Logs may lie at any depth. Files that are there but not being written are read first, if
         `start` asks for them.
     topics : collection of str, optional
-        All by default.
+        Names of the topics; all by default.
     start : int, optional
-        Log time, in nanoseconds, from which on messages are read; by default those that are
+        Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
         written from now on.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
     stop : threading.Event, optional
-        Ends it.
+        Ends the reading when it is set; by default it never ends.
 
     Yields
     ------
@@ -53,7 +53,8 @@ def follow(
     Raises
     ------
     LogError
-        If there is no such folder, or a log is damaged.
+        If there is no such folder, if a log is damaged, or if its messages are not of the type that
+        it says.
     """
     for _, messages in follow_messages(folder, topics, start, stop):
         yield decode(messages, fields)
@@ -77,14 +78,30 @@ def follow_messages(
 
     Parameters
     ----------
+    folder : Path
+        Logs may lie at any depth.
+    topics : collection of str, optional
+        Names of the topics; all by default.
+    start : int, optional
+        Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
+        written from now on.
+    stop : threading.Event, optional
+        Ends the reading when it is set; by default it never ends.
     damaged : callable
-        Takes the error of a log that is damaged, of which no more is read then; by default it is
+        Told the error of a log that is damaged, of which no more is read then; by default it is
         raised.
 
     Yields
     ------
-    Path, list of RawMessages
-        A log, and what was written to it since the last time.
+    path : Path
+        A log.
+    messages : list of RawMessages
+        What was written to it since the last time.
+
+    Raises
+    ------
+    LogError
+        If there is no such folder, or what `damaged` raises.
     """
     stop = stop or Event()
     if not folder.is_dir():

@@ -47,9 +47,9 @@ class TopicBatch(NamedTuple):
 
 
 class LogStreamWriter:
-    """A log on a stream.
+    """Writes a log to a stream.
 
-    What is pickled goes on elsewhere: `continue_on` a stream that has what was flushed.
+    A pickled writer can go on elsewhere: `continue_on` a stream that has what was flushed.
 
     Parameters
     ----------
@@ -79,28 +79,67 @@ class LogStreamWriter:
             )
 
     def continue_on(self, stream: BinaryIO) -> None:
-        """Go on with a stream that has, and is behind, all that was flushed."""
+        """Continue on another stream.
+
+        Parameters
+        ----------
+        stream : BinaryIO
+            At its end, and it contains all that was flushed; stays open.
+        """
         self._writer.continue_on(stream)
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        """Append a metadata record."""
+        """Append a metadata record.
+
+        Parameters
+        ----------
+        name : str
+            Of the record, such as "hearthlog".
+        metadata : mapping of str to str
+        """
         self._writer.add_metadata(name, dict(metadata))
 
     def add_attachment(self, attachment: Attachment, created: int) -> None:
-        """Append a file; `created` is its time, in nanoseconds of UTC."""
+        """Append a file.
+
+        Parameters
+        ----------
+        attachment : Attachment
+        created : int
+            Time of the file, in nanoseconds of UTC.
+        """
         item = attachment
         self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
-        """Append one encoded message; its publish time is its log time."""
+        """Append one encoded message.
+
+        Parameters
+        ----------
+        topic : str
+            Name of one of the writer's topics.
+        log_time : int
+            In nanoseconds of UTC; it is also the publish time.
+        data : bytes
+            CDR.
+        """
         self._writer.add_message(self._channels[topic], log_time, data, log_time)
         self._count(topic, 1, log_time, log_time)
 
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, in the order of their log times.
 
-        Messages of one time are written in the order of the batch. The file is the same as if
-        they had been encoded and written one by one.
+        The file is the same as if they had been encoded and written one by one.
+
+        Parameters
+        ----------
+        batch : sequence of TopicBatch
+            Messages of one time are written in the order of the batch.
+
+        Raises
+        ------
+        LogError
+            If a message cannot be encoded; see `encode_groups`.
         """
         blocks = []
         first = 0
@@ -122,7 +161,13 @@ class LogStreamWriter:
         self._writer.flush()
 
     def finish(self, name: str) -> None:
-        """Complete the log, whose file will have this name."""
+        """Complete the log.
+
+        Parameters
+        ----------
+        name : str
+            Name that its file will have.
+        """
         metadata = rosbag2.file_metadata(name, self._counts, self._span or (0, 0))
         self._writer.add_metadata(rosbag2.METADATA, metadata)
         self._writer.finish()

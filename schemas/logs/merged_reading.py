@@ -28,7 +28,13 @@ class Messages(Protocol):
     def __len__(self) -> int: ...
 
     def between(self, start: int | None, end: int | None) -> Self:
-        """Return those with start <= log time < end."""
+        """Return the messages with start <= log time < end.
+
+        Parameters
+        ----------
+        start, end : int or None
+            Log times, in nanoseconds of UTC; None for no limit on that side.
+        """
 
 
 Piece = TypeVar("Piece", bound=Messages)
@@ -37,14 +43,24 @@ Piece = TypeVar("Piece", bound=Messages)
 def time_spans(
     logs: Iterable[Path], span_of: Callable[[Path], tuple[int, int] | None] = time_span
 ) -> list[tuple[int, int, Path]]:
-    """Return first and last log time of each log that has messages, in the order of time.
+    """Return the first and the last log time of each log that has messages.
 
-    `span_of` finds out those of one log, or None.
+    Parameters
+    ----------
+    logs : iterable of Path
+    span_of : callable
+        Told a log; returns its first and last log time in nanoseconds of UTC, or None if it has no
+        messages.
+
+    Returns
+    -------
+    list of (int, int, Path)
+        First and last log time, and the log, in the order of time.
 
     Raises
     ------
     LogError
-        If a log is damaged.
+        If a log cannot be read, is no MCAP file, or is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
@@ -132,9 +148,9 @@ def iterate_messages(
     ----------
     logs : iterable of Path
     topics : collection of str, optional
-        All by default.
+        Names of the topics; all by default.
     start, end : int, optional
-        Log times, in nanoseconds: from `start` on, before `end`.
+        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     check : bool
         Whether to compare chunks with their checksums.
 
@@ -147,7 +163,7 @@ def iterate_messages(
     Raises
     ------
     LogError
-        If a log is damaged.
+        If a log cannot be read, is no MCAP file, or is damaged.
     """
     return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
 
@@ -163,8 +179,27 @@ def iterate_pieces(  # noqa: PLR0913
 ) -> Iterator[list[Piece]]:
     """Apply a function to the messages of each span of time, in the threads that read them.
 
-    Parameters and errors are those of `iterate_messages`; of `every` so many chunks of a log one
-    is read, for a sample.
+    Parameters
+    ----------
+    logs : iterable of Path
+    topics : collection of str or None
+        Names of the topics; None for all.
+    start, end : int or None
+        Log times, in nanoseconds of UTC: from `start` on, before `end`. None for no limit.
+    function : callable
+        Told the messages of one span of time; returns pieces that can be cut by log time.
+    every : int
+        Of so many chunks of a log one is read, for a sample; 1 for all.
+
+    Yields
+    ------
+    list of Piece
+        Those of the next span of time; none is older than any that was yielded before.
+
+    Raises
+    ------
+    LogError
+        If a log cannot be read, is no MCAP file, or is damaged; also what `function` raises.
     """
     return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
 

@@ -20,19 +20,28 @@ _LARGEST, _MOST = 1 << 20, 64 << 20  # bytes of one record, and of all; ours hav
 
 
 def provenance(node: str, **more: str) -> dict[str, str]:
-    """Make the record of a file that this version writes; `more` is what its kind says besides."""
+    """Make the record of a file that this version writes.
+
+    Parameters
+    ----------
+    node : str
+        Name of the node that the file is of.
+    **more : str
+        What this kind of file says besides.
+    """
     return {"version": __version__, _KEY: str(SCHEMA_VERSION), "node": node, **more}
 
 
 def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the records of a file, equal ones once: one, or those of all logs that were merged.
+    """Read the records of a file, each different one once.
 
-    A record of a newer version gives a `HearthlogWarning`.
+    There is one, or those of all logs that were merged. A record of a newer version gives a
+    `HearthlogWarning`.
 
     Raises
     ------
     LogError
-        If one is damaged.
+        If a record is damaged.
     """
     records = provenance_records(file)
     for record in records:
@@ -41,7 +50,13 @@ def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the records of a file as `read_provenance` does, whatever their version."""
+    """Read the records of a file as `read_provenance` does, whatever their version.
+
+    Raises
+    ------
+    LogError
+        If a record is damaged.
+    """
     different: dict[frozenset[tuple[str, str]], Mapping[str, str]] = {}
     size = 0
     for place in file.record_locations:
@@ -54,17 +69,40 @@ def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def version_text(record: Mapping[str, str]) -> str:
-    """Return the schema version that a record says, which need not be a number."""
+    """Return the schema version that a record names, which need not be a number.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        As `read_provenance` gives it.
+    """
     return record.get(_KEY, _FIRST)
 
 
 def schema_version(record: Mapping[str, str]) -> int | None:
-    """Return the schema version of a record; None if this version of hearthlog does not know it."""
+    """Return the schema version of a record; None if this version of hearthlog does not know it.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        As `read_provenance` gives it.
+    """
     return _KNOWN.get(version_text(record))
 
 
 def unknown_version(record: Mapping[str, str]) -> str:
-    """Say that a record is of a version that this one does not know; empty if it knows it."""
+    """Say that a record has a schema version that this version does not know.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        As `read_provenance` gives it.
+
+    Returns
+    -------
+    str
+        The rest of a sentence that begins with the file; empty if the version is known.
+    """
     if schema_version(record) is not None:
         return ""
     return (
@@ -74,7 +112,15 @@ def unknown_version(record: Mapping[str, str]) -> str:
 
 
 def check_version(record: Mapping[str, str], path: Path) -> None:
-    """Give a `HearthlogWarning` if a file is of a version that this one does not know."""
+    """Give a `HearthlogWarning` if a file has a schema version that this version does not know.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        As `read_provenance` gives it.
+    path : Path
+        Name of the file, for the warning.
+    """
     text = unknown_version(record)
     if text:
         warnings.warn(HearthlogWarning(text, path), stacklevel=2)

@@ -12,7 +12,7 @@ _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 @dataclass
 class TopicCount:
-    """One topic of a file and how often it spoke."""
+    """One topic of a file and the number of its messages."""
 
     type: str
     channel_metadata: Mapping[str, str]
@@ -20,7 +20,16 @@ class TopicCount:
 
 
 def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
-    """Return the metadata that a ROS 2 channel must have; JSON is a part of YAML."""
+    """Return the metadata that a ROS 2 channel must have.
+
+    Its quality of service is JSON, which is a part of YAML.
+
+    Parameters
+    ----------
+    type_hash : str
+        RIHS01 hash of the topic's type.
+    quality : Quality
+    """
     seconds = quality.lifespan_seconds
     profile = {
         "history": "keep_last",
@@ -39,7 +48,17 @@ def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
 def file_metadata(
     name: str, topics: Mapping[str, TopicCount], span: tuple[int, int]
 ) -> dict[str, str]:
-    """Return the `rosbag2` metadata record of a file (version 9 of its `metadata.yaml`)."""
+    """Return the `rosbag2` metadata record of a file (version 9 of its `metadata.yaml`).
+
+    Parameters
+    ----------
+    name : str
+        Name of the file, without its folder.
+    topics : mapping of str to TopicCount
+        By name of the topic.
+    span : (int, int)
+        First and last log time, in nanoseconds of UTC.
+    """
     start, end = span
     times = {
         "starting_time": {"nanoseconds_since_epoch": start},

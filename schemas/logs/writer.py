@@ -32,10 +32,15 @@ class LogWriter:
     created : int
         Time of the attachments, in nanoseconds of UTC.
 
+    Attributes
+    ----------
+    active_path : Path
+        Name of the log while it is being written.
+
     Raises
     ------
     LogError
-        If there is such a log already.
+        If the log exists already, or is being written.
     OSError
         If the folder or the file cannot be written.
     """
@@ -57,24 +62,70 @@ class LogWriter:
             self._content.add_attachment(attachment, created)
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
-        """Append one encoded message; its publish time is its log time."""
+        """Append one encoded message.
+
+        Parameters
+        ----------
+        topic : str
+            Name of one of the log's topics.
+        log_time : int
+            In nanoseconds of UTC; it is also the publish time.
+        data : bytes
+            CDR.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
         self._content.write(topic, log_time, data)
 
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
-        """Append messages of several topics, as `LogStreamWriter.write_columns` does."""
+        """Append messages of several topics, as `LogStreamWriter.write_columns` does.
+
+        Parameters
+        ----------
+        batch : sequence of TopicBatch
+            Messages of one time are written in the order of the batch.
+
+        Raises
+        ------
+        LogError
+            If a message cannot be encoded; see `encode_groups`.
+        OSError
+            If the file cannot be written.
+        """
         self._content.write_columns(batch)
 
     def flush(self) -> None:
-        """End the chunk and hand it to the operating system."""
+        """End the chunk and hand it to the operating system.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
         self._content.flush()
         self._stream.flush()
 
     def sync(self) -> None:
-        """Wait until what was flushed is on the disk."""
+        """Wait until what was flushed is on the disk.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
         os.fsync(self._stream.fileno())
 
     def finish(self) -> Path:
-        """Complete the log, give it its name and return it."""
+        """Complete the log, give it its name, and return that.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written or renamed.
+        """
         self._content.finish(self.path.name)
         self._stream.flush()
         self.sync()

@@ -28,21 +28,32 @@ _TRIED = 64  # layouts, before rows are looked at one by one
 def encode_groups(
     typename: str, columns: Mapping[str, Column], count: int
 ) -> Iterator[tuple[Indices, NDArray[np.void]]]:
-    """Encode `count` messages, each field given as one column.
+    """Encode `count` messages, given as one column for each field.
 
     Parameters
     ----------
+    typename : str
+        ROS 2 name of the type, such as "hearthlog_msgs/msg/AudioLabel".
     columns : mapping from field path, such as "header.frame_id", to its values
         An array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k)
-        for an array of numbers; for a string, one for all messages or a sequence of `count`.
-        Fields that were appended to the type may be left out.
+        for an array of numbers, and (count, 0) for an array of messages, which must be empty; for
+        a string, one for all messages or a sequence of `count`. Fields that were appended to the
+        type may be left out.
+    count : int
+        Number of messages.
 
     Yields
     ------
-    rows : np.ndarray [shape=(m,)]
-        Which messages have strings of the same lengths.
+    rows : np.ndarray [shape=(m,)], intp
+        Indices of messages whose strings have the same lengths.
     payloads : np.ndarray [shape=(m,)], of a structured dtype
-        Equal to what the typestore gives for each message.
+        Equal to what the typestore gives for each of these messages.
+
+    Raises
+    ------
+    LogError
+        If the type is unknown, if an array of messages in it is not empty, or if a message would be
+        larger than 100 MiB.
     """
     kind = message_type(typename)
     arrays: dict[str, NDArray[Any]] = {}
@@ -65,7 +76,27 @@ def encode_groups(
 
 
 def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
-    """Encode messages as `encode_groups` does, one `bytes` each."""
+    """Encode `count` messages, given as one column for each field, into one `bytes` each.
+
+    Parameters
+    ----------
+    typename : str
+        ROS 2 name of the type, such as "hearthlog_msgs/msg/AudioLabel".
+    columns : mapping of str to column
+        As `encode_groups` takes them.
+    count : int
+        Number of messages.
+
+    Returns
+    -------
+    list of bytes
+        One payload for each message, in the order of the rows.
+
+    Raises
+    ------
+    LogError
+        As `encode_groups`.
+    """
     payloads: list[bytes] = [b""] * count
     for rows, block in encode_groups(typename, columns, count):
         raw, size = block.tobytes(), block.dtype.itemsize
@@ -158,13 +189,15 @@ def decode_rows(
     sizes: Int64,
     fields: Collection[str] | None = None,
 ) -> Fields:
-    """Decode messages of one type.
+    """Decode messages of one type into one column for each field.
 
     Parameters
     ----------
+    kind : MessageType
     buffer : np.ndarray [shape=(b,)], uint8
+        Bytes that contain the payloads.
     offsets, sizes : np.ndarray [shape=(n,)], int64
-        Where in the buffer the payloads are.
+        First byte of each payload in the buffer, and its number of bytes.
     fields : collection of str, optional
         Paths of the fields to read; all by default.
 
@@ -176,7 +209,7 @@ def decode_rows(
     Raises
     ------
     LogError
-        If a payload is not of this type.
+        If a payload is not of this type, or a string in it is not UTF-8.
     """
     parts: list[tuple[Indices, Fields]] = []
     for size, rows in _by_size(sizes):
@@ -294,5 +327,14 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
 
 
 def ragged(column: NDArray[Any]) -> NDArray[np.object_]:
-    """Make each row of an array an object of its own."""
+    """Turn each row of an array into an object of its own.
+
+    Parameters
+    ----------
+    column : np.ndarray [shape=(n, ...)]
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], object
+    """
     return np.fromiter(column, object, len(column))

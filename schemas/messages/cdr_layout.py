@@ -62,8 +62,10 @@ class Layout(NamedTuple):
     Attributes
     ----------
     dtype : np.dtype
-        Of the whole payload. A field bears its path as name, and the word before a string or a
-        sequence, which says how long it is, that name and " length".
+        Of the whole payload. A field has its path as its name. The word before a string or a
+        sequence, which holds its length, has that name and " length".
+    leaves : tuple of Leaf, MessageArray or Default
+        What is read of each message, in the order of the fields.
     fixed : dict of str to int or np.void
         What every payload of this layout has in common: byte order, lengths, ends of strings.
     """
@@ -73,7 +75,16 @@ class Layout(NamedTuple):
     fixed: dict[str, Any]
 
     def fits(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Tell which payloads, given as rows of the dtype, have this layout."""
+        """Tell which payloads have this layout.
+
+        Parameters
+        ----------
+        rows : np.ndarray [shape=(n,)], of the dtype of the layout
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], bool
+        """
         fitting = np.ones(len(rows), bool)
         for name, value in self.fixed.items():
             fitting &= rows[name] == value
@@ -91,7 +102,22 @@ _SAME = Growth(frozenset(), ())
 
 
 def default_rows(name: str, fields: Sequence[tuple[str, Any]], prefix: str = "") -> list[Default]:
-    """Make what stands, in columns, for fields that were appended to a type."""
+    """Make the default values of fields, for messages that do not have these fields.
+
+    Parameters
+    ----------
+    name : str
+        ROS 2 name of the type that has the fields.
+    fields : sequence of (str, Any)
+        Name and description of each field, as rosbags has them.
+    prefix : str
+        Put before the path of each field, such as "header.".
+
+    Returns
+    -------
+    list of Default
+        One for each field, or one for each field of a message that a field holds.
+    """
     appended = APPENDED.get(name, {})
     return [
         leaf
@@ -137,8 +163,21 @@ class TypeDefinition(NamedTuple):
 class LayoutWalk:
     """One way through the fields of a message, on which the layout is noted.
 
-    `order` is the byte order as numpy has it, `length_at` returns the length of the string or
-    sequence of a path by the offset of its length word, `size` are the bytes at most.
+    Parameters
+    ----------
+    definition : TypeDefinition
+    order : str
+        Byte order, as numpy has it: "<" or ">".
+    length_at : callable
+        Told the path of a string or sequence and the offset of its length word in bytes; returns
+        its length. That of a string is in bytes, with its end.
+    size : int
+        Bytes of the message, at most.
+
+    Attributes
+    ----------
+    end : int
+        Bytes so far.
     """
 
     def __init__(
@@ -159,7 +198,15 @@ class LayoutWalk:
         self._fixed: dict[str, Any] = {"encapsulation": np.void(_ENCAPSULATION[order])}
 
     def layout(self, leaves: tuple[AnyLeaf, ...], size: int) -> Layout:
-        """Return what was noted, for payloads of this size."""
+        """Return the layout that was noted.
+
+        Parameters
+        ----------
+        leaves : tuple of Leaf, MessageArray or Default
+            What `message` returned.
+        size : int
+            Bytes of a payload.
+        """
         fields = {
             "names": list(self._fields),
             "formats": [form for form, _ in self._fields.values()],
@@ -169,7 +216,26 @@ class LayoutWalk:
         return Layout(np.dtype(fields), leaves, self._fixed)  # type: ignore[call-overload]
 
     def message(self, name: str, prefix: str = "") -> tuple[AnyLeaf, ...]:
-        """Walk through the fields of a message."""
+        """Walk through the fields of a message and return their leaves.
+
+        Parameters
+        ----------
+        name : str
+            ROS 2 name of the type.
+        prefix : str
+            Put before the path of each field, such as "header.".
+
+        Returns
+        -------
+        tuple of Leaf, MessageArray or Default
+            In the order of the fields; those with defaults come last.
+
+        Raises
+        ------
+        LogError
+            If the type is not defined, contains itself, or has a field of an unsupported type; if the
+            message ends before one of its fields, or has too many of them.
+        """
         if name not in self._types:
             raise LogError(f"{self._name}: builds on {name}, which is not defined")
         self._step()

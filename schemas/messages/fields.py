@@ -39,12 +39,12 @@ class Field(NamedTuple):
 
 @lru_cache(64)
 def fields_of(kind: MessageType) -> dict[str, Field]:
-    """List the fields of a message type by path, those of messages in it among them.
+    """List all fields of a message type by path, with the fields of the messages inside it.
 
     Raises
     ------
     LogError
-        If it contains itself, or is too large.
+        If the type contains itself, builds on one that is not defined, or has too many fields.
     """
     return dict(_fields(kind, kind.name, "", 0, iter(range(_FIELDS_LIMIT))))
 
@@ -74,14 +74,27 @@ def _fields(
 
 
 def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
-    """List the paths at which a file's definition has no field, or not one as ours of that name.
+    """List the paths at which a file's definition lacks a field, or has another one than ours.
 
-    What was appended to one of our types since is not lacking: there is a default for it.
+    A field that was appended to one of our types is not lacking: it has a default.
+
+    Parameters
+    ----------
+    kind : MessageType
+        As the file defines it.
+    paths : collection of str
+        Paths of fields, such as "header.stamp".
+
+    Returns
+    -------
+    list of str
+        Sorted.
 
     Raises
     ------
     LogError
-        If the definition cannot be understood.
+        If the definition contains itself, builds on a type that is not defined, or is too large, or
+        if there is no type of its name in ROS 2 or hearthlog.
     """
     theirs, ours = fields_of(kind), fields_of(message_type(kind.name))
     return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))
@@ -105,13 +118,20 @@ def _plain(name: str) -> str:
 
 
 def difference(kind: MessageType, version: int) -> str:
-    """Say how a file's definition of a type is none that was ever released; empty if it is one.
+    """Say how a file's definition of a type differs from every definition that was released.
 
     Parameters
     ----------
+    kind : MessageType
+        As the file defines it; there must be a type of its name in ROS 2 or hearthlog.
     version : int
-        Of the file's messages: what was appended up to it must be there. More may be, as a later
-        version would have appended it.
+        Schema version of the file's messages. Fields that were appended up to it must be there;
+        more may follow, as a later version would append them.
+
+    Returns
+    -------
+    str
+        Words for an error message; empty if there is no difference.
     """
     ours = message_type(kind.name).types
     for name in _built_on(ours, kind.name):
@@ -162,7 +182,7 @@ def type_hash_of(kind: MessageType) -> str:
     Raises
     ------
     LogError
-        If it cannot be understood.
+        If the type contains itself, or builds on one that is not defined.
     """
     store = get_typestore(Stores.EMPTY)
     store.fielddefs.update({name: ([], list(fields)) for name, fields in kind.types.items()})

@@ -39,7 +39,21 @@ def typestore() -> Typestore:
 
 
 def message(typename: str, **fields: Any) -> Any:
-    """Make a message of the given type; fields that were appended to it may be left out."""
+    """Make a message of a type.
+
+    Parameters
+    ----------
+    typename : str
+        ROS 2 name of the type, such as "std_msgs/msg/Header".
+    **fields : Any
+        Values by name of the field, as rosbags has them. Fields that were appended to the type may
+        be left out, and have their defaults then.
+
+    Returns
+    -------
+    message
+        Of the typestore's class for this type.
+    """
     absent = APPENDED.get(typename, {}).keys() - fields.keys()
     if absent:
         descriptions = dict(typestore().fielddefs[typename][1])
@@ -64,49 +78,111 @@ def _default(description: tuple[Nodetype, Any], value: float | str | None = None
 
 
 def number_type(name: str) -> np.dtype[Any]:
-    """Return the dtype of numbers, by the name that message definitions have for them."""
+    """Return the dtype of numbers of a primitive type.
+
+    Parameters
+    ----------
+    name : str
+        As message definitions name it, such as "float32" or "byte".
+    """
     return np.dtype("uint8" if name in {"byte", "char"} else name)
 
 
 def header(stamp: int, frame_id: str) -> Any:
-    """Make a `std_msgs/Header`; `stamp` in nanoseconds of UTC."""
+    """Make a `std_msgs/Header`.
+
+    Parameters
+    ----------
+    stamp : int
+        In nanoseconds of UTC.
+    frame_id : str
+        Name of the microphone.
+    """
     return message("std_msgs/msg/Header", stamp=time_message(stamp), frame_id=frame_id)
 
 
 def time_message(nanoseconds: int) -> Any:
-    """Make a `builtin_interfaces/Time`."""
+    """Make a `builtin_interfaces/Time`.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC, since 1970.
+    """
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
 
 def duration_message(nanoseconds: int) -> Any:
-    """Make a `builtin_interfaces/Duration`."""
+    """Make a `builtin_interfaces/Duration`.
+
+    Parameters
+    ----------
+    nanoseconds : int
+    """
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Duration", sec=seconds, nanosec=rest)
 
 
 def nanoseconds(stamp: Any) -> int:
-    """Read a `builtin_interfaces` Time or Duration."""
+    """Convert a `builtin_interfaces` Time or Duration to nanoseconds.
+
+    Parameters
+    ----------
+    stamp : message
+        A Time or a Duration.
+    """
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
 def encode(fields: Any) -> bytes:
-    """Encode one message as little-endian CDR."""
+    """Encode one message as little-endian CDR.
+
+    Parameters
+    ----------
+    fields : message
+        As `message` makes it.
+    """
     return bytes(typestore().serialize_cdr(fields, fields.__msgtype__, little_endian=True))
 
 
 def decode(data: bytes | memoryview, typename: str) -> Any:
-    """Decode one message."""
+    """Decode one message from CDR.
+
+    Parameters
+    ----------
+    data : bytes or memoryview
+        The payload, of either byte order.
+    typename : str
+        ROS 2 name of the type.
+
+    Returns
+    -------
+    message
+        Of the typestore's class for this type.
+    """
     return typestore().deserialize_cdr(data, typename)
 
 
 @cache
 def definition(typename: str) -> str:
-    """Return a type's definition and those it builds on, as MCAP's `ros2msg` wants them."""
+    """Return the definitions of a type and of those that it builds on, as MCAP's `ros2msg` text.
+
+    Parameters
+    ----------
+    typename : str
+        ROS 2 name of the type.
+    """
     return typestore().generate_msgdef(typename, ros_version=2)[0]
 
 
 @cache
 def type_hash(typename: str) -> str:
-    """Return the type's RIHS01 hash, by which ROS 2 tells that two sides mean the same type."""
+    """Return the RIHS01 hash of a type, by which ROS 2 compares the types of two sides.
+
+    Parameters
+    ----------
+    typename : str
+        ROS 2 name of the type.
+    """
     return typestore().hash_rihs01(typename)

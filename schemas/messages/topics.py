@@ -32,7 +32,18 @@ _OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # o
 
 @dataclass(frozen=True)
 class Topic:
-    """One channel of a log."""
+    """One channel of a log.
+
+    Attributes
+    ----------
+    name : str
+        Such as "/mic/features".
+    type : str
+        ROS 2 name of the type.
+    quality : Quality
+    array_names : mapping of str to sequence of str
+        Names of the elements of an array, by the name of the field that holds the array.
+    """
 
     name: str
     type: str
@@ -41,7 +52,18 @@ class Topic:
 
 
 def check_microphone_name(name: str) -> str:
-    """Return the name if it can be part of a ROS topic."""
+    """Return the name of a microphone if it can be part of a ROS topic.
+
+    Parameters
+    ----------
+    name : str
+        Lower-case letters, digits and single underscores, starting with a letter.
+
+    Raises
+    ------
+    LogError
+        If the name has another form.
+    """
     if not re.fullmatch(_MICROPHONE, name):
         raise LogError(
             f"microphone name {name!r} cannot be a topic: use lower-case letters, digits and "
@@ -51,7 +73,15 @@ def check_microphone_name(name: str) -> str:
 
 
 def topic(microphone: str, kind: str) -> str:
-    """Name the topic of one kind (`info`, `features`, `label` …) of a microphone."""
+    """Name the topic of one kind of a microphone: `/<microphone>/<kind>`.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    kind : str
+        `info`, `features`, `label` …
+    """
     return f"/{microphone}/{kind}"
 
 
@@ -64,23 +94,51 @@ class TopicName(NamedTuple):
 
 
 def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
-    """Name the topic of one kind (`label`, `segment`, `mark`) of a labelling."""
+    """Name the topic of one kind of a labelling.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    labelling : str
+        `live`, `review` or `relabel/<model>`.
+    kind : str
+        `label`, `segment` or `mark`.
+    """
     return topic(microphone, kind if labelling == LIVE else f"{labelling}/{kind}")
 
 
 def relabelling(model: str) -> str:
-    """Name the labelling of a model that relabelled logs."""
+    """Name the labelling of a model that relabelled logs: `relabel/<model>`.
+
+    Parameters
+    ----------
+    model : str
+        Name of the model; what cannot be in a topic becomes `_`.
+    """
     return f"{RELABEL}/{re.sub('[^A-Za-z0-9_]', '_', model)}"
 
 
 def parse_topic(name: str) -> TopicName | None:
-    """Return the parts of a topic of a microphone; None if it is none."""
+    """Return the parts of the name of a topic; None if it is no topic of a microphone.
+
+    Parameters
+    ----------
+    name : str
+        Such as "/mic/features" or "/mic/review/segment".
+    """
     match = _TOPIC.fullmatch(name)
     return None if match is None else TopicName(match[1], match[2] or LIVE, match[3])
 
 
 def microphone_of(topic: str) -> str:
-    """Return the microphone of a topic; empty if it is of none."""
+    """Return the name of a topic's microphone; empty if it has none.
+
+    Parameters
+    ----------
+    topic : str
+        Name of the topic, such as "/mic/features".
+    """
     parts = topic.split("/")
     return parts[1] if len(parts) > 2 else ""
 
@@ -88,7 +146,18 @@ def microphone_of(topic: str) -> str:
 def topics_of(
     microphone: str, feature_names: Sequence[str], classes: Sequence[str] | None
 ) -> list[Topic]:
-    """List what a recorder writes for a microphone; without classes it writes no labels."""
+    """List the topics that a recorder writes for a microphone.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    feature_names : sequence of str
+        Names of the values of a frame, in their order.
+    classes : sequence of str or None
+        Names of the classes, in the order of the probabilities; None for a recorder without a
+        model, which writes no labels and no segments.
+    """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [
         Topic(topic(microphone, "info"), message_types.STREAM_INFO, _LATCHED),
@@ -110,5 +179,11 @@ def topics_of(
 
 
 def audio_topic(microphone: str) -> Topic:
-    """Return the one topic of a layer of sound."""
+    """Return the only topic of a layer of sound.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    """
     return Topic(topic(microphone, "audio"), message_types.RAW_AUDIO)

@@ -25,9 +25,14 @@ _LAYOUTS_KEPT = 256
 
 
 class MessageType:
-    """A ROS 2 message type as a file defines it; parameters as in `TypeDefinition`.
+    """A ROS 2 message type as a file defines it.
 
-    Of types of ours those fields are read that this version has, whichever version wrote them.
+    Of our own types, the fields of this version are read, whichever version wrote them.
+
+    Parameters
+    ----------
+    name, types, growth
+        As in `TypeDefinition`; by default no type has grown.
     """
 
     def __init__(
@@ -39,23 +44,45 @@ class MessageType:
         self._made: dict[tuple[tuple[str, int], ...], Layout] = {}
 
     def read_fields(self, name: str) -> list[tuple[str, Any]]:
-        """List what is read of one of the types: field and description."""
+        """List the fields that are read of this type, or of one that it builds on.
+
+        Parameters
+        ----------
+        name : str
+            ROS 2 name of that type.
+
+        Returns
+        -------
+        list of (str, Any)
+            Name and description of each field, as rosbags has them.
+        """
         if name not in self.growth:
             return list(self.types[name])
         later, absent = self.growth[name]
         return [*(field for field in self.types[name] if field[0] not in later), *absent]
 
     def layouts(self, size: int) -> list[Layout]:
-        """Return the layouts of payloads of this size that were met last."""
+        """Return the layouts that were found last for payloads of one size.
+
+        Parameters
+        ----------
+        size : int
+            Bytes of a payload.
+        """
         return self._layouts.get(size, [])
 
     def layout_of(self, payload: memoryview) -> Layout:
         """Find the layout of an encoded message.
 
+        Parameters
+        ----------
+        payload : memoryview
+            CDR of either byte order.
+
         Raises
         ------
         LogError
-            If its bytes are not of this type.
+            If the payload is not plain CDR, or not of this type.
         """
         order = ORDERS.get(bytes(payload[:2]))
         if order is None or len(payload) < START:
@@ -80,7 +107,19 @@ class MessageType:
         return layout
 
     def layout_for(self, lengths: Mapping[str, int]) -> Layout:
-        """Lay out a message whose strings (bytes, with their end) and sequences are this long."""
+        """Lay out a little-endian message with strings and sequences of given lengths.
+
+        Parameters
+        ----------
+        lengths : mapping of str to int
+            By field path: bytes of a string, with its end, and number of elements of a sequence.
+
+        Raises
+        ------
+        LogError
+            If the type is not defined, contains itself, or has a field of an unsupported type, or if
+            the message would be larger than 100 MiB or have too many fields.
+        """
         key = tuple(lengths.items())
         if key not in self._made:
             walk = LayoutWalk(self._definition, "<", lambda path, _: lengths[path], _MESSAGE_LIMIT)
@@ -93,12 +132,21 @@ class MessageType:
 
 @lru_cache(64)
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
-    """Read a type's definition; without a text it is one of ROS 2's or ours.
+    """Read the definition of a message type.
+
+    Parameters
+    ----------
+    name : str
+        ROS 2 name of the type.
+    encoding : str
+        `ros2msg` or `ros2idl`; empty for the definition of ROS 2 or hearthlog.
+    text : bytes
+        The definition in that encoding, in UTF-8.
 
     Raises
     ------
     LogError
-        If it cannot be understood.
+        If the encoding is another one, or the text is larger than 256 KiB or cannot be understood.
     """
     ours = {key: fields for key, (_, fields) in typestore().fielddefs.items()}
     if not encoding or (name in ours and text == definition(name).encode()):
