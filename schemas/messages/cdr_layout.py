@@ -233,8 +233,8 @@ class LayoutWalk:
         Raises
         ------
         LogError
-            If the type is not defined, contains itself, or has a field of an unsupported type; if the
-            message ends before one of its fields, or has too many of them.
+            If the type is not defined, contains itself, or has a field of an unsupported type; if
+            the message ends before one of its fields, or has too many of them.
         """
         if name not in self._types:
             raise LogError(f"{self._name}: builds on {name}, which is not defined")

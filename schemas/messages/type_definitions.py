@@ -117,8 +117,8 @@ class MessageType:
         Raises
         ------
         LogError
-            If the type is not defined, contains itself, or has a field of an unsupported type, or if
-            the message would be larger than 100 MiB or have too many fields.
+            If the type is not defined, contains itself, or has a field of an unsupported type, or
+            if the message would be larger than 100 MiB or have too many fields.
         """
         key = tuple(lengths.items())
         if key not in self._made:
