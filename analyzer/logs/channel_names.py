@@ -12,26 +12,48 @@ _MOST_NAMES = 256
 
 
 def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
-    """Return the names that a channel has for the elements of an array; none if one is unfit."""
+    """Return the names that a channel gives to the elements of an array.
+
+    Parameters
+    ----------
+    metadata : mapping of str to str
+        Of the channel; its `<field>_names` is a JSON list of texts.
+    field : str
+        Path of the array in the message, such as `values`.
+
+    Returns
+    -------
+    list of str
+        In the order of the elements; empty if there are no names, if one cannot be printed, or if
+        two are equal.
+    """
     names = _names(metadata, field)
     fit = all(name.isprintable() for name in names) and len(set(names)) == len(names)
     return names if fit else []
 
 
 def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
-    """Return the names that a channel has for the elements of an array: one for each.
+    """Return the names that a channel gives to the elements of an array: one for each.
 
     Parameters
     ----------
     path : Path
         Of the log, for the message.
     columns : Columns
+        Messages of the channel.
     field : str
+        Path of the array in the message, such as `values`.
+
+    Returns
+    -------
+    tuple of str
+        In the order of the elements.
 
     Raises
     ------
     LogError
-        If there are no names, or too many, equal ones, or another number than elements.
+        If the messages have no such field, if there are no names or more than 256, if two names
+        are equal, or if there are more or fewer names than elements.
     """
     where = f"{path}: {columns.topic}"
     names = _names(columns.metadata, field)

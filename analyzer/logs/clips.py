@@ -38,12 +38,18 @@ class Clip(NamedTuple):
 
 
 def clips_of(columns: Columns) -> Iterator[Clip]:
-    """Yield the clips of messages.
+    """Yield the clips of messages, in their order.
+
+    Parameters
+    ----------
+    columns : Columns
+        Messages of type `RawAudio`, with the fields `CLIP_FIELDS`.
 
     Raises
     ------
     LogError
-        If one is of another format, or cannot be.
+        If a field is missing, or if a clip is not `pcm-s16`, has fewer than 1000 or more than
+        1,000,000 samples a second, has no channel or more than 256, or ends within a sample.
     """
     fields = (columns[path].tolist() for path in ("format", "sample_rate", "number_of_channels"))
     for start, data, form, rate, channels in zip(
@@ -68,6 +74,15 @@ def read_clips(
 ) -> Iterator[tuple[int, int, Float32]]:
     """Read the clips of one topic of a log.
 
+    Parameters
+    ----------
+    path : Path
+    name : str
+        The topic, such as `/mic/audio`.
+    start, end : int, optional
+        Log times in nanoseconds of UTC: messages from `start` on, before `end`. By default there
+        is no limit.
+
     Yields
     ------
     start : int
@@ -80,7 +95,7 @@ def read_clips(
     Raises
     ------
     LogError
-        If the log is damaged, or a clip is of another format.
+        If the log is damaged, if the topic holds no clips, or if `clips_of` refuses one.
     """
     for batch in iterate_messages([path], [name], start, end):
         for raw in batch:

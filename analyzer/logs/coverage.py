@@ -32,10 +32,16 @@ class Coverage:
     def split(self, start: int, end: int) -> list[tuple[Path, int, int]]:
         """Divide a span of time among the logs.
 
+        Parameters
+        ----------
+        start, end : int
+            Nanoseconds of UTC.
+
         Returns
         -------
         list of (Path, int, int)
-            Empty if more of it than a frame is in none of them.
+            Log, start and end (nanoseconds of UTC) of each part, in the order of time. Empty if
+            more than a frame of the span is in no log.
         """
         parts: list[tuple[Path, int, int]] = []
         covered = start
@@ -50,17 +56,17 @@ class Coverage:
 
 
 def find_coverage(path: Path) -> dict[str, Coverage]:
-    """Find when the microphones of a log, or of a folder of logs, were recording.
+    """Find when each microphone of a log, or of a folder of logs, was recording.
 
     Returns
     -------
     dict of str to Coverage
-        By microphone.
+        By name of the microphone.
 
     Raises
     ------
     DataError
-        If there are no features.
+        If there are no features of a microphone.
     LogError
         If there is no log, or one is damaged.
     """
@@ -77,7 +83,16 @@ def find_coverage(path: Path) -> dict[str, Coverage]:
 
 
 def coverage_of(spans: Sequence[tuple[int, int, Path]]) -> Coverage:
-    """Make the coverage of spans (start, end, log) in the order of time."""
+    """Make a coverage from the spans of logs.
+
+    A log that ends no more than a frame before the next one begins, or after that, gets the end
+    at which the next one begins.
+
+    Parameters
+    ----------
+    spans : sequence of (int, int, Path)
+        Start and end (nanoseconds of UTC) of the frames of each log, in the order of time.
+    """
     starts = [start for start, _, _ in spans]
     ends = [end for _, end, _ in spans]
     for i, following in enumerate(starts[1:]):

@@ -41,7 +41,25 @@ class MicrophoneState(NamedTuple):
 
 
 def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
-    """Yield the gaps of messages, but those of no length."""
+    """Yield the gaps of messages, without those of no length.
+
+    Parameters
+    ----------
+    node : str
+        Name of the recorder; the source of a gap is `<node>/<topic>`.
+    columns : Columns
+        Messages of type `AudioGap`, with the fields `header.stamp`, `duration` and `reason`.
+
+    Yields
+    ------
+    Trouble
+        In the order of the messages.
+
+    Raises
+    ------
+    LogError
+        If one of these fields is missing.
+    """
     starts, durations = columns["header.stamp"], columns["duration"]
     rows = zip(starts.tolist(), durations.tolist(), columns["reason"].tolist(), strict=True)
     for start, nanoseconds, reason in rows:
@@ -50,14 +68,47 @@ def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
 
 
 def statuses_of(columns: Columns) -> Iterator[Status]:
-    """Yield each status of diagnostic messages."""
+    """Yield each status of diagnostic messages.
+
+    Parameters
+    ----------
+    columns : Columns
+        Messages of type `diagnostic_msgs/DiagnosticArray`, with the field `status`.
+
+    Yields
+    ------
+    Status
+        In the order of the messages, at their log times.
+
+    Raises
+    ------
+    LogError
+        If the field is missing.
+    """
     for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:
             yield Status(status["name"], time, int(status["level"]), status["message"])
 
 
 def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
-    """Yield the state of a microphone for each diagnostic message that is about one."""
+    """Yield the state of a microphone for each diagnostic message that is about one.
+
+    Parameters
+    ----------
+    columns : Columns
+        Messages of type `diagnostic_msgs/DiagnosticArray`, with the fields `header.stamp`,
+        `header.frame_id` (the microphone) and `status`.
+
+    Yields
+    ------
+    MicrophoneState
+        In the order of the messages, at their stamps.
+
+    Raises
+    ------
+    LogError
+        If one of these fields is missing.
+    """
     times, names = columns["header.stamp"].tolist(), columns["header.frame_id"].tolist()
     for time, name, statuses in zip(times, names, columns["status"], strict=True):
         topic = parse_topic(f"/{name}/info")
@@ -68,14 +119,20 @@ def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
 
 
 def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
-    """Yield what was not well: from when it was said to when something else was, or nothing was.
+    """Yield what was not well, from when it was said until something else was said.
 
     Parameters
     ----------
     statuses : iterable of Status
         In any order.
     end : int
-        Nanoseconds of UTC, at which the last trouble ends if it is not over before.
+        Nanoseconds of UTC. The last trouble of a name ends with the last status of that name, or
+        here if that is earlier.
+
+    Yields
+    ------
+    Trouble
+        By name, then in the order of time.
     """
     for name, same in groupby(sorted(statuses), lambda status: status.name):
         own = list(same)
@@ -85,17 +142,20 @@ def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
 
 
 def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple[int, int, str]]:
-    """Let each text last until the next one that differs, the last one until `end`.
+    """Let each text last until the next one that differs, and the last one until `end`.
 
     Parameters
     ----------
     texts : sequence of (int, str or None)
-        When something was said, in the order of time; None is nothing.
+        When something was said (nanoseconds of UTC), in the order of time; None where there is
+        nothing to say.
     end : int
+        Nanoseconds of UTC.
 
     Yields
     ------
     start, end : int
+        Nanoseconds of UTC.
     text : str
     """
     changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]

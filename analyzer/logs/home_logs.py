@@ -37,7 +37,20 @@ class HomeLogs:
     losses: Sequence[str]  # what cannot be read, and why
 
     def between(self, start: int, end: int, layer: str = "") -> list[HomeLog]:
-        """List the logs, or the layers of one name, that may speak of a span of time."""
+        """List the logs, or the layers of one name, that may speak of a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            Nanoseconds of UTC: from `start` on, before `end`.
+        layer : str
+            `review` or `relabel-<model>`; empty for logs.
+
+        Returns
+        -------
+        list of HomeLog
+            In the order of time.
+        """
         return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
 
     @property
@@ -51,7 +64,18 @@ class HomeLogs:
         return latest_records(entry.path for entry in self.between(0, _NEVER))
 
     def days(self, zone: tzinfo) -> list[date]:
-        """List the days on which there are logs."""
+        """List the days on which there are logs.
+
+        Parameters
+        ----------
+        zone : tzinfo
+            Of the home.
+
+        Returns
+        -------
+        list of date
+            The days on which logs begin, and that of the last message; ascending.
+        """
         days = {local_time(entry.start, zone).date() for entry in self.between(0, _NEVER)}
         end = self.end()
         if end is not None:
@@ -59,7 +83,20 @@ class HomeLogs:
         return sorted(days)
 
     def last_whole_day(self, zone: tzinfo) -> date:
-        """Return the last day that the logs reach beyond, or the last one if there is none."""
+        """Return the last day to whose end the logs reach, or the last day if there is none.
+
+        A day counts as whole if no more than its last minute is missing.
+
+        Parameters
+        ----------
+        zone : tzinfo
+            Of the home.
+
+        Raises
+        ------
+        LogError
+            If there are only layers, and logs that cannot be read or have no message.
+        """
         days = self.days(zone)
         if not days:
             raise LogError(self.losses[0] if self.losses else "there is no message in these logs")
@@ -68,7 +105,13 @@ class HomeLogs:
         return whole[-1] if whole else days[-1]
 
     def end(self) -> int | None:
-        """Return the log time of the last message of the logs."""
+        """Return the log time of the last message of the logs.
+
+        Returns
+        -------
+        int or None
+            Nanoseconds of UTC; None if no log has a message that can be read.
+        """
         for entry in reversed(self.between(0, _NEVER)):
             try:
                 span = time_span(entry.path)
@@ -80,12 +123,22 @@ class HomeLogs:
 
 
 def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
-    """Look which logs there are, by their names; only others are opened.
+    """Find the logs and layers of a home by their names; only files of other names are opened.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs.
+
+    Returns
+    -------
+    HomeLogs
+        Without layers of sound; its `losses` name the files that cannot be read.
 
     Raises
     ------
     LogError
-        If there is none.
+        If there is no such log, or none in a folder.
     """
     losses: list[str] = []
     entries = []
@@ -103,7 +156,13 @@ def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
 
 
 def days_in_words(days: Sequence[date]) -> str:
-    """Name days, those that follow each other as one: `2026-03-01 to 2026-03-04, 2026-03-09`."""
+    """Write days as text, with runs of days joined: `2026-03-01 to 2026-03-04, 2026-03-09`.
+
+    Parameters
+    ----------
+    days : sequence of date
+        Ascending. Of more than five runs, the text has the first and the last four.
+    """
     numbered = enumerate(days)
     runs = [list(run) for _, run in groupby(numbered, lambda pair: pair[1].toordinal() - pair[0])]
     texts = [f"{run[0][1]}" if len(run) == 1 else f"{run[0][1]} to {run[-1][1]}" for run in runs]
@@ -111,7 +170,21 @@ def days_in_words(days: Sequence[date]) -> str:
 
 
 def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
-    """Raise DataError unless there is a log on one of some days."""
+    """Check that there is a log on one of some days.
+
+    Parameters
+    ----------
+    logs : HomeLogs
+    first, last : date
+        The days from `first` to `last`, both of them included.
+    zone : tzinfo
+        Of the home.
+
+    Raises
+    ------
+    DataError
+        If there is no log on any of these days.
+    """
     days = logs.days(zone)
     if any(first <= day <= last for day in days):
         return

@@ -41,7 +41,13 @@ class Labelling:
         return len(self.starts)
 
     def called_as(self, classes: Sequence[str]) -> "Labelling":
-        """Give labels that mean one of some classes, by another name, the name of that class."""
+        """Give each label the name that its class has among some classes.
+
+        Parameters
+        ----------
+        classes : sequence of str
+            A label that means exactly one of these, by another name, gets its name; others stay.
+        """
         names = translation(set(self.labels), classes)
         return replace(self, labels=np.array([names[label] for label in self.labels], object))
 
@@ -68,12 +74,18 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     ----------
     path : Path
     topic : str, optional
-        By default that of the only microphone.
+        The topic of the segments, such as `/mic/segment`; by default that of the only microphone.
+
+    Returns
+    -------
+    TopicLabelling
+        Its segments are in the order of time.
 
     Raises
     ------
     LogError
-        If a log is damaged, or has no such segments.
+        If there is no log, if one is damaged, if there are no such segments, if they overlap, or
+        if `topic` is None and there are several microphones.
     """
     selection = select(with_layers(path))
     topic = _segment_topic(selection, topic)
@@ -88,19 +100,35 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
 
 
 def labelling_of(segments: Columns) -> Labelling:
-    """Make a labelling of segments; raises as `segments_in_order`."""
+    """Make a labelling of segments.
+
+    Parameters
+    ----------
+    segments : Columns
+        Messages of type `AudioSegment`, with the fields `FIELDS`.
+
+    Raises
+    ------
+    LogError
+        If a field is missing, or if segments overlap.
+    """
     segments = segments_in_order(segments)
     starts = segments["header.stamp"]
     return Labelling(starts, starts + segments["duration"], segments["label"])
 
 
 def segments_in_order(segments: Columns) -> Columns:
-    """Put segments in the order of time; those that are over at once are left out.
+    """Sort segments by their stamps, and leave out those without a duration.
+
+    Parameters
+    ----------
+    segments : Columns
+        Messages of type `AudioSegment`, with the fields `header.stamp` and `duration`.
 
     Raises
     ------
     LogError
-        If they overlap.
+        If a field is missing, or if segments overlap.
     """
     segments = segments.take(np.flatnonzero(segments["duration"] > 0))
     segments = segments.take(np.argsort(segments["header.stamp"], kind="stable"))
@@ -116,12 +144,26 @@ def segments_in_order(segments: Columns) -> Columns:
 def all_classes(
     topic: str, named: Iterable[Sequence[str]], labels: Iterable[str]
 ) -> tuple[str, ...]:
-    """List the labels that there may be: those that logs name, and those that there are.
+    """List the labels that there may be: those that logs name, and those that occur.
+
+    Parameters
+    ----------
+    topic : str
+        Of the segments, for the message.
+    named : iterable of sequence of str
+        The names that channels of labels have for their probabilities.
+    labels : iterable of str
+        Those of the segments.
+
+    Returns
+    -------
+    tuple of str
+        Each once: the named ones first, in their order.
 
     Raises
     ------
     LogError
-        If they are too many.
+        If there are more than 100.
     """
     classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
     if len(classes) > MOST_CLASSES:
@@ -130,7 +172,21 @@ def all_classes(
 
 
 def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
-    """Raise LogError if a label cannot be the name of a class, or the time of the first span."""
+    """Check that labels can be names of classes, and that no segment begins before 1970.
+
+    Parameters
+    ----------
+    topic : str
+        Of the segments, for the message.
+    starts : np.ndarray [shape=(n,)], int64
+        Nanoseconds of UTC, ascending.
+    labels : iterable of str
+
+    Raises
+    ------
+    LogError
+        If a label cannot be the name of a class, or the first start is negative.
+    """
     for label in labels:
         if not CLASS_NAME.fullmatch(label):
             raise LogError(f"{topic}: {label[:64]!r} cannot be the name of a class")

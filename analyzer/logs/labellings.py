@@ -57,7 +57,13 @@ class NamedLabelling(NamedTuple):
     labelling: Labelling  # in the order of time, one label at a time
 
     def called_as(self, classes: Sequence[str]) -> "NamedLabelling":
-        """Give classes that are among some by another name the name that they have there."""
+        """Give each label the name that its class has among some classes.
+
+        Parameters
+        ----------
+        classes : sequence of str
+            A label that means exactly one of these, by another name, gets its name; others stay.
+        """
         names = translation(self.classes, classes)
         own = tuple(dict.fromkeys(names.values()))
         return NamedLabelling(self.name, own, self.labelling.called_as(classes))
@@ -71,7 +77,20 @@ class Labellings:
     losses: list[str] = field(default_factory=list)  # what could not be used, and why
 
     def microphone(self, name: str | None) -> str:
-        """Return the only microphone, or the named one if there is one of this name."""
+        """Return the named microphone, or the only one.
+
+        Parameters
+        ----------
+        name : str or None
+            None for the only one.
+
+        Raises
+        ------
+        LogError
+            If there are no segments.
+        DataError
+            If there are several microphones and `name` is None, or none of this name.
+        """
         names = {topic.microphone for topic in self._topics()}
         there = ", ".join(sorted(names))
         if not names:
@@ -88,23 +107,40 @@ class Labellings:
         return name or names.pop()
 
     def names(self, microphone: str) -> list[str]:
-        """List the labellings of a microphone; what the recorder said comes first."""
+        """List the labellings of a microphone.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+
+        Returns
+        -------
+        list of str
+            `live` first, then `relabel/<model>` and `review` in the order of the alphabet.
+        """
         names = {t.labelling for t in self._topics() if t.microphone == microphone}
         return sorted(names, key=lambda name: (name != LIVE, name))
 
     def find(self, microphone: str, text: str) -> str:
-        """Find the labelling that a user means.
+        """Find the name of the labelling that a user asks for.
 
         Parameters
         ----------
         microphone : str
         text : str
-            `live`, `review`, the name of a model, or `relabel` if there is only one.
+            `live`, `review`, `relabel/<model>`, the name of a model, or `relabel` if there is only
+            one.
+
+        Returns
+        -------
+        str
+            `live`, `review` or `relabel/<model>`.
 
         Raises
         ------
         DataError
-            If it is none of them.
+            If the microphone has no such labelling.
         """
         names = self.names(microphone)
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
@@ -124,20 +160,25 @@ class Labellings:
         end: int | None = None,
         progress: Progress = ignore_progress,
     ) -> NamedLabelling:
-        """Read the segments of a labelling; of a log that is damaged `losses` tell.
+        """Read the segments of a labelling.
+
+        What cannot be read of a damaged log is missing; `losses` then say so.
 
         Parameters
         ----------
         microphone, name : str
             As `microphone` and `find` return them.
         start, end : int, optional
-            In nanoseconds: what is before and after is cut off.
+            Nanoseconds of UTC: what is before `start` and after `end` is cut off. By default there
+            is no limit.
         progress : callable, optional
+            Is told the share of the logs that is done, 0 to 1.
 
         Raises
         ------
         LogError
-            If there is none in this span of time, or if segments overlap or cannot be.
+            If there is no segment in this span of time, if segments overlap, if the first begins
+            before 1970, or if labels are too many or cannot be names of classes.
         """
         topic = labelling_topic(microphone, name, "segment")
         labelling = self._labelling(topic, start, end, progress)
@@ -151,14 +192,47 @@ class Labellings:
         return NamedLabelling(name, classes, labelling)
 
     def marks(self, microphone: str, start: int | None, end: int | None) -> Labelling | None:
-        """Read what was reviewed in a span of time, if anything was; as `read` otherwise."""
+        """Read the marks of a reviewer in a span of time.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+        start, end : int or None
+            Nanoseconds of UTC: what is before `start` and after `end` is cut off; None for no
+            limit.
+
+        Returns
+        -------
+        Labelling or None
+            None if there is no mark. What cannot be read is missing; `losses` then say so.
+
+        Raises
+        ------
+        LogError
+            If marks overlap.
+        """
         topic = labelling_topic(microphone, REVIEW, "segment")
         return self._labelling(topic, start, end, ignore_progress)
 
     def with_topic(
         self, topic: str, start: int | None = None, end: int | None = None
     ) -> list[LogContents]:
-        """List the logs that have a topic, and messages at a span of time."""
+        """List the logs that have a topic and may have messages in a span of time.
+
+        Parameters
+        ----------
+        topic : str
+            Of segments or labels.
+        start, end : int, optional
+            Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
+            limit.
+
+        Returns
+        -------
+        list of LogContents
+            In the order of time.
+        """
         return [
             log
             for log in self.logs
@@ -168,11 +242,23 @@ class Labellings:
         ]
 
     def unfinished(self, topics: Sequence[str]) -> list[Path]:
-        """List the logs with one of some topics that were not completed."""
+        """List the unfinished logs that have one of some topics.
+
+        Parameters
+        ----------
+        topics : sequence of str
+            Of segments.
+        """
         return [log.path for log in self.logs if not log.complete and log.segments & set(topics)]
 
     def lose(self, error: LogError) -> None:
-        """Note what could not be read."""
+        """Append the text of an error to `losses`, once.
+
+        Parameters
+        ----------
+        error : LogError
+            Why a log could not be read.
+        """
         if str(error) not in self.losses:
             self.losses.append(str(error))
 
@@ -215,10 +301,20 @@ class Labellings:
 def find_labellings(*paths: Path) -> Labellings:
     """Find the labellings of logs and their layers, or of folders of logs.
 
+    Parameters
+    ----------
+    *paths : Path
+        Logs, or folders of logs.
+
+    Returns
+    -------
+    Labellings
+        Its `losses` name the logs that cannot be read.
+
     Raises
     ------
     LogError
-        If there is no log, or none that can be read.
+        If there is no log, if none can be read, or if none has a message.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
     logs = [log for log in opened if isinstance(log, LogContents)]

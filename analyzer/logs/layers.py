@@ -36,7 +36,18 @@ class Chain(NamedTuple):
 
 
 def with_layers(path: Path) -> list[Path]:
-    """List a log and the layers beside it; of a folder the folder alone, which has them."""
+    """List a log and the layers beside it.
+
+    Parameters
+    ----------
+    path : Path
+        A log, or a folder of logs.
+
+    Returns
+    -------
+    list of Path
+        The log, then its layers by name; of a folder, which has the layers in it, the folder alone.
+    """
     if not path.is_file():
         return [path]
     beside = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
@@ -45,7 +56,17 @@ def with_layers(path: Path) -> list[Path]:
 
 
 def find_with_layers(paths: Iterable[Path]) -> list[Path]:
-    """List logs with the layers beside them, and all that is in folders, each file once.
+    """List logs with the layers beside them, and all logs and layers in folders.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs.
+
+    Returns
+    -------
+    list of Path
+        Each file once, in the order of `paths`.
 
     Raises
     ------
@@ -66,14 +87,20 @@ def find_timed_files(
     paths : iterable of Path
         As `find_with_layers` takes them.
     start, end : int, optional
-        In nanoseconds of UTC.
+        Nanoseconds of UTC: what may speak of the time from `start` on, before `end`. None for no
+        limit.
     losses : list of str
-        What cannot be read, and why, is appended.
+        Is appended to: what cannot be read, and why.
 
     Returns
     -------
     list of TimedFile
         In the order of time.
+
+    Raises
+    ------
+    LogError
+        If there is no such log, or none in a folder.
     """
     files = []
     for path in find_with_layers(paths):
@@ -93,7 +120,15 @@ def find_timed_files(
 
 
 def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
-    """Yield the `hearthlog` records of logs that have one, the last log first; layers have none."""
+    """Yield the first `hearthlog` record of each log that has one, the last log first.
+
+    Layers, and logs that cannot be read, are passed over.
+
+    Parameters
+    ----------
+    logs : iterable of Path
+        In the order of time.
+    """
     for path in reversed(list(logs)):
         if is_layer(path):
             continue
@@ -102,7 +137,15 @@ def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
 
 
 def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
-    """Find the time zone of a home: the named one, or that of the latest log that says one.
+    """Find the time zone of a home.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs, or folders of logs.
+    name : str or None
+        IANA name of the zone, such as `Europe/Vienna`; None for that of the latest log that names
+        one, or UTC.
 
     Raises
     ------
@@ -115,12 +158,17 @@ def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
 
 
 def find_chains(paths: Iterable[Path]) -> list[Chain]:
-    """Find logs, and those before and behind them.
+    """Find all logs of the nodes that wrote some logs.
 
     Parameters
     ----------
     paths : iterable of Path
-        Logs, or folders of logs, of which layers are passed over.
+        Logs, or folders of logs; layers in folders are passed over.
+
+    Returns
+    -------
+    list of Chain
+        One for each node of a home that has one of the logs.
 
     Raises
     ------
@@ -143,7 +191,7 @@ def find_chains(paths: Iterable[Path]) -> list[Chain]:
 
 
 def home_folder(log: Path) -> Path:
-    """Return the folder that has the folders of years; of another layout that of the log."""
+    """Return the folder of a home: that of the folders of years, else that of the log."""
     folder = log.parent
     days = "/".join(part.name for part in (folder.parent.parent, folder.parent, folder))
     return folder.parent.parent.parent if _DAY.fullmatch(days) else folder

@@ -41,22 +41,53 @@ def _zone(name: str, advice: str) -> tzinfo:
 
 
 def midnight(day: date, zone: tzinfo) -> int:
-    """Return when a day begins, in nanoseconds of UTC."""
+    """Return the time at which a day begins, in nanoseconds of UTC."""
     local = datetime(day.year, day.month, day.day, tzinfo=zone)
     return int(local.timestamp()) * NANOSECONDS
 
 
 def day_span(day: date, zone: tzinfo) -> Span:
-    """Return when a day begins, and when the next one does; 23 to 25 hours later, in most zones."""
+    """Return the times at which a day and the next one begin, in nanoseconds of UTC.
+
+    In most zones they are 23 to 25 hours apart.
+    """
     return midnight(day, zone), midnight(day + timedelta(days=1), zone)
 
 
 def at_hour(day: date, hour: int, zone: tzinfo) -> int:
-    """Return when the clock on the wall shows a full hour, in nanoseconds of UTC."""
+    """Return the time at which the clock on the wall shows a full hour.
+
+    Parameters
+    ----------
+    day : date
+        In the time of the home.
+    hour : int
+        0 to 23.
+    zone : tzinfo
+        Of the home.
+
+    Returns
+    -------
+    int
+        Nanoseconds of UTC.
+    """
     local = datetime(day.year, day.month, day.day, hour, tzinfo=zone)
     return int(local.timestamp()) * NANOSECONDS
 
 
 def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
-    """Return what clock and calendar on the wall show, down to the second."""
+    """Return what the clock and the calendar on the wall show.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC.
+    zone : tzinfo
+        Of the home.
+
+    Returns
+    -------
+    datetime
+        In `zone`, without fractions of a second.
+    """
     return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)

@@ -72,7 +72,7 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
     ----------
     path : Path
     kind : str
-        One of `TYPES`, the sort of topic by which the microphone is known.
+        A key of `TYPES`, `features` or `audio`: the topic by which the microphone is known.
 
     Returns
     -------
@@ -127,19 +127,30 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
 
 
 def attachments_of(file: LogFile) -> list[Attachment]:
-    """Read what is attached to a log."""
+    """Read the attachments of a log, in the order of its index.
+
+    Parameters
+    ----------
+    file : LogFile
+        Open.
+
+    Raises
+    ------
+    LogError
+        If one is too large, or damaged.
+    """
     locations = [each for each in file.record_locations if each.opcode == Opcode.ATTACHMENT]
     attached = [r for r in map(file.record, locations) if isinstance(r, records.Attachment)]
     return [Attachment(r.name, r.media_type, r.data) for r in attached]
 
 
 def features_of(origin: RecorderInfo) -> FeatureSet:
-    """Return the feature set of a log, the default one where the log does not say which.
+    """Return the feature set of a log; the default one where the log names none.
 
     Raises
     ------
     LogError
-        If it is not installed, or another version of it is.
+        If the set is not installed, cannot be imported, or is installed in another version.
     """
     name = origin.feature_set or DEFAULT.name
     try:

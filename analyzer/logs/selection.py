@@ -43,7 +43,23 @@ class Selection:
     span: tuple[int, int]  # log times of the first and the last message
 
     def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
-        """Read the messages as `iterate_messages` does, and report the share that is done."""
+        """Read the messages of the selection, still encoded, in the order of time.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Is told the share of the time span that is done, 0 to 1.
+
+        Yields
+        ------
+        list of RawMessages
+            As `iterate_messages` yields them; checksums are not compared.
+
+        Raises
+        ------
+        LogError
+            If a log is damaged.
+        """
         first, last = self.span
         for batch in iterate_messages(self.logs, self.topics, self.start, self.end):
             yield batch
@@ -66,7 +82,20 @@ class Selection:
                 )
 
     def topics_of(self, type_: str, fields: Collection[str]) -> list[str]:
-        """List the topics of a type, of which all channels have some fields."""
+        """List the topics of a type whose channels all have some fields.
+
+        Parameters
+        ----------
+        type_ : str
+            Name of a message type, such as those in `message_types`.
+        fields : collection of str
+            Paths of the fields.
+
+        Returns
+        -------
+        list of str
+            In the order of `channels`.
+        """
         return [
             topic
             for topic, channels in self.channels.items()
@@ -74,12 +103,18 @@ class Selection:
         ]
 
     def only(self, topics: Collection[str]) -> "Selection":
-        """Leave out all other topics."""
+        """Return the selection without its other topics.
+
+        Parameters
+        ----------
+        topics : collection of str
+            Names of the topics that stay.
+        """
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
 
     def nothing(self) -> LogError:
-        """Make the error that says that there is no message."""
+        """Make the error that says that the selection has no message."""
         topics = "" if self.topics is None else f" of {', '.join(sorted(self.topics))}"
         return LogError(f"no message{topics} in this span of time; `hearthlog info` shows spans")
 
@@ -90,7 +125,7 @@ def select(
     start: int | None = None,
     end: int | None = None,
 ) -> Selection:
-    """Find out which of some logs have messages of some topics in a span of time.
+    """Find the logs that have messages in a span of time, and their topics of some names.
 
     Parameters
     ----------
@@ -99,7 +134,8 @@ def select(
     patterns : sequence of str
         Names of topics, in which `*` stands for anything; all topics by default.
     start, end : int, optional
-        Log times in nanoseconds: from `start` on, before `end`.
+        Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
+        limit.
 
     Raises
     ------
@@ -170,7 +206,19 @@ class _Content:
 
 
 def identity(channel: Channel, schema: Schema | None) -> Hashable:
-    """Return what two channels, of two logs perhaps, have in common if they say the same."""
+    """Return a key that two channels share if they say the same, though their numbers differ.
+
+    Parameters
+    ----------
+    channel : Channel
+    schema : Schema or None
+        Of the channel; None if it has none.
+
+    Returns
+    -------
+    hashable
+        Of topic, encoding, metadata and definition.
+    """
     definition = None if schema is None else (schema.name, schema.encoding, schema.data)
     metadata = frozenset(channel.metadata.items())
     return channel.topic, channel.message_encoding, metadata, definition

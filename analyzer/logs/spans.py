@@ -19,7 +19,7 @@ class Spans(NamedTuple):
 
     @property
     def length(self) -> int:
-        """Nanoseconds of all of them."""
+        """Sum of the lengths of the spans, in nanoseconds."""
         return int((self.ends - self.starts).sum())
 
 
@@ -45,7 +45,7 @@ class Overlay(NamedTuple):
     rows: Int64
 
     def in_all(self) -> "Overlay":
-        """Return the parts in which all have a span."""
+        """Return the parts in which every layer has a span."""
         which = np.logical_and.reduce(self.rows >= 0)
         return Overlay(self.starts[which], self.ends[which], self.rows[:, which])
 
@@ -54,12 +54,18 @@ NONE = Spans(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 def one(start: int, end: int) -> Spans:
-    """Return a single span."""
+    """Return a single span.
+
+    Parameters
+    ----------
+    start, end : int
+        Nanoseconds of UTC; the end is after the start.
+    """
     return Spans(np.array([start]), np.array([end]))
 
 
 def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
-    """Find the first of each group of spans no more than a pause apart.
+    """Find the first span of each group of spans no more than a pause apart.
 
     Parameters
     ----------
@@ -87,7 +93,7 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
     starts, ends : np.ndarray [shape=(n,)], int64
         Nanoseconds, in any order.
     pause : int, optional
-        Nanoseconds.
+        Nanoseconds; 0 joins spans that touch.
     """
     order = np.argsort(starts, kind="stable")
     starts, ends = starts[order], ends[order]
@@ -101,31 +107,34 @@ def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Ro
     Parameters
     ----------
     firsts, counts : np.ndarray [shape=(n,)], int
+        Where to begin, and how many numbers to count.
 
     Returns
     -------
     rows, numbers : np.ndarray [shape=(counts.sum(),)]
-        `firsts[0]`, `firsts[0] + 1` … of row 0, then those of row 1.
+        The row of `firsts` that each number belongs to, and the numbers: `firsts[0]`,
+        `firsts[0] + 1` … of row 0, then those of row 1.
     """
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(counts.sum()) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
 
 
 def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
-    """Cut spans to others.
+    """Cut spans to the parts that lie in other spans.
 
     Parameters
     ----------
-    a : Spans, or anything with starts and ends
+    a : Timed
         They may overlap.
     b : Spans
+        They do not overlap.
 
     Returns
     -------
     spans : Spans
         What is in both, in the order of `a`.
-    of_a, of_b : np.ndarray [shape=(n,)]
-        The rows each is a piece of.
+    of_a, of_b : np.ndarray [shape=(n,)], intp
+        The rows of `a` and of `b` that each piece lies in.
     """
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
@@ -135,12 +144,24 @@ def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
 
 
 def common(a: Spans, b: Spans) -> Spans:
-    """Return what is in both."""
+    """Return the time that is in both.
+
+    Parameters
+    ----------
+    a, b : Spans
+    """
     return pieces(a, b)[0]
 
 
 def cut(spans: Spans, start: int, end: int) -> Spans:
-    """Return what is between two times; unlike `common` it does not look at all the others."""
+    """Return the time of spans between two times, without a look at all the other spans.
+
+    Parameters
+    ----------
+    spans : Spans
+    start, end : int
+        Nanoseconds of UTC.
+    """
     first = np.searchsorted(spans.ends, start, side="right")
     last = max(np.searchsorted(spans.starts, end), first)
     rows = slice(first, last)
@@ -148,19 +169,31 @@ def cut(spans: Spans, start: int, end: int) -> Spans:
 
 
 def without(a: Spans, b: Spans) -> Spans:
-    """Return what is in the first and not in the second."""
+    """Return the time that is in the first spans and not in the second.
+
+    Parameters
+    ----------
+    a, b : Spans
+    """
     return remains(a, b)[0]
 
 
 def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
-    """Take spans from others.
+    """Cut spans to the parts that lie outside of other spans.
+
+    Parameters
+    ----------
+    a : Timed
+        Ascending by their starts and by their ends.
+    b : Spans
+        They do not overlap.
 
     Returns
     -------
     spans : Spans
-        What is in `a` and not in `b`.
-    of_a : np.ndarray [shape=(n,)]
-        The row each is left of.
+        What is in `a` and not in `b`, in the order of `a`.
+    of_a : np.ndarray [shape=(n,)], intp
+        The row of `a` that each piece is left of.
     """
     if not len(a.starts) or not len(b.starts):
         return Spans(a.starts, a.ends), np.arange(len(a.starts))
@@ -176,13 +209,15 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
 
     Parameters
     ----------
-    spans : Spans, or anything with starts and ends
+    spans : Timed
+        They do not overlap.
     times : np.ndarray [shape=(n,)], int64
+        Nanoseconds of UTC, in any order.
 
     Returns
     -------
     np.ndarray [shape=(n,)], int64
-        Rows; -1 for none.
+        Rows of `spans`; -1 for a time in none of them.
     """
     if not len(spans.starts):
         return np.full(len(times), -1)
@@ -191,14 +226,20 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
 
 
 def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
-    """Cut the time wherever one of some layers of spans changes.
+    """Cut the time wherever a span of one of several layers begins or ends.
 
     Parameters
     ----------
-    layers : sequence
-        Of spans that ascend and do not overlap.
+    layers : sequence of Timed
+        At least one; the spans of a layer ascend and do not overlap.
     every : int, optional
-        Cut it also at the multiples of so many nanoseconds.
+        Nanoseconds: cut the time also at the multiples of this, where it is not 0; every layer
+        then has a span.
+
+    Returns
+    -------
+    Overlay
+        From the first edge to the last, in the order of time; `rows` has a row for each layer.
     """
     edges = [times for spans in layers for times in (spans.starts, spans.ends)]
     if every:
@@ -210,13 +251,13 @@ def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
 
 
 def lengths(spans: Spans, edges: Int64) -> Int64:
-    """Measure how much of spans is between each two successive edges.
+    """Measure how much time of spans lies between each two successive edges.
 
     Parameters
     ----------
     spans : Spans
     edges : np.ndarray [shape=(n + 1,)], int64
-        Ascending.
+        Nanoseconds of UTC, ascending.
 
     Returns
     -------

@@ -46,7 +46,18 @@ _TIMES = 16  # bytes of an attachment before its name
 
 
 def summarise(paths: Iterable[Path]) -> Summary:
-    """Count what is in some logs; those that are damaged are only named."""
+    """Count what is in some logs.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Logs and layers, not folders.
+
+    Returns
+    -------
+    Summary
+        Of all of them; `damaged` names those that cannot be read.
+    """
     total = Summary()
     for path in paths:
         try:

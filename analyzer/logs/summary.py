@@ -30,7 +30,17 @@ class TopicSummary:
         return (self.messages - 1) * NANOSECONDS / (last - first) if last > first else 0.0
 
     def add(self, count: int, size: int | None, span: Span | None) -> None:
-        """Add messages of this topic: how many, their bytes and their first and last log time."""
+        """Add messages of this topic.
+
+        Parameters
+        ----------
+        count : int
+            How many there are.
+        size : int or None
+            Bytes of their payloads before compression; None if that is not known.
+        span : (int, int) or None
+            Their first and last log time, in nanoseconds of UTC; None if that is not known.
+        """
         self.messages += count
         self.bytes = None if self.bytes is None or size is None else self.bytes + size
         self.span = _hull(self.span, span)
@@ -76,7 +86,7 @@ class Summary:
 
     @property
     def span(self) -> Span | None:
-        """Log times of the first and the last message; None if there is none."""
+        """First and last log time, in nanoseconds of UTC; None if there is no message."""
         span = None
         for topic in self.topics.values():
             span = _hull(span, topic.span)
@@ -84,13 +94,13 @@ class Summary:
 
     @property
     def seconds(self) -> float:
-        """Time from the first message to the last."""
+        """Seconds from the first message to the last."""
         first, last = self.span or (0, 0)
         return (last - first) / NANOSECONDS
 
     @property
     def gap_seconds(self) -> float:
-        """Time that was not heard, of all microphones together."""
+        """Seconds that were not heard, of all microphones together."""
         return sum(gap.seconds for gap in self.gaps)
 
     @property
@@ -99,7 +109,13 @@ class Summary:
         return self.raw_bytes / self.chunk_bytes if self.chunk_bytes else None
 
     def add(self, other: "Summary") -> None:
-        """Add what other files hold."""
+        """Add what other files hold to this summary.
+
+        Parameters
+        ----------
+        other : Summary
+            Of files that are not in this one; stays as it is.
+        """
         self.files += other.files
         self.unfinished += other.unfinished
         self.layers += other.layers
@@ -126,7 +142,18 @@ class Summary:
 
 
 def worse(one: Status | None, other: Status | None) -> Status | None:
-    """Return the worse of two, of equal ones the later."""
+    """Return the status of the higher level, of equal levels the later one.
+
+    Parameters
+    ----------
+    one, other : Status or None
+        None where nothing was said.
+
+    Returns
+    -------
+    Status or None
+        None if nothing was said at all.
+    """
     statuses = [status for status in (one, other) if status is not None]
     return max(statuses, key=lambda status: (status.level, status.time), default=None)
 

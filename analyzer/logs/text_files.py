@@ -19,14 +19,14 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
     ----------
     path : Path
     what : str
-        What it should be, for the message.
+        What the file should be, such as `manifest`, for the message.
     size_limit : int
-        In bytes.
+        Bytes that the file may have at most.
 
     Raises
     ------
     DataError
-        If it cannot be read, is larger, or is not UTF-8.
+        If there is no such file, or it cannot be read, is larger, or is not UTF-8.
     """
     raw = read_whole(path, what, size_limit, DataError)
     try:
@@ -37,12 +37,26 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
 
 
 def csv_records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the records of CSV that are not blank, each with the line it starts in.
+    """Yield the records of CSV that are not blank.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Yields
+    ------
+    line : int
+        The line in which the record begins, from 1.
+    record : list of str
+        Its fields.
 
     Raises
     ------
     DataError
-        If the text is not CSV, or has more than a million lines.
+        If the text is not CSV, has more than a million lines, or a record of more than 1 MiB.
     """
     count = max(text.count("\n"), text.count("\r"))
     if count > _MOST_LINES:

@@ -26,15 +26,22 @@ class TypedColumns(NamedTuple):
 def decode_types(
     path: Path, batch: Iterable[RawMessages], types: Mapping[str, Collection[str]]
 ) -> list[Columns]:
-    """Decode the messages of some types; all others are left out.
+    """Decode the messages of some types, and leave out all others.
 
     Parameters
     ----------
     path : Path
         The log they are from.
     batch : iterable of RawMessages
+        Messages, still encoded; iterated once for each type.
     types : mapping of str to collection of str
-        Paths of the fields to decode, by type; `is_compatible` says which they may be.
+        Paths of the fields to decode, by name of the type; `is_compatible` says which fields a
+        type may have.
+
+    Returns
+    -------
+    list of Columns
+        By type in the order of `types`; messages of one topic and definition are together.
 
     Raises
     ------
@@ -52,12 +59,23 @@ def decode_types(
 
 
 def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
-    """Decode messages of any type, those of one topic and definition together.
+    """Decode messages of any type with all of their fields.
+
+    Parameters
+    ----------
+    batch : iterable of RawMessages
+        Messages, still encoded.
+
+    Returns
+    -------
+    list of TypedColumns
+        Messages of one topic and definition are together.
 
     Raises
     ------
     LogError
-        If they are not of the type that their channel says, or not encoded as CDR.
+        If a message is not of the type that its channel says, is not encoded as CDR, or if the
+        definition of a type cannot be understood.
     """
     groups: dict[Any, list[RawMessages]] = {}
     for raw in batch:
@@ -76,18 +94,25 @@ def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
 def is_compatible(
     channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
 ) -> bool:
-    """Tell whether a channel has messages of a type, of which some fields can be read.
+    """Tell whether some fields can be read from the messages of a channel, if it is of a type.
 
-    Whatever version of a type of ours a log has, they can: there are defaults for those that were
-    appended since. A definition that is none of any version gives a `HearthlogWarning`.
+    Any version of a type of ours can be read: fields that were appended later have defaults. If a
+    definition is of no version of the type, a `HearthlogWarning` says so.
 
     Parameters
     ----------
     channel : Channel
     schema : Schema or None
+        Of the channel; None if it has none.
     type_ : str
+        Name of a message type, such as those in `message_types`.
     fields : collection of str
         Paths of the fields that the reader needs.
+
+    Returns
+    -------
+    bool
+        False also if the channel is of another type, or not encoded as CDR.
     """
     if schema is None or schema.name != type_ or channel.message_encoding != ENCODING:
         return False

@@ -97,19 +97,26 @@ class Catalog:
         return len(self.table)
 
     def current(self, path: Path) -> CatalogRow | None:
-        """Return what is said of a file; None if nothing is, or the file was changed since."""
+        """Return the row of a file; None if it has none, or the file was changed since."""
         number = self.find(path)
         return None if number is None else next(self.rows(number, 1))
 
     def span(self, path: Path) -> tuple[int, int] | None:
-        """Return first and last log time of a file; None if only the file can tell."""
+        """Return the time span that the catalogue has for a file.
+
+        Returns
+        -------
+        tuple of int, or None
+            First and last log time, in nanoseconds of UTC; None where `current` is None, or where
+            the row has no times.
+        """
         number = self.find(path)
         if number is None or self._starts[number] == _NEVER:
             return None
         return int(self._starts[number]), int(self._ends[number])
 
     def find(self, path: Path) -> int | None:
-        """Return which row is that of a file; None where `current` is None."""
+        """Return the number of a file's row, from 0; None where `current` is None."""
         try:
             number = self._numbers.get(_relative(path, self.folder))
             size_and_time = None if number is None else _size_and_time(path)
@@ -120,19 +127,49 @@ class Catalog:
         return number
 
     def rows(self, first: int = 0, count: int | None = None) -> Iterator[CatalogRow]:
-        """Go through rows, by default all."""
+        """Read rows of the catalogue.
+
+        Parameters
+        ----------
+        first : int
+            Number of the first row, from 0.
+        count : int, optional
+            How many rows at most; by default all that follow.
+
+        Yields
+        ------
+        CatalogRow
+            In the order of the table.
+        """
         for batch in self._plain.slice(first, count).to_batches(_BATCH):
             for values in batch.to_pylist():
                 yield CatalogRow(**values)
 
     def of_state(self, state: str) -> list[CatalogRow]:
-        """Return the rows of files of one state."""
+        """Return the rows of the files in one state.
+
+        Parameters
+        ----------
+        state : str
+            `FINISHED`, `UNFINISHED` or `DAMAGED`.
+        """
         states = self.table["state"].to_pylist()
         return [row for n, same in enumerate(states) if same == state for row in self.rows(n, 1)]
 
 
 def read_catalog(folder: Path) -> Catalog | None:
-    """Read the catalogue of a folder; None if there is none, or none that can be used."""
+    """Read the catalogue of a folder if there is one that can be used.
+
+    Returns
+    -------
+    Catalog or None
+        None if there is no catalogue, or `load_catalog` refuses it.
+
+    Raises
+    ------
+    LogError
+        If the folder cannot be looked into.
+    """
     try:
         return load_catalog(folder)
     except DataError:
@@ -145,7 +182,9 @@ def load_catalog(folder: Path) -> Catalog | None:
     Raises
     ------
     DataError
-        If it is damaged, or no catalogue as this version makes them.
+        If the catalogue is damaged, or not of this version.
+    LogError
+        If the folder cannot be looked into.
     """
     path = folder / CATALOG
     with store_errors(path):
@@ -163,15 +202,21 @@ def load_catalog(folder: Path) -> Catalog | None:
 def write_catalog(
     folder: Path, before: Catalog | None = None, progress: Progress = ignore_progress
 ) -> Catalog:
-    """Make the catalogue of a folder; in one step it takes the place of the one that is there.
+    """Make the catalogue of a folder, and replace an older one in one step.
 
     Parameters
     ----------
     folder : Path
     before : Catalog, optional
-        Files that are as it says are not read again, damaged ones excepted.
+        An older catalogue: files that are as it says are not read again, damaged ones excepted.
+        By default all files are read.
     progress : callable, optional
-        Is given how many of how many files are done.
+        Is told the share of the files that is done, 0 to 1.
+
+    Returns
+    -------
+    Catalog
+        What was written.
 
     Raises
     ------

@@ -52,18 +52,18 @@ class Contents:
 
 
 def read_contents(path: Path, labelling: str) -> Contents:
-    """Find out what a log holds.
+    """Read what a log holds, without decoding its features.
 
     Parameters
     ----------
     path : Path
     labelling : str
-        `live`, `relabel` or `review`: segments of others are not counted.
+        `live`, `relabel` or `review`; only segments of this labelling are counted.
 
     Raises
     ------
     LogError
-        If what is read of it is damaged.
+        If the log cannot be read, or a part of it that is needed is damaged.
     """
     span = time_span(path)
     with LogFile(path) as file:

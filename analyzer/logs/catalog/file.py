@@ -49,12 +49,34 @@ _GROWTH = 100  # for each one in the file; ours takes up to 15
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """Make a table; times are nanoseconds of UTC."""
+    """Make the table of a catalogue from its rows.
+
+    Parameters
+    ----------
+    rows : sequence of mapping of str to object
+        Values by column of `SCHEMA`; times are int, in nanoseconds of UTC.
+
+    Returns
+    -------
+    pa.Table
+        Of `SCHEMA`.
+    """
     return pa.Table.from_pylist(rows, SCHEMA)
 
 
 def without_times(table: pa.Table) -> pa.Table:
-    """Turn times into numbers: Python has no times with nanoseconds."""
+    """Replace timestamps by numbers, because Python has no times with nanoseconds.
+
+    Parameters
+    ----------
+    table : pa.Table
+        Of `SCHEMA`.
+
+    Returns
+    -------
+    pa.Table
+        The same columns; times are int64, in nanoseconds of UTC.
+    """
     plain = [
         column.cast(pa.int64()) if column.type == _MOMENT else column for column in table.columns
     ]
@@ -62,7 +84,15 @@ def without_times(table: pa.Table) -> pa.Table:
 
 
 def write_table(table: pa.Table, stream: BinaryIO) -> None:
-    """Write a catalogue."""
+    """Write the table of a catalogue as Parquet, with a digest.
+
+    Parameters
+    ----------
+    table : pa.Table
+        Of `SCHEMA`.
+    stream : binary file
+        Is written to, from where it is.
+    """
     buffer = pa.BufferOutputStream()
     pq.write_table(table, buffer, compression="none")
     stream.writelines(sealed(memoryview(buffer.getvalue())))
@@ -72,18 +102,39 @@ def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
     """Put a digest before the footer of a Parquet file, where readers do not look.
 
     Parquet has no checksum of its footer, and Arrow may abort the process on a damaged one.
+
+    Parameters
+    ----------
+    data : memoryview
+        All bytes of a Parquet file.
+
+    Returns
+    -------
+    body, digest, footer : memoryview, bytes, memoryview
+        To be written in this order; the digest is the SHA-256 of the other two.
     """
     footer = _footer(data)
     return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
 
 
 def read_table(stream: BinaryIO) -> pa.Table:
-    """Read a catalogue.
+    """Read the table of a catalogue, and check it.
+
+    Parameters
+    ----------
+    stream : binary file
+        Is read from where it is, up to 1 GiB.
+
+    Returns
+    -------
+    pa.Table
+        Of `SCHEMA`.
 
     Raises
     ------
     ValueError, pa.ArrowException
-        If it is none, of another version, or damaged.
+        If the file is no catalogue, of another version, damaged or compressed, if a value is
+        missing, or if the table would take too much memory.
     """
     data = memoryview(stream.read(_LIMIT))
     footer = _footer(data)

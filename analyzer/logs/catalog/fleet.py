@@ -51,7 +51,13 @@ class LabelAmount:
 
 
 def homes(catalog: Catalog) -> list[HomeSummary]:
-    """Sum up the files of each home."""
+    """Sum up the files of each home.
+
+    Returns
+    -------
+    list of HomeSummary
+        In the order of the names of the homes.
+    """
     table = catalog.table
     logs = pc.equal(table["kind"], LOG)
     counted = pa.table(
@@ -74,7 +80,13 @@ def homes(catalog: Catalog) -> list[HomeSummary]:
 
 
 def label_amounts(catalog: Catalog) -> list[LabelAmount]:
-    """Sum up the labels of each home, the live ones, those of relabellings and of reviews."""
+    """Sum up the labels of each home, by kind of labelling and by model.
+
+    Returns
+    -------
+    list of LabelAmount
+        In the order of home, kind and model; within these the label with most minutes first.
+    """
     table = catalog.table
     lists = table["labels"].combine_chunks()
     labels = pa.Table.from_struct_array(lists.flatten())
