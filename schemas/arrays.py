@@ -15,15 +15,36 @@ Int64 = NDArray[np.int64]
 def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
     """Copy pieces of `size` bytes, at any offsets, out of a buffer.
 
+    Parameters
+    ----------
+    buffer : np.ndarray [shape=(b,)], uint8
+        At least `size` bytes.
+    offsets : np.ndarray [shape=(n,)], int64
+        Bytes of the buffer at which the pieces begin, 0 to b - `size`; pieces may overlap.
+    size : int
+        Bytes of each piece.
+
     Returns
     -------
     np.ndarray [shape=(n,)], of dtype V`size`
+        The pieces, in the order of their offsets in `offsets`.
     """
     return _pieces(buffer, size)[offsets]
 
 
 def scatter(rows: NDArray[np.void], buffer: Bytes, offsets: Int64) -> None:
-    """Copy rows of dtype V`size` to offsets of a buffer, at which they do not overlap."""
+    """Copy rows to offsets of a buffer.
+
+    Parameters
+    ----------
+    rows : np.ndarray [shape=(n,)], of dtype V`size`
+        Pieces of `size` bytes.
+    buffer : np.ndarray [shape=(b,)], uint8
+        At least `size` bytes, which the rows overwrite.
+    offsets : np.ndarray [shape=(n,)], int64
+        Bytes of the buffer at which the rows begin, 0 to b - `size`; they must not
+        overlap there.
+    """
     _pieces(buffer, rows.dtype.itemsize)[offsets] = rows
 
 

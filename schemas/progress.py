@@ -6,4 +6,10 @@ Progress = Callable[[float], None]  # is told the share of the work that is done
 
 
 def ignore_progress(_share: float) -> None:
-    """Do nothing with a report of progress."""
+    """Do nothing with a report of progress.
+
+    Parameters
+    ----------
+    _share : float
+        Share of the work that is done, 0 to 1.
+    """

@@ -4,15 +4,39 @@ from collections.abc import Sequence
 
 
 def printable(text: object) -> str:
-    """Return a text on one line, with spaces in the place of what would steer a terminal."""
+    """Return a text on one line, with spaces in the place of what would steer a terminal.
+
+    Parameters
+    ----------
+    text : object
+        A text, or what `str` makes one of.
+
+    Returns
+    -------
+    str
+        As many characters as the text has, all of them printable.
+    """
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
 def shortened(text: str, length: int) -> str:
-    """Return a text as it can be printed, of at most so many characters."""
+    """Shorten a text to a number of characters, and make it printable.
+
+    Parameters
+    ----------
+    text : str
+    length : int
+        Characters that are returned at most, 1 or more; the last is `…` if the text has more.
+    """
     return printable(text if len(text) <= length else text[: length - 1] + "…")
 
 
 def listed(names: Sequence[str]) -> str:
-    """List alternatives: `a, b or c`."""
+    """List alternatives: `a, b or c`.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Alternatives in the order of the list; without any the list is an empty text.
+    """
     return " or ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

@@ -9,7 +9,24 @@ _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 
 
 def read_time(text: str) -> int:
-    """Read a time, in nanoseconds of UTC; raise ValueError if it is none."""
+    """Read a time in ISO 8601.
+
+    Parameters
+    ----------
+    text : str
+        A date such as `2026-03-01`, or date and time such as `2026-03-01T07:00:00.123456789+01:00`;
+        UTC without an offset, at most nine decimals.
+
+    Returns
+    -------
+    int
+        Nanoseconds of UTC since 1970.
+
+    Raises
+    ------
+    ValueError
+        If the text is no time.
+    """
     rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for them
     moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
     if moment.tzinfo is None:
@@ -19,7 +36,18 @@ def read_time(text: str) -> int:
 
 
 def millisecond_text(nanoseconds: int) -> str:
-    """Write a time in UTC to the millisecond; one that no calendar has as its nanoseconds."""
+    """Write a time in UTC, to the millisecond.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Nanoseconds of UTC since 1970.
+
+    Returns
+    -------
+    str
+        Such as `2026-03-01T07:00:00.123Z`, or `<nanoseconds> ns` if no calendar has the time.
+    """
     try:
         moment = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
     except (OverflowError, ValueError, OSError):
@@ -28,12 +56,34 @@ def millisecond_text(nanoseconds: int) -> str:
 
 
 def time_text(nanoseconds: int) -> str:
-    """Write a time with all nine decimals of its seconds."""
+    """Write a time in UTC, with all nine decimals of its seconds.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Nanoseconds of UTC since 1970, within the years 1 to 9999.
+
+    Returns
+    -------
+    str
+        Such as `2026-03-01T07:00:00.123456789Z`.
+    """
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09}Z"
 
 
 def seconds_text(nanoseconds: int) -> str:
-    """Write nanoseconds as seconds with all nine decimals."""
+    """Write a duration or a time in seconds, with all nine decimals.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        May be negative.
+
+    Returns
+    -------
+    str
+        Such as `-1.500000000`.
+    """
     seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
     return f"{'-' * (nanoseconds < 0)}{seconds}.{rest:09}"

@@ -20,12 +20,32 @@ Result = TypeVar("Result")
 
 
 def is_local(path: object) -> bool:
-    """Tell whether a path is one of this machine; others are `upath.UPath` of a store."""
+    """Tell whether a path is one of this machine.
+
+    Parameters
+    ----------
+    path : Path or upath.UPath
+        A `upath.UPath` is a path of a store.
+    """
     return isinstance(path, Path)
 
 
 def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterable[Result]:
-    """Apply a function to logs, in their order; to several at once where a store has to answer."""
+    """Apply a function to logs, in their order.
+
+    Parameters
+    ----------
+    function : callable
+        Called with the path of each log; in several threads at once if a log is in a store.
+    logs : sequence of Path
+        Logs of this machine or of a store.
+
+    Returns
+    -------
+    iterable
+        Results in the order of the logs, made while they are consumed. An error of the function
+        comes out in the place of its result.
+    """
     if all(map(is_local, logs)):
         return map(function, logs)
     return prefetch(function, logs, _ASKED)
@@ -33,7 +53,18 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
 
 @contextmanager
 def store_errors(path: object) -> Iterator[None]:
-    """Make errors of the store of a path those of this log, but not that of a missing package."""
+    """Turn errors of a store into LogError while its file or folder is used.
+
+    Parameters
+    ----------
+    path : object
+        File or folder that the message names.
+
+    Raises
+    ------
+    LogError
+        If the block raises any error but HearthlogError and ImportError, which pass unchanged.
+    """
     try:
         yield
     except (HearthlogError, ImportError):
@@ -51,7 +82,13 @@ def _line(error: Exception) -> str:
 
 
 class LocalFile:
-    """A file of this machine, open for reading; raise LogError if it cannot be read."""
+    """A file of this machine, open for reading.
+
+    Raises
+    ------
+    LogError
+        If it cannot be opened, or is no regular file.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -70,21 +107,57 @@ class LocalFile:
         os.close(self._descriptor)
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether the file of this name is this one."""
+        """Tell whether a path leads to this open file, and not to another one or none."""
         try:
             return os.path.samestat(os.fstat(self._descriptor), path.stat())
         except FileNotFoundError:
             return False
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read some bytes; fewer at the end of the file."""
+        """Read bytes from an offset on.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file.
+        length : int
+            Bytes to read.
+
+        Returns
+        -------
+        bytes
+            Fewer than `length` at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
+        """
         try:
             return os.pread(self._descriptor, length, offset)
         except OSError as error:
             raise self._unreadable(error) from error
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read as many bytes as there is room for, or fewer at the end; return their number."""
+        """Read bytes from an offset on into a buffer.
+
+        Parameters
+        ----------
+        out : memoryview
+            Filled from its beginning; its length in bytes says how many to read.
+        offset : int
+            Byte of the file.
+
+        Returns
+        -------
+        int
+            Bytes that were read: fewer than there is room for at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
+        """
         try:
             return os.preadv(self._descriptor, [out], offset)
         except OSError as error:
@@ -100,7 +173,7 @@ class StoredFile:
     Raises
     ------
     LogError
-        If it cannot be read, or is another one by now.
+        If the store does not answer, refuses, or has no file of this name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -114,14 +187,33 @@ class StoredFile:
         self._block = self._read_block
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether the file of this name is this one."""
+        """Tell whether a path leads to this file, unchanged since it was opened."""
         try:
             return path == self._path and _identity(path) == self._identity
         except LogError:
             return False
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read some bytes, fewer at the end of the file; few come with their neighbours."""
+        """Read bytes from an offset on, and keep short pieces with their neighbours for later.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file.
+        length : int
+            Bytes to read.
+
+        Returns
+        -------
+        bytes
+            Fewer than `length` at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the store does not answer, refuses, or returns another number of bytes, as it may do
+            after the file has changed.
+        """
         end = min(offset + length, self.size)
         if end - offset >= _BLOCK:
             return self._fetch(offset, end)
@@ -130,7 +222,26 @@ class StoredFile:
         return read[offset % _BLOCK :][: max(end - offset, 0)]
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read as many bytes as there is room for, or fewer at the end; return their number."""
+        """Read bytes from an offset on into a buffer.
+
+        Parameters
+        ----------
+        out : memoryview
+            Filled from its beginning; its length in bytes says how many to read.
+        offset : int
+            Byte of the file.
+
+        Returns
+        -------
+        int
+            Bytes that were read: fewer than there is room for at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the store does not answer, refuses, or returns another number of bytes, as it may do
+            after the file has changed.
+        """
         read = self.read(offset, len(out))
         out[: len(read)] = read
         return len(read)
@@ -160,12 +271,31 @@ def _identity(path: Any) -> dict[str, Any]:
 
 
 def open_file(path: Path) -> LocalFile | StoredFile:
-    """Open a file for reading by ranges; raise LogError if it cannot be read."""
+    """Open a file for reading by ranges.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Raises
+    ------
+    LogError
+        If the file cannot be opened.
+    """
     return LocalFile(path) if is_local(path) else StoredFile(path)
 
 
 class Section(io.RawIOBase):
-    """A file from some place on, as a stream."""
+    """A file from some byte on, as a stream.
+
+    Parameters
+    ----------
+    file : LocalFile or StoredFile
+        Stays open when the stream is closed.
+    start : int
+        Byte of the file at which the stream begins.
+    """
 
     def __init__(self, file: LocalFile | StoredFile, start: int) -> None:
         super().__init__()
@@ -177,7 +307,23 @@ class Section(io.RawIOBase):
         return True
 
     def readinto(self, out: Any) -> int:
-        """Read the next bytes."""
+        """Read the next bytes into a buffer.
+
+        Parameters
+        ----------
+        out : buffer
+            Filled from its beginning; its length in bytes says how many to read.
+
+        Returns
+        -------
+        int
+            Bytes that were read; 0 at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
+        """
         count = self._file.read_into(memoryview(out), self._position)
         self._position += count
         return count

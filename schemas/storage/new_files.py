@@ -20,7 +20,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a file's creation or renaming in this folder survive a power cut."""
+    """Make what was created or renamed in a folder survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -30,7 +30,18 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep out other processes that lock this folder; raises OSError if it cannot be opened."""
+    """Hold a lock on a folder, which keeps out other processes that lock it.
+
+    Parameters
+    ----------
+    folder : Path
+        A folder of this machine. The lock is waited for without limit.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be opened.
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -40,9 +51,20 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 
 def check_new(path: Path) -> None:
-    """Raise LogError unless a file or folder can be made under this name.
+    """Check that a file or folder can be made under this name.
 
     Whether a store lets us write is known only when we do.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Raises
+    ------
+    LogError
+        If something of this name exists; on this machine, also if the folder around it does not
+        exist or cannot be written to; in a store, also if it does not answer or refuses.
     """
     if not is_local(path):
         stored: Any = path
@@ -65,12 +87,22 @@ def _exists(path: Path) -> LogError:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Make a file: yield a temporary name to write to, and give it its own when that went well.
+    """Make a file under a temporary name, and give it its own if the block raises no error.
 
     For a path in a store the temporary file is one of this machine, and is put there at the end.
     S3 shows it whole or not at all, and refuses to put it over another one. That is not sure of
     every store: between a last look and the end of putting, another file of this name may be
     replaced, and a store that has real folders may keep a part of a file when it is cut off.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Yields
+    ------
+    Path
+        Temporary name, of this machine, to write the file to.
 
     Raises
     ------
@@ -87,6 +119,16 @@ def new_file(path: Path) -> Iterator[Path]:
 def replaced_file(path: Path) -> Iterator[Path]:
     """Make a file as `new_file` does, or put it in one step in the place of the one that is there.
 
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Yields
+    ------
+    Path
+        Temporary name, of this machine, to write the file to.
+
     Raises
     ------
     LogError
@@ -99,7 +141,23 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder as `new_file` makes a file; raises LogError as it does."""
+    """Make a folder under a temporary name, and give it its own if the block raises no error.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine.
+
+    Yields
+    ------
+    Path
+        The temporary folder, for files but no folders.
+
+    Raises
+    ------
+    LogError
+        If something of this name exists, or the folder cannot be written.
+    """
     check_new(path)
     with _temporary(path) as temporary:
         temporary.mkdir()

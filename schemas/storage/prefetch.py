@@ -12,15 +12,23 @@ Result = TypeVar("Result")
 def prefetch(
     function: Callable[[Item], Result], items: Iterable[Item], workers: int
 ) -> Generator[Result, None, None]:
-    """Apply a function to items in threads, few ahead of the consumer; yield results in order.
+    """Apply a function to items in threads, a few items ahead of the consumer.
 
     Parameters
     ----------
     function : callable
-        Should spend its time where the interpreter is not needed: reading, decompressing, numpy.
+        Called with one item. Should spend its time where the interpreter is not needed: reading,
+        decompressing, numpy.
     items : iterable
+        Is consumed in the caller's thread.
     workers : int
-        Threads; one item more than these is worked on, or waits for the consumer.
+        Threads, 1 or more; one item more than these is worked on, or waits for the consumer.
+
+    Yields
+    ------
+    object
+        Results in the order of the items. An error of the function comes out in the place of its
+        result.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()

@@ -7,7 +7,16 @@ from pathlib import Path
 
 
 def open_regular(path: Path) -> int:
-    """Open a file of this machine for reading, and return its descriptor.
+    """Open a regular file of this machine for reading.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    int
+        The file's descriptor, for the caller to close.
 
     Raises
     ------
@@ -23,7 +32,17 @@ def open_regular(path: Path) -> int:
 
 
 def may_be_regular(path: Path) -> bool:
-    """Tell whether this is a regular file, or one that cannot be looked at: reading it says why."""
+    """Tell whether a path is that of a regular file, or of one whose kind cannot be found out.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+        True, too, if there is no such file or its folder cannot be read: opening it says why.
+    """
     try:
         return stat.S_ISREG(path.stat().st_mode)
     except OSError:

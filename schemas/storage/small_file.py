@@ -19,12 +19,19 @@ def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -
     Parameters
     ----------
     path : Path
+        On this machine, or a `upath.UPath` of a store.
     what : str
-        What it should be, for the message.
+        What it should be, for the message: `scenario file`.
     limit : int
         Bytes, at most.
     error : type of HearthlogError
-        Raised if there is no such file, or it is larger or cannot be read.
+        Type of the error that is raised.
+
+    Raises
+    ------
+    HearthlogError
+        Of the type `error`, if there is no such file, it is larger than the limit, cannot be read,
+        or is no regular file.
     """
     try:
         if not path.exists():
@@ -44,9 +51,27 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
-    """Read a TOML file; parameters as of `read_whole`.
+    """Read a TOML file of at most 1 MB.
 
-    Raise `error` if it cannot be read, is larger than 1 MB, nested too deeply, or no TOML in UTF-8.
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+    what : str
+        What it should be, for the message: `scenario file`.
+    error : type of HearthlogError
+        Type of the error that is raised.
+
+    Returns
+    -------
+    dict of str to object
+        The content, tables as dictionaries.
+
+    Raises
+    ------
+    HearthlogError
+        Of the type `error`, if there is no such file, it is larger than 1 MB, cannot be read, is
+        nested too deeply, or is no TOML in UTF-8.
     """
     data = read_whole(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
