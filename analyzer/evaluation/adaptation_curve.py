@@ -42,12 +42,19 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
     data : Dataset
     method : Method
     progress : callable
-        Told the share of the fits that is done.
+        Told the share of the fits that is done, 0 to 1.
+
+    Returns
+    -------
+    AdaptationCurve
+        Means of three divisions of each collection into segments to correct and segments to be
+        tried on.
 
     Raises
     ------
     DataError
-        If no collection is large and varied enough to stand for a home.
+        If no collection is large and varied enough to stand for a home, or the method wants
+        augmented copies and its feature set has none.
     """
     names = data.collection_names
     chosen = [number for number in range(len(names)) if _is_like_a_home(data, number)]

@@ -76,13 +76,15 @@ def compare_models(
     ----------
     a, b : Model
     recordings : iterable of Recording
+        With features of the set of both models.
     scenario : Scenario
         With the classes of both.
 
     Raises
     ------
     DataError
-        If the classes of a model are not those of the scenario, or there is no segment.
+        If the classes of a model are not those of the scenario, the models are for different
+        feature sets, or there is no segment.
     """
     check_classes(a, scenario)
     check_classes(b, scenario)

@@ -28,7 +28,13 @@ class LabelRuns(NamedTuple):
     b: Int64
 
     def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "LabelRuns":
-        """Return some of them."""
+        """Return some of the runs.
+
+        Parameters
+        ----------
+        which : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
+            Whether each is taken, or the rows of those that are, in their new order.
+        """
         return LabelRuns(*(column[which] for column in self))
 
 
@@ -75,6 +81,16 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> Difference:
 
     What b has by another name (see `hearthlog.models.classes`) is called as a calls it.
 
+    Parameters
+    ----------
+    a, b : NamedLabelling
+        Each has one label at a time.
+
+    Returns
+    -------
+    Difference
+        With Cohen's kappa; the classes are those of a, then those that only b has.
+
     Raises
     ------
     DataError
@@ -108,7 +124,20 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> Difference:
 
 
 def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
-    """Join successive pieces whose labels are the same; they may be a frame apart."""
+    """Join successive pieces whose labels are the same; they may be a frame apart.
+
+    Parameters
+    ----------
+    pieces : Overlay
+        Of `a` and `b`, where both have a span; at least one piece.
+    a, b : Events
+        The spans behind its rows, labels as indices of the same classes.
+
+    Returns
+    -------
+    LabelRuns
+        In the order of time.
+    """
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)
     new[1:] = (

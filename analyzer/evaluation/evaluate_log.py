@@ -59,14 +59,15 @@ def evaluate_labelling(
         May have several labels at a time, and other names for the classes (see
         `hearthlog.models.classes`).
     predicted : Labelling
-        Has one at a time.
+        Has one at a time, each of `classes`.
     classes : sequence of str
         What the log may be labelled with.
 
     Raises
     ------
     DataError
-        If the two have no time in common, or the reference no label that the log knows.
+        If the two have no time in common; if the reference has no label that the log knows, or no
+        frame with a single one; or if so many events start together that this is no labelling.
     """
     covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
     spans = common(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
@@ -165,17 +166,24 @@ def read_reference(source: str, path: Path, microphone: str) -> Labelling:
     Parameters
     ----------
     source : str
-        A label file, or `review` for the review layers.
+        Path of a label file, or `review` for the review layers.
     path : Path
         The log, or folder of logs.
     microphone : str
+        Labels of other microphones are left out.
+
+    Returns
+    -------
+    Labelling
+        In the order of the file or the layers.
 
     Raises
     ------
     DataError
-        If there is no such file, it is no label file, or nobody has reviewed the logs.
+        If there is no such file, it is no label file, it has no label of the microphone or a time
+        that no log has, the logs have no features, or nobody has reviewed them.
     LogError
-        If a log or a layer is damaged.
+        If there is no log, or a log or a layer is damaged.
     """
     if source == REVIEW:
         marks = [mark for log in find_logs(path) for mark in read_marks(log)]

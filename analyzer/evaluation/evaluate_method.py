@@ -43,16 +43,17 @@ def evaluate_method(
     data : Dataset
     method : Method
     kind : str
-        What is never on both sides of a fold: a `segment` (the paper's folds, which flatter,
-        since segments of one recording are alike), a `source`, or a `collection`, which is what
-        a new home is.
+        What is never on both sides of a fold: a `segment` (the paper's folds, which flatter, since
+        segments of one recording are alike), a `source`, or a `collection`, which is what a new
+        home is.
     progress : callable
-        Told the share of the folds that is done.
+        Told the share of the folds that is done, 0 to 1.
 
     Raises
     ------
     DataError
-        If there are too few sources or collections.
+        If all segments are alike, if the method wants augmented copies and its feature set has
+        none, and as `divide`.
     """
     check_varied(data)
     folds = divide(data, kind)
@@ -70,10 +71,23 @@ def evaluate_method(
 def divide(data: Dataset, kind: Kind) -> list[Fold]:
     """Divide segments into folds, of which a `kind` is never on both sides.
 
+    Parameters
+    ----------
+    data : Dataset
+    kind : str
+        `segment`, `source` or `collection`.
+
+    Returns
+    -------
+    list of Fold
+        For each the rows that are learned from, and those that are tried; each row is tried once.
+
     Raises
     ------
     DataError
-        If there are too few sources or collections.
+        If a class has fewer than five segments (`segment`) or comes from fewer than two groups
+        (`source`), if there is one collection (`collection`), or if a fold leaves too few classes
+        to learn from.
     """
     if kind == "source":
         return group_folds(data)

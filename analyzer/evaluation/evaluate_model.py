@@ -45,9 +45,9 @@ def evaluate_model(
     model : Model
     clips : sequence of LabelledClip
     scenario : Scenario
-        With the classes of the model.
+        With the classes of the model, in any order.
     progress : callable
-        Told the share of the clips that is done.
+        Told the share of the clips that is done, 0 to 1.
 
     Raises
     ------
@@ -82,7 +82,18 @@ def evaluate_model(
 
 
 def check_classes(model: Model, scenario: Scenario) -> None:
-    """Raise DataError unless a model has the classes of a scenario, in any order."""
+    """Raise DataError unless a model has the classes of a scenario, in any order.
+
+    Parameters
+    ----------
+    model : Model
+    scenario : Scenario
+
+    Raises
+    ------
+    DataError
+        If one of the two has a class that the other lacks.
+    """
     lacking = [name for name in scenario.classes if name not in model.classes]
     other = [name for name in model.classes if name not in scenario.classes]
     if lacking or other:

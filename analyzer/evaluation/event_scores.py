@@ -39,16 +39,35 @@ class Events:
         return len(self.starts)
 
     def of(self, label: int) -> "Events":
-        """Return those of one label."""
+        """Return the spans of one label.
+
+        Parameters
+        ----------
+        label : int
+            Index of the class.
+        """
         return self.taken(np.flatnonzero(self.labels == label))
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
-        """Return some of them."""
+        """Return some of the spans.
+
+        Parameters
+        ----------
+        rows : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
+            Whether each is taken, or the rows of those that are, in their new order.
+        """
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
 
 def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
-    """Return the spans of a labelling, their labels as indices of `classes`."""
+    """Return the spans of a labelling, with their labels as indices.
+
+    Parameters
+    ----------
+    labelling : Labelling
+    classes : sequence of str
+        With every label of the labelling.
+    """
     indices = {name: i for i, name in enumerate(classes)}
     labels = np.fromiter(map(indices.__getitem__, labelling.labels), np.int64, len(labelling))
     return Events(labelling.starts, labelling.ends, labels)
@@ -96,6 +115,7 @@ def detect(
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
     classes : sequence of str
+        The names behind their labels.
     duration : int
         Evaluated time in nanoseconds.
 
@@ -114,13 +134,20 @@ def detect(
 def laid_out(events: Events, spans: Spans) -> Events:
     """Cut events to spans of time, and lay the spans out as recordings one after the other.
 
-    Every span begins on a whole second, and at least one second after the end of the last: no
-    event is compared with one of another span.
+    Every span begins on a whole second, and at least one second after the end of the last: no event
+    is compared with one of another span.
 
     Parameters
     ----------
     events : Events
+        In nanoseconds of UTC.
     spans : Spans
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    Events
+        In nanoseconds from 0 on, in the order of `events`; an event may come in several pieces.
     """
     seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
@@ -132,11 +159,14 @@ def laid_out(events: Events, spans: Spans) -> Events:
 def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score second by second: a class is active in each second that one of its events touches.
 
+    These are the segment-based metrics of Mesaros et al. (2016), with segments of a second.
+
     Parameters
     ----------
     reference, predicted : Events
         From 0 on, as `laid_out` makes them.
     classes : sequence of str
+        The names behind their labels.
     """
     counts = []
     for label in range(len(classes)):
@@ -153,13 +183,16 @@ def _seconds(events: Events) -> Spans:
 def event_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score event by event, each matched with at most one.
 
-    Two events match if their onsets are at most 0.2 s apart, and their offsets at most 0.2 s or
-    half the length of the reference's, whichever is more. As many as possible are matched.
+    These are the event-based metrics of Mesaros et al. (2016). Two events match if their onsets are
+    at most 0.2 s apart, and their offsets at most 0.2 s or half the length of the reference's,
+    whichever is more. As many as possible are matched.
 
     Parameters
     ----------
     reference, predicted : Events
+        From 0 on, as `laid_out` makes them.
     classes : sequence of str
+        The names behind their labels.
 
     Raises
     ------
@@ -198,14 +231,16 @@ def false_alarms_per_day(
     Parameters
     ----------
     reference, predicted : Events
+        From 0 on, as `laid_out` makes them.
     classes : sequence of str
+        The names behind their labels.
     duration : int
-        Evaluated time in nanoseconds.
+        Evaluated time in nanoseconds, more than 0.
 
     Returns
     -------
     dict of str to float
-        For 24 hours of evaluated time.
+        By class: how many there are in 24 hours of evaluated time.
     """
     alarms = (_false_alarms(reference.of(i), predicted.of(i)) for i in range(len(classes)))
     return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}

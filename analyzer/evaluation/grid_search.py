@@ -24,10 +24,11 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
     ----------
     data : Dataset
     methods : list of Method
+        At least one; all have the same feature set and make the same copies.
     by : str
-        What is never on both sides of a fold: see `analyzer.evaluation.folds.evaluate_method`.
+        What is never on both sides of a fold: `segment`, `source` or `collection`.
     progress : callable
-        Told the share of the fits that is done.
+        Told the share of the fits that is done, 0 to 1.
 
     Returns
     -------
@@ -37,7 +38,8 @@ def search(data: Dataset, methods: list[Method], by: Kind, progress: Progress) -
     Raises
     ------
     DataError
-        If there are too few sources or collections.
+        If all segments are alike, if the methods want augmented copies and their feature set has
+        none, and as `divide`.
     """
     check_varied(data)
     folds, examples = divide(data, by), prepare(methods[0], data)

@@ -18,6 +18,15 @@ _NAME_WIDTH = 16
 def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) -> None:
     """Draw the confusion matrix, F1 by class and, if there are bins, the reliability diagram.
 
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file, which must not exist.
+    title : str
+    scores : Scores
+    bins : sequence of Bin, optional
+        From `reliability`.
+
     Raises
     ------
     LogError

@@ -20,7 +20,18 @@ class Usual(NamedTuple):
 
 
 def usual(values: Sequence[Value | None]) -> Usual | None:
-    """Return what is usual; None if there are too few days."""
+    """Return what is usual; None if there are too few days.
+
+    Parameters
+    ----------
+    values : sequence of (Count, Minutes, Clock or None)
+        The same figure on each day; None where it is not known.
+
+    Returns
+    -------
+    Usual or None
+        Of the `middle` of each value; None if fewer than seven days have one.
+    """
     numbers = [value.middle for value in values if value is not None]
     if len(numbers) < FEWEST:
         return None
@@ -29,6 +40,12 @@ def usual(values: Sequence[Value | None]) -> Usual | None:
 
 def compared(value: Value, baseline: Usual) -> int:
     """Compare a figure, as far as it is sure, with what is usual.
+
+    Parameters
+    ----------
+    value : Count, Minutes or Clock
+    baseline : Usual
+        Of the same kind of figure.
 
     Returns
     -------

@@ -16,13 +16,25 @@ _MONTHS = (
 
 
 def in_words(label: str) -> str:
-    """Name a class as people would."""
+    """Name a class as people would.
+
+    Parameters
+    ----------
+    label : str
+        A name of the class, in any spelling; that of an unknown class is written without `_`.
+    """
     row = find_class(label)
     return label.replace("_", " ").capitalize() if row is None else row.words
 
 
 def several_in_words(label: str) -> str:
-    """Name events of a class as people would who count them."""
+    """Name the events of a class as people who count them would.
+
+    Parameters
+    ----------
+    label : str
+        A name of the class, in any spelling.
+    """
     row = find_class(label)
     return (row.several if row else "") or in_words(label)
 
@@ -43,17 +55,41 @@ def short_day(day: date) -> str:
 
 
 def clock_text(nanoseconds: int, zone: tzinfo) -> str:
-    """Write the time of day."""
+    """Write the time of day: `07:05`.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC.
+    zone : tzinfo
+        Of the home.
+    """
     return f"{local_time(nanoseconds, zone):%H:%M}"
 
 
 def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
-    """List times of day; where they are many, the first and how many more."""
+    """List times of day; where they are many, the first and how many more.
+
+    Parameters
+    ----------
+    starts : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC, in any order.
+    zone : tzinfo
+        Of the home.
+    most : int, optional
+        Number of times that are listed, at most.
+    """
     shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
     more = len(starts) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
 
 
 def listed(items: list[str]) -> str:
-    """Put items in a sentence: `a, b and c`."""
+    """Put items in a sentence: `a, b and c`.
+
+    Parameters
+    ----------
+    items : list of str
+        Of none the sentence is empty.
+    """
     return " and ".join([*([", ".join(items[:-1])] if items[:-1] else []), *items[-1:]])

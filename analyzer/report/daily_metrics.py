@@ -44,7 +44,13 @@ class CountedEvents(NamedTuple):
     chances: NDArray[np.float64]  # shape (n,), of each that it happened
 
     def between(self, spans: Spans) -> "CountedEvents":
-        """Leave those that began in some spans of time."""
+        """Return the events that began in some spans of time.
+
+        Parameters
+        ----------
+        spans : Spans
+            In nanoseconds of UTC.
+        """
         of = np.searchsorted(spans.starts, self.starts, side="right") - 1
         inside = of >= 0
         inside[inside] = self.starts[inside] < spans.ends[of[inside]]
@@ -72,7 +78,13 @@ class HomeMetrics:
     events: dict[str, CountedEvents]
 
     def between(self, start: int, end: int) -> "HomeMetrics":
-        """Leave what was heard in a span of time."""
+        """Return what was heard in a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; an event belongs to the span that it begins in.
+        """
         return HomeMetrics(
             self.classes,
             cut(self.coverage, start, end),
@@ -131,45 +143,88 @@ class Day:
 
     @property
     def share(self) -> float:
-        """How much of the day was heard, 0 to 1."""
+        """Share of the day that was heard, 0 to 1."""
         return self.coverage.length / self.span.length
 
     @property
     def night_hours(self) -> float:
-        """How much of the night was heard."""
+        """Hours of the night that were heard."""
         return common(self.home.coverage, self.night).length / HOUR
 
     def comparable(self, name: str = "") -> bool:
-        """Tell whether most of the day and of its night was heard; of all classes by default."""
+        """Tell whether three quarters of the day, and of its night, were heard.
+
+        Parameters
+        ----------
+        name : str, optional
+            A class of the home: what was heard by microphones whose model knows it; by default the
+            class that is worst off.
+        """
         spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
         wholes = self.span, self.night
         shares = [common(each, whole).length / whole.length for each in spans for whole in wholes]
         return min(shares) >= MOST
 
     def share_of(self, name: str) -> float:
-        """How much of the day a class would have been heard, 0 to 1."""
+        """Return the share of the day in which a class would have been heard, 0 to 1.
+
+        Parameters
+        ----------
+        name : str
+            Of the class; 0 for one that the home does not know.
+        """
         return common(self.home.listened.get(name, NONE), self.span).length / self.span.length
 
     def minutes(self, name: str) -> Minutes | None:
-        """For how long a class was heard; None if it could not be."""
+        """Return for how long a class was heard; None if it could not be.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        """
         if not self.share_of(name):
             return None
         return _minutes(common(self.home.spans.get(name, NONE), self.span))
 
     def events(self, name: str) -> CountedEvents:
-        """Events of a class that began on this day."""
+        """Return the events of a class that began on this day.
+
+        Parameters
+        ----------
+        name : str
+            Of the class; one without events, such as silence, has none.
+        """
         return _of(self.home, name).between(self.span)
 
     def night_events(self, name: str) -> CountedEvents:
-        """Events of a class that began in the night."""
+        """Return the events of a class that began in the night.
+
+        Parameters
+        ----------
+        name : str
+            Of the class; one without events, such as silence, has none.
+        """
         return _of(self.home, name).between(self.night)
 
     def count(self, name: str) -> Count | None:
-        """How often a class was heard; None if it could not be."""
+        """Return how often a class was heard on this day; None if it could not be.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        """
         return self.events(name).number if self.share_of(name) else None
 
     def night_count(self, name: str) -> Count | None:
-        """How often it was heard in the night; None if it could not be."""
+        """Return how often a class was heard in the night; None if it could not be.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        """
         listened = common(self.home.listened.get(name, NONE), self.night).length > 0
         return self.night_events(name).number if listened else None
 
@@ -185,7 +240,10 @@ class Day:
 
     @property
     def night_stretches(self) -> Count:
-        """How often there was sound in the night: stretches with ten quiet minutes between."""
+        """Number of stretches of sound in the night, with ten quiet minutes between them.
+
+        A stretch has at least half a minute of sound.
+        """
         sound = common(self.home.sound, self.night)
         stretches = joined(*sound, _STRETCH_PAUSE)
         if not len(stretches.starts):
@@ -195,13 +253,13 @@ class Day:
 
     @property
     def hours(self) -> Int64:
-        """Edges of the hours of the day, in nanoseconds of UTC: 24 to 26 of them."""
+        """Edges of the hours of the day, in nanoseconds of UTC; 24 to 26 of them."""
         start, end = self.span.starts[0], self.span.ends[0]
         return np.append(np.arange(start, end, HOUR), end)
 
     @property
     def sound_by_hour(self) -> NDArray[np.float64]:
-        """Minutes with sound in each of these hours."""
+        """Minutes with sound between each two successive edges of `hours`."""
         return lengths(self.home.sound, self.hours) / _MINUTE
 
     @property
@@ -216,23 +274,23 @@ class Day:
 
     @property
     def quiet(self) -> Minutes | None:
-        """How long that was."""
+        """Length of `longest_quiet`; None if nothing of the day was heard."""
         return _minutes(self.longest_quiet) if self.coverage.length else None
 
     @property
     def active(self) -> Int64:
-        """Starts of the ten minutes with a minute of sound, from four o'clock on."""
+        """Starts of the ten minutes with a minute of sound, from four o'clock on, in ns of UTC."""
         edges = np.arange(at_hour(self.day, _RISING, self.zone), self.span.ends[0] + 1, _BIN)
         return edges[:-1][lengths(self.home.sound, edges) >= _BUSY]
 
     @property
     def first(self) -> Clock | None:
-        """When the day began to be lively."""
+        """Start of the first of the `active` ten minutes; None if there are none."""
         return self._clock(self.active[:1])
 
     @property
     def last(self) -> Clock | None:
-        """When it ended to be."""
+        """Last minute of the last of the `active` ten minutes; None if there are none."""
         return self._clock(self.active[-1:] + _BIN - _MINUTE)
 
     def _clock(self, times: Int64) -> Clock | None:
@@ -243,7 +301,16 @@ class Day:
 
 
 def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
-    """Look at one day of a home."""
+    """Return the figures of one day of a home.
+
+    Parameters
+    ----------
+    home : HomeMetrics
+    day : date
+        By the clock of the home; its night is from 22:00 on the day before to 07:00.
+    zone : tzinfo
+        Of the home.
+    """
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
     span = one(start, end)

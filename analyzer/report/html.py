@@ -33,7 +33,20 @@ class PageTable(NamedTuple):
 
 
 def fill_page(picture: bytes, **parts: Any) -> str:
-    """Fill the template; all text is escaped, and the picture is in the page itself."""
+    """Fill the template; all text is escaped, and the picture is in the page itself.
+
+    Parameters
+    ----------
+    picture : bytes
+        A PNG file.
+    **parts
+        By the names that the template has for them; none may be lacking.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,

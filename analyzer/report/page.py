@@ -49,7 +49,20 @@ class Part(NamedTuple):
 
 
 def day_page(account: Account, picture: bytes) -> str:
-    """Write the page of a day."""
+    """Write the page of a day.
+
+    Parameters
+    ----------
+    account : Account
+        Of one day.
+    picture : bytes
+        A PNG file.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
     day = account.days[0]
     names = [name for name in account.classes if name != SILENCE]
     return _page(
@@ -64,7 +77,20 @@ def day_page(account: Account, picture: bytes) -> str:
 
 
 def week_page(account: Account, picture: bytes) -> str:
-    """Write the page of a week."""
+    """Write the page of a week.
+
+    Parameters
+    ----------
+    account : Account
+        Of seven days.
+    picture : bytes
+        A PNG file.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{class_words.date_in_words(first)} to {class_words.date_in_words(last)}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]

@@ -56,7 +56,13 @@ class HomeData:
     losses: list[str] = field(default_factory=list)  # what could not be read, and why
 
     def lose(self, line: str) -> None:
-        """Note what could not be read."""
+        """Note what could not be read, once.
+
+        Parameters
+        ----------
+        line : str
+            The file, and why.
+        """
         if line not in self.losses:
             self.losses.append(line)
 
@@ -74,19 +80,27 @@ def read_home(
     ----------
     logs : HomeLogs
     labelling : str
-        `live`, or the model of relabel layers.
+        `live`, or the name of the model of relabel layers.
     since : int
-        From when on segments are wanted, in nanoseconds of UTC.
+        Log time from which on segments are read, in nanoseconds of UTC.
     close : (int, int)
-        The days that are reported: of them gaps and troubles are wanted too.
+        Start and end, in nanoseconds of UTC, of the days that are reported: of them gaps and
+        troubles are read too.
     progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
+
+    Returns
+    -------
+    HomeData
+        What could not be read is in its `losses`.
 
     Raises
     ------
     DataError
         If there is no such labelling, or no label at all in these days.
     LogError
-        If segments overlap, or cannot be.
+        If segments overlap, begin before 1970, or have labels that are too many or cannot be names
+        of classes.
     """
     layer = _layer(logs, labelling)
     home = HomeData(losses=list(logs.losses))

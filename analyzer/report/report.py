@@ -56,10 +56,11 @@ def make_report(
     logs : HomeLogs
     period : Period
     page : Path
-        Of the HTML file; the picture is beside it, with the suffix `.png`.
+        Of the HTML file; the picture is beside it, with the suffix `.png`. Neither may exist.
     labelling : str, optional
-        `live`, or the model of relabel layers.
+        `live`, or the name of the model of relabel layers.
     progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
 
     Raises
     ------

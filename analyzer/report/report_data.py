@@ -54,7 +54,18 @@ class Account:
         return len(self.earlier) >= FEWEST
 
     def baseline(self, figure: Figure) -> tuple[Usual, Value] | None:
-        """Return what is usual, and a value that can write it; None if there are too few days."""
+        """Return what is usual, and a value that can write it; None if there are too few days.
+
+        Parameters
+        ----------
+        figure : Figure
+
+        Returns
+        -------
+        (Usual, Value) or None
+            Of the earlier days of which most was heard; None if fewer than seven of them know the
+            figure.
+        """
         days = [day for day in self.earlier if day.comparable(figure.name)]
         values = [value for day in days if (value := figure.value(day)) is not None]
         baseline = usual(values)

@@ -31,7 +31,13 @@ class FigureSection(NamedTuple):
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:
-    """Return the tables, for the classes that the model of a home knows."""
+    """Return the tables, for the classes that the model of a home knows.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        A figure of any other class is left out.
+    """
     return [
         FigureSection(
             "Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)
@@ -42,13 +48,27 @@ def sections(classes: Sequence[str]) -> list[FigureSection]:
 
 
 def minutes_of(name: str) -> Figure:
-    """Return for how long a class was heard."""
+    """Return the figure that says for how long a class was heard.
+
+    Parameters
+    ----------
+    name : str
+        Of the class.
+    """
     title = in_words(name)
     return Figure(title, title, lambda day: day.minutes(name), name)
 
 
 def events_of(name: str, title: str = "") -> Figure:
-    """Return how often a class was heard."""
+    """Return the figure that says how often a class was heard.
+
+    Parameters
+    ----------
+    name : str
+        Of the class.
+    title : str, optional
+        By default the class in words.
+    """
     title = title or in_words(name)
     return Figure(title, title, lambda day: day.count(name), name)
 

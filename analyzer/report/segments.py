@@ -31,10 +31,16 @@ class Segments(NamedTuple):
 def segments_of(parts: Sequence[Columns]) -> Segments:
     """Join the segments of a microphone; each class has one name, whatever logs call it.
 
+    Parameters
+    ----------
+    parts : sequence of Columns
+        Segments of one topic, with stamp, duration, label and confidence; at least one part.
+
     Raises
     ------
     LogError
-        If they overlap, or cannot be.
+        If they overlap, begin before 1970, are of different types, or have labels that are too many
+        or cannot be names of classes.
     """
     columns = segments_in_order(join(parts))
     starts, labels = columns["header.stamp"], columns["label"]
@@ -50,7 +56,18 @@ def segments_of(parts: Sequence[Columns]) -> Segments:
 
 
 def segments_of_marks(marks: Sequence[Mark]) -> Segments:
-    """Make segments of marks, in the order of time."""
+    """Make segments of marks, in the order of time.
+
+    Parameters
+    ----------
+    marks : sequence of Mark
+        Of one microphone, in any order.
+
+    Returns
+    -------
+    Segments
+        With a confidence of 1.
+    """
     ordered = sorted(marks, key=lambda mark: mark.start)
     return Segments(
         np.array([mark.start for mark in ordered], np.int64),
@@ -61,7 +78,18 @@ def segments_of_marks(marks: Sequence[Mark]) -> Segments:
 
 
 def corrected(segments: Segments, marks: Segments) -> Segments:
-    """Put what a reviewer says in the place of what a model said."""
+    """Put what a reviewer says in the place of what a model said.
+
+    Parameters
+    ----------
+    segments, marks : Segments
+        Of one microphone.
+
+    Returns
+    -------
+    Segments
+        All marks, and the parts of segments outside of them.
+    """
     left, rows = remains(segments, marks.spans)
     starts = np.concatenate([left.starts, marks.starts])
     order = np.argsort(starts, kind="stable")

@@ -26,7 +26,14 @@ _MINUTE = HOUR // 60
 
 
 def gist_of_day(account: Account, day: Day) -> Iterator[str]:
-    """Say in a few lines what matters."""
+    """Sum up a day in a few sentences, and compare it with earlier days.
+
+    Parameters
+    ----------
+    account : Account
+    day : Day
+        One of its days.
+    """
     minutes = Minutes(day.coverage.length / _MINUTE).text
     yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}"
     yield _changes(account, day)
@@ -37,7 +44,7 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
-    """Say in a few lines what matters."""
+    """Sum up a week in a few sentences, and compare it with earlier days."""
     days = [day for day in account.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
     yield f"Heard: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
@@ -55,7 +62,7 @@ def gist_of_week(account: Account) -> Iterator[str]:
 
 
 def not_heard(account: Account) -> Iterator[str]:
-    """State how much was not heard, and why; the first line says how much in all."""
+    """Say how much was not heard, and why; the first line says how much in all."""
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
     if missing >= _MINUTE:
@@ -76,7 +83,7 @@ def not_heard(account: Account) -> Iterator[str]:
 
 
 def not_well(account: Account) -> Iterator[str]:
-    """State what the box said of itself, where gaps do not say it already."""
+    """Say which troubles the box reported, where gaps do not say it already."""
     told = {gap.text for gap in account.gaps}
     troubles = [trouble for trouble in account.troubles if trouble.text not in told]
     if troubles:
@@ -86,7 +93,7 @@ def not_well(account: Account) -> Iterator[str]:
 
 
 def longest_quiet(day: Day) -> str:
-    """Say when the longest quiet stretch of the day was."""
+    """Say when the longest quiet stretch of the day was; nothing if it was under a minute."""
     quiet = day.longest_quiet
     if day.quiet is None or day.quiet.minutes < 1:
         return ""
@@ -95,14 +102,26 @@ def longest_quiet(day: Day) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share."""
+    """Write a share: `12 %`.
+
+    Parameters
+    ----------
+    share : float
+        0 to 1.
+    """
     if 0 < share < 0.005:
         return "less than 1 %"
     return "more than 99 %" if 0.995 <= share < 1 else f"{100 * share:.0f} %"
 
 
 def plain(name: str) -> str:
-    """Write a name as people do."""
+    """Write a name as people do, with spaces for `_`.
+
+    Parameters
+    ----------
+    name : str
+        Of a microphone, or of a source of trouble.
+    """
     return name.replace("_", " ")
 
 

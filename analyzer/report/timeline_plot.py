@@ -31,7 +31,7 @@ def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
     Parameters
     ----------
     path : Path
-        Of a PNG file.
+        Of a PNG file, which is replaced.
     day : Day
     earlier : sequence of Day
         Those that it is compared with.
@@ -47,7 +47,15 @@ def save_day(path: Path, day: Day, earlier: Sequence[Day]) -> None:
 
 
 def save_week(path: Path, days: Sequence[Day]) -> None:
-    """Draw a week: for each class seven lanes, the first day at the top."""
+    """Draw a week: for each class seven lanes, the first day at the top.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file, which is replaced.
+    days : sequence of Day
+        In the order of time.
+    """
     names = _names(*days)
     figure = Figure(figsize=(10, 0.66 * len(names) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -28,17 +28,17 @@ class Count:
 
     @property
     def middle(self) -> float:
-        """The likeliest number."""
+        """The expected number."""
         return self.expected
 
     @property
     def low(self) -> float:
-        """In nine cases of ten there were at least so many."""
+        """Lower end of the interval that the number lies in nine times in ten."""
         return max(self.certain, self.expected - _WIDTH * math.sqrt(self.variance))
 
     @property
     def high(self) -> float:
-        """In nine cases of ten there were at most so many."""
+        """Upper end of the interval that the number lies in nine times in ten."""
         return min(self.marked, self.expected + _WIDTH * math.sqrt(self.variance))
 
     @property
@@ -49,16 +49,34 @@ class Count:
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a number of events."""
+        """Write a number of events, rounded.
+
+        Parameters
+        ----------
+        number : float
+            Of events.
+        """
         return f"{whole(number)}"
 
     def spread(self, median: float, lowest: float, highest: float) -> str:
-        """Write what is usual: `4 (3 to 6)`."""
+        """Write what is usual: `4 (3 to 6)`.
+
+        Parameters
+        ----------
+        median, lowest, highest : float
+            Numbers of events.
+        """
         return _spread(self.show(median), self.show(lowest), self.show(highest))
 
 
 def exactly(number: int) -> Count:
-    """Return a number that is what it is."""
+    """Return the count of events that happened for certain.
+
+    Parameters
+    ----------
+    number : int
+        Of events.
+    """
     return Count(number, 0.0, number, number)
 
 
@@ -108,7 +126,13 @@ class Minutes(_Plain):
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a length of time: `2 h 05 min`."""
+        """Write a length of time: `2 h 05 min`.
+
+        Parameters
+        ----------
+        number : float
+            In minutes.
+        """
         hours, minutes = divmod(whole(number), 60)
         if hours:
             return f"{hours} h {minutes:02} min"
@@ -123,12 +147,18 @@ class Clock(_Plain):
 
     @property
     def middle(self) -> float:
-        """Minutes."""
+        """Minutes from midnight on."""
         return self.minutes
 
     @staticmethod
     def show(number: float) -> str:
-        """Write a time of day: `07:05`."""
+        """Write a time of day: `07:05`.
+
+        Parameters
+        ----------
+        number : float
+            Minutes from midnight on.
+        """
         hours, minutes = divmod(int(number), 60)
         return f"{hours:02}:{minutes:02}"
 
@@ -146,5 +176,10 @@ def _spread(middle: str, low: str, high: str) -> str:
 
 
 def whole(number: float) -> int:
-    """Round as people do: 2.5 is 3."""
+    """Round to a whole number, halves upwards: 2.5 is 3.
+
+    Parameters
+    ----------
+    number : float
+    """
     return math.floor(number + 0.5)
