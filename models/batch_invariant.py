@@ -16,13 +16,13 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
 
     Parameters
     ----------
-    rows : np.ndarray [shape=(n, k)]
-    weights : np.ndarray [shape=(k, m)]
+    rows : np.ndarray [shape=(n, k)], float64
+    weights : np.ndarray [shape=(k, m)], float64
         At most a few thousand values, else the BLAS may still divide a stack among threads.
 
     Returns
     -------
-    np.ndarray [shape=(n, m)]
+    np.ndarray [shape=(n, m)], float64
     """
     count, width = rows.shape
     columns = weights.shape[1]
@@ -46,7 +46,12 @@ def aligned(weights: Float64) -> Float64:
 
     Parameters
     ----------
-    weights : np.ndarray [shape=(k, m)]
+    weights : np.ndarray [shape=(k, m)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(k, m)], float64
+        In C order.
     """
     room = np.empty(weights.size * weights.itemsize + _LINE, np.uint8)
     start = -room.ctypes.data % _LINE

@@ -78,22 +78,43 @@ _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 def find_class(label: str) -> SoundClass | None:
     """Return the class that a label means; None for a class that is not in the table.
 
-    Capitals, and spaces, commas and hyphens for `_`, make no difference: `Crying, sobbing` is
-    `crying_sobbing`.
+    Parameters
+    ----------
+    label : str
+        Name or alias of a class. Capitals, and spaces, commas and hyphens for `_`, make no
+        difference: `Crying, sobbing` is `crying_sobbing`.
     """
     return _BY_NAME.get(_spelt(label))
 
 
 def class_name(label: str) -> str:
-    """Return the name of the class that a label means; the label itself if there is none."""
+    """Return the name of the class that a label means; the label itself if there is none.
+
+    Parameters
+    ----------
+    label : str
+        In any spelling that `find_class` knows.
+    """
     row = find_class(label)
     return label if row is None else row.name
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
-    """Return those of some names that a label means: itself in any spelling, or all of its class.
+    """Return the names that a label means: the label itself in any spelling, or all of its class.
 
-    Two names of one class in a list are different things there, so a third name means both.
+    Two names of one class in a collection are different things there, so a third name means both.
+
+    Parameters
+    ----------
+    label : str
+        In any spelling that `find_class` knows.
+    names : collection of str
+        Names that come into question, such as the classes of a model.
+
+    Returns
+    -------
+    list of str
+        In the order of `names`; empty if the label means none of them.
     """
     if label in names:
         return [label]
@@ -103,7 +124,20 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
 
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
-    """Return the name of each label among `names`; the label itself if it means none or several."""
+    """Translate labels to the names that they mean.
+
+    Parameters
+    ----------
+    labels : iterable of str
+        In any spelling that `find_class` knows.
+    names : collection of str
+        Names that come into question, such as the classes of a model.
+
+    Returns
+    -------
+    dict of str to str
+        The name of each label; the label itself if it means none of the names or several.
+    """
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}
 

@@ -55,17 +55,24 @@ class Extensions(Generic[T]):
         self._loaded = dict(self._ours)
 
     def names(self) -> list[str]:
-        """Return all names, ours first."""
+        """Return all names: ours first, then the others in alphabetical order."""
         theirs = {point.name for point in entry_points(group=self._group)}
         return [*self._ours, *sorted(theirs - self._ours.keys())]
 
     def get(self, name: str) -> T:
         """Return an object by its name.
 
+        Parameters
+        ----------
+        name : str
+            Name of one of ours, or of an entry point of the group.
+
         Raises
         ------
         HearthlogError
-            The type `missing` if there is none; ModelError if it cannot be imported.
+            Of the type `missing`, if there is none of this name.
+        ModelError
+            If its entry point cannot be imported, or is no object of this kind and name.
         """
         if name not in self._loaded:
             for point in entry_points(group=self._group, name=name):

@@ -15,6 +15,11 @@ class Classifier:
 
     A row's probabilities do not depend on the rows computed together with it, nor on threads.
 
+    Parameters
+    ----------
+    model : Model
+        As `load_model` or a training gives it.
+
     Attributes
     ----------
     classes : tuple of str
@@ -25,6 +30,11 @@ class Classifier:
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
         Those of the model.
+
+    Raises
+    ------
+    ModelError
+        If the model's feature set or kind of classifier is not installed, or cannot be imported.
     """
 
     def __init__(self, model: Model) -> None:
@@ -38,7 +48,18 @@ class Classifier:
         self._machine = classifier_kind(description.kind).machine(model)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute the probability of each class, shape (n, C); see `classify`."""
+        """Compute the probability of each class in each window.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, C)], float32
+            In the order of the model's classes; every row sums to 1.
+        """
         return self.classify(inputs)[0]
 
     def classify(self, inputs: Float32) -> tuple[Float32, Float32]:

@@ -15,7 +15,7 @@ class Machine(Protocol):
     """Inference of one model."""
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Return decision values and novelty of some hundreds of windows at most.
+        """Compute decision values and novelty of some hundreds of windows at most.
 
         A row's result must not depend on the rows that are computed together with it, nor on
         threads; see `hearthlog.models.batch_invariant`.
@@ -57,17 +57,36 @@ class ClassifierKind(ABC):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that arrays must have; those given may be of any type and shape.
+        """Return the shapes that the arrays of a model must have.
 
         Parameters
         ----------
         classes, width : int
             Number of classes, and of inputs.
         arrays : mapping of str to np.ndarray
+            Those of the model, by name; they may be of any type and shape.
+
+        Returns
+        -------
+        dict of str to tuple of int
+            By name of the array; other arrays of this kind must be absent.
         """
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with arrays of the right types and shapes, all finite; or None."""
+        """Return what is wrong with the arrays of a model; None if nothing is.
+
+        Parameters
+        ----------
+        classes : int
+            Number of classes.
+        arrays : mapping of str to np.ndarray
+            By name; of the right types and shapes, and finite.
+
+        Returns
+        -------
+        str or None
+            The rest of a sentence that begins with the file.
+        """
         del classes, arrays
         return None
 
@@ -80,6 +99,12 @@ class ClassifierKind(ABC):
         """Return the size of a model in a few words."""
 
     def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return inputs of training windows, if they are among the arrays."""
+        """Return the inputs of training windows that are among the arrays of a model.
+
+        Returns
+        -------
+        sequence of np.ndarray [shape=(n, width)], float32
+            Empty if the arrays hold none.
+        """
         del model
         return ()

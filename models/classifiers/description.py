@@ -145,10 +145,15 @@ class Description(_Record):
 def read_description(text: str) -> Description:
     """Read a description, of this format or an older one.
 
+    Parameters
+    ----------
+    text : str
+        JSON.
+
     Raises
     ------
     ModelError
-        If it is of a newer format, or invalid.
+        If the description is of a newer format, is no JSON, or is invalid.
     """
     try:
         content = json.loads(text)
@@ -170,10 +175,15 @@ class _WithMetrics(BaseModel):
 def class_metrics(text: bytes) -> dict[str, ClassMetrics]:
     """Read the scores of each class from a description in a log, which may be of any format.
 
+    Parameters
+    ----------
+    text : bytes
+        JSON in UTF-8.
+
     Returns
     -------
     dict of str to ClassMetrics
-        Empty where it has none that can be read.
+        By name of the class; empty where there are none that can be read.
     """
     try:
         return _WithMetrics.model_validate_json(text).metrics.classes
@@ -201,12 +211,28 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def first_problem(error: ValidationError) -> str:
-    """Return the first problem of a description, on one line."""
+    """Return the first problem of a description on one line.
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+
+    Returns
+    -------
+    str
+        `field: problem`, printable.
+    """
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part)[:64] for part in first["loc"]) or "description"
     return f"{one_line(where)}: {one_line(first['msg'])}"
 
 
 def one_line(text: object) -> str:
-    """Return a text of any file as part of a message: printable, and not too long."""
+    """Return a text from any file as a part of a message: printable, 200 characters at most.
+
+    Parameters
+    ----------
+    text : object
+        What `str` makes of it is shown.
+    """
     return printable(text)[:200]

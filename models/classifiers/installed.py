@@ -15,6 +15,11 @@ CLASSIFIERS = Extensions(
 def classifier_kind(name: str) -> ClassifierKind:
     """Return a kind of classifier by its name.
 
+    Parameters
+    ----------
+    name : str
+        As the field `kind` of a description has it, such as "svm-rbf".
+
     Raises
     ------
     ModelError

@@ -69,7 +69,20 @@ class SvmKind(ClassifierKind):
     def shapes(
         self, classes: int, width: int, arrays: Mapping[str, Array]
     ) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that arrays must have."""
+        """Return the shapes that the arrays of a model must have.
+
+        Parameters
+        ----------
+        classes, width : int
+            Number of classes, and of inputs.
+        arrays : mapping of str to np.ndarray
+            Those of the model, by name; they may be of any type and shape.
+
+        Returns
+        -------
+        dict of str to tuple of int
+            By name of the array; home vectors only if there are any.
+        """
         total, home = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
             for name in ("support_vectors", "home_vectors")
@@ -87,7 +100,20 @@ class SvmKind(ClassifierKind):
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
-        """Return what is wrong with arrays, or None."""
+        """Return what is wrong with the arrays of a model; None if nothing is.
+
+        Parameters
+        ----------
+        classes : int
+            Number of classes.
+        arrays : mapping of str to np.ndarray
+            By name; of the right types and shapes, and finite.
+
+        Returns
+        -------
+        str or None
+            The rest of a sentence that begins with the file.
+        """
         if not (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
             return "scaler_scale has values that are not positive"
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
@@ -107,7 +133,12 @@ class SvmKind(ClassifierKind):
         return f"{len(model.arrays['support_vectors'])} support vectors"
 
     def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return the support vectors, which are inputs of training windows."""
+        """Return the support vectors and the home vectors, which are inputs of windows.
+
+        Returns
+        -------
+        sequence of np.ndarray [shape=(n, width)], float32
+        """
         names = ("support_vectors", "home_vectors")
         return [model.arrays[name] for name in names if name in model.arrays]
 
@@ -119,6 +150,11 @@ class SvmMachine:
     """Inference of one model; its pairs of classes decide as scikit-learn's `SVC` within 1e-5.
 
     The decision value of a class is that of the weakest of its pairs, plus `home_votes`.
+
+    Parameters
+    ----------
+    model : Model
+        Of kind `svm-rbf`.
     """
 
     def __init__(self, model: Model) -> None:
@@ -131,7 +167,19 @@ class SvmMachine:
         self._first, self._second = np.triu_indices(self._count, 1)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Return decision values; novelty is one minus the kernel of the nearest support vector."""
+        """Compute decision values and novelty of windows.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        decisions : np.ndarray [shape=(n, C)], float64
+        novelty : np.ndarray [shape=(n,)], float64
+            One minus the kernel of the nearest support vector, 0 to 1.
+        """
         extended = self._extended(inputs)
         pairs, others, nearest = self._pairs(extended)
         decision = weakest_pairs(pairs, self._count)
@@ -191,14 +239,14 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
 
     Parameters
     ----------
-    pairs : np.ndarray [shape=(n, C (C - 1) / 2)]
+    pairs : np.ndarray [shape=(n, C (C - 1) / 2)], float64
         Decision values for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
     classes : int
         C.
 
     Returns
     -------
-    np.ndarray [shape=(n, C)]
+    np.ndarray [shape=(n, C)], float64
     """
     decision = np.full((len(pairs), classes), np.inf)
     for place, (first, second) in enumerate(combinations(range(classes), 2)):
@@ -208,7 +256,7 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
 
 
 def home_votes(home: Float64, others: Float64) -> Float64:
-    """Return what is added to decision values for inputs near to vectors of a home.
+    """Compute what is added to decision values for inputs near to vectors of a home.
 
     A support vector machine learns a few segments of a home among thousands, but not what is
     similar to them. A vote is the share of a class of the home among all vectors nearby, so that
@@ -216,10 +264,15 @@ def home_votes(home: Float64, others: Float64) -> Float64:
 
     Parameters
     ----------
-    home : np.ndarray [shape=(n, C)]
+    home : np.ndarray [shape=(n, C)], float64
         Sums over the home vectors of kernels with gamma times `HOME_SHARPNESS`, by class.
-    others : np.ndarray [shape=(n, 1)]
+    others : np.ndarray [shape=(n, 1)], float64
         The same sums over the support vectors.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        From 0 to `HOME_VOTE`.
     """
     home = HOME_SHARE * home
     return HOME_VOTE * home / (home.sum(axis=1, keepdims=True) + others + _TINY)

@@ -11,6 +11,11 @@ FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
     """Return a feature set by its name.
 
+    Parameters
+    ----------
+    name : str
+        Such as "auros21".
+
     Raises
     ------
     ModelError

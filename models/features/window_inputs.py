@@ -104,6 +104,7 @@ class WindowStatistics:
         Returns
         -------
         np.ndarray [shape=(n, width)], float32
+            Means, standard deviations and, with `changes`, mean absolute differences.
         """
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
@@ -122,10 +123,12 @@ class WindowStatistics:
         Parameters
         ----------
         frames : sequence of np.ndarray [shape=(n, d')]
-            As of `successive`.
+            Values of the first frames of all windows, of their second frames and so on, as of
+            `successive`.
         changes : sequence of np.ndarray [shape=(n, d')]
-            The same of the absolute differences.
+            The same of the absolute differences from frame to frame.
         out : np.ndarray [shape=(n, width)], float32
+            Overwritten: means, standard deviations and, with `changes`, mean absolute differences.
         """
         parts = [*mean_and_std(frames)]
         if self.changes:
@@ -134,7 +137,12 @@ class WindowStatistics:
 
 
 class StatisticsStream:
-    """The statistics at the frames of one stream, as `InputStream`."""
+    """The statistics at the frames of one stream, as `InputStream`.
+
+    Parameters
+    ----------
+    inputs : WindowStatistics
+    """
 
     def __init__(self, inputs: WindowStatistics) -> None:
         self._inputs = inputs
@@ -168,26 +176,31 @@ def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
     ----------
     values : np.ndarray [shape=(n, d)]
     length : int
-        Rows of a window.
+        Rows of a window; at most n.
 
     Returns
     -------
     list of np.ndarray [shape=(n - length + 1, d)]
-        The first rows of all windows, the second rows, and so on.
+        Views: the first rows of all windows, the second rows, and so on.
     """
     count = len(values) - length + 1
     return [values[place : place + count] for place in range(length)]
 
 
 def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
-    """Compute mean and standard deviation of windows, shape (n, d), in float64.
+    """Compute mean and standard deviation of many windows at once, in float64.
 
-    It sums frame after frame for many windows at once, so that the sums stay in the cache.
+    The sums go from frame to frame for all windows, so that they stay in the cache.
 
     Parameters
     ----------
     frames : sequence of np.ndarray [shape=(n, d)]
         As of `successive`.
+
+    Returns
+    -------
+    mean, std : np.ndarray [shape=(n, d)], float64
+        The standard deviation divides by the number of frames.
     """
     mean = _sum(frames) / len(frames)
     square = np.zeros_like(mean)

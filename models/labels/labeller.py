@@ -35,7 +35,18 @@ class FrameLabels(NamedTuple):
     novelty: Float32
 
     def columns(self, microphone: str) -> dict[str, Column]:
-        """Return the fields of one `AudioLabel` a frame."""
+        """Return the fields of one `AudioLabel` for each frame.
+
+        Parameters
+        ----------
+        microphone : str
+            Its name.
+
+        Returns
+        -------
+        dict of str to column
+            By field path, as `encode_groups` takes them.
+        """
         best = self.probabilities.argmax(axis=1)
         return {
             "header.stamp": self.stamps,
@@ -58,6 +69,7 @@ class Labeller:
     Attributes
     ----------
     classes : tuple of str
+        Names behind the columns of the probabilities.
     segmenter : Segmenter
     """
 
@@ -68,7 +80,12 @@ class Labeller:
         self._inputs = classifier.inputs.stream()
 
     def fill_window(self, features: Float32) -> None:
-        """Put the features of successive frames into the window, and label none of them."""
+        """Put the features of successive frames into the window, and label none of them.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        """
         self._inputs(features)
 
     def push(
@@ -99,7 +116,18 @@ class Labeller:
         return FrameLabels(self.classes, frames, stamps, probabilities, novelty), segments
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments of a sound that ends at `end`, and begin anew."""
+        """Return the remaining segments of a sound that ends, and begin anew.
+
+        Parameters
+        ----------
+        end : int
+            End of the sound, in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Segment
+            In the order of time.
+        """
         self._inputs.restart()
         return self.segmenter.close(end)
 
@@ -107,7 +135,7 @@ class Labeller:
 def segment_columns(
     segments: Sequence[Segment], classes: Sequence[str], microphone: str
 ) -> dict[str, Column]:
-    """Return the fields of one `AudioSegment` a segment.
+    """Return the fields of one `AudioSegment` for each segment.
 
     Parameters
     ----------
@@ -115,6 +143,12 @@ def segment_columns(
     classes : sequence of str
         Names behind the labels of the segments.
     microphone : str
+        Its name.
+
+    Returns
+    -------
+    dict of str to column
+        By field path, as `encode_groups` takes them.
     """
     starts = np.array([segment.start for segment in segments], np.int64)
     ends = np.array([segment.end for segment in segments], np.int64)

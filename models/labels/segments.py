@@ -37,7 +37,18 @@ class Run(NamedTuple):
     confidence: int
 
     def prepend(self, earlier: "Run | None") -> "Run":
-        """Return this run with an earlier run of the same label, if any, joined to its start."""
+        """Join an earlier run to the start of this one.
+
+        Parameters
+        ----------
+        earlier : Run or None
+            Of the same label, ending where this run starts; None for none.
+
+        Returns
+        -------
+        Run
+            With the start of the earlier run, and the frames of both.
+        """
         if earlier is None:
             return self
         frames, confidence = earlier.frames + self.frames, earlier.confidence + self.confidence
@@ -126,8 +137,14 @@ class Segmenter:
         Parameters
         ----------
         probabilities : np.ndarray [shape=(n, C)], float32
+            At least one row.
         stamps : np.ndarray [shape=(n,)], int64
             Starts of the frames in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Segment
+            In the order of time.
         """
         states = self._states(probabilities)
         self._note_convergence(stamps)
@@ -144,7 +161,18 @@ class Segmenter:
         return segments
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments of a sound that ends at `end`, and begin anew."""
+        """Return the remaining segments of a sound that ends, and begin anew.
+
+        Parameters
+        ----------
+        end : int
+            End of the sound, in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Segment
+            In the order of time.
+        """
         segments = []
         if self._smoother is not None and self._undecided is not None:
             probabilities, stamps = self._undecided

@@ -69,6 +69,7 @@ class FixedLagSmoother:
         Parameters
         ----------
         probabilities : np.ndarray [shape=(n, C)], float32
+            Of the classes, 0 to 1.
 
         Returns
         -------
@@ -81,7 +82,13 @@ class FixedLagSmoother:
         return np.concatenate([np.empty(0, np.intp), *parts])
 
     def close(self) -> Indices:
-        """Return the states of the remaining frames, and begin anew."""
+        """Return the states of the remaining frames, and begin anew.
+
+        Returns
+        -------
+        np.ndarray [shape=(m,)], intp
+            Of the last `lag_frames` frames, or fewer if there were no more.
+        """
         states = np.empty(len(self._back), np.intp)
         if len(states):
             states[-1] = self._score.argmax()

@@ -11,7 +11,13 @@ DESCRIPTION = "model.json"
 
 
 def model_attachments(model: Model) -> list[Attachment]:
-    """Return the attachments of a log with labels of a model."""
+    """Return the attachments of a log with labels of a model: its card and its description.
+
+    Raises
+    ------
+    ModelError
+        If the model's kind of classifier is not installed, or cannot be imported.
+    """
     description = {"name": model.name, "sha256": model.sha256, **model.description.model_dump()}
     text = json.dumps(description, ensure_ascii=False)
     return [
@@ -21,7 +27,13 @@ def model_attachments(model: Model) -> list[Attachment]:
 
 
 def model_card(model: Model) -> str:
-    """Describe a model for people, as Markdown."""
+    """Describe a model for people, as Markdown.
+
+    Raises
+    ------
+    ModelError
+        If the model's kind of classifier is not installed, or cannot be imported.
+    """
     description, metrics = model.description, model.description.metrics
     amounts = description.training_data.classes
     purpose = (

@@ -42,7 +42,19 @@ _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are op
 
 
 def check_output(path: Path) -> None:
-    """Raise ModelError unless a model can be saved under this name."""
+    """Check that a model can be saved under a name.
+
+    Parameters
+    ----------
+    path : Path
+        A new file whose name ends in `.safetensors`.
+
+    Raises
+    ------
+    ModelError
+        If the name has another ending or cannot be printed, if there is a file of this name, or if
+        its folder does not exist or cannot be written.
+    """
     if path.suffix != SUFFIX:
         raise ModelError(f"{path}: the name of a model file must end in {SUFFIX}")
     if not path.stem.isprintable():
@@ -56,10 +68,17 @@ def check_output(path: Path) -> None:
 def save_model(model: Model, path: Path) -> None:
     """Write a model file; the same model gives the same bytes.
 
+    Parameters
+    ----------
+    model : Model
+    path : Path
+        A new file whose name ends in `.safetensors`.
+
     Raises
     ------
     ModelError
-        If the file exists, the folder does not or cannot be written, or the model is inconsistent.
+        If `check_output` refuses the name, the file cannot be written, or the model is
+        inconsistent.
     """
     check_output(path)
     common = {name: getattr(model, name) for name in _COMMON if getattr(model, name).size}
@@ -78,10 +97,17 @@ def save_model(model: Model, path: Path) -> None:
 def load_model(path: Path) -> Model:
     """Read a model file and check everything in it; nothing of it is executed.
 
+    Parameters
+    ----------
+    path : Path
+        The file, or a symbolic link to it: the model has the name of the file.
+
     Raises
     ------
     ModelError
-        If it is missing, too large, damaged, inconsistent, or made for another feature set.
+        If the file is missing, larger than 64 MiB, damaged or inconsistent, if its name cannot be
+        printed, or if it is made for another feature set, or for a feature set or kind of
+        classifier that is not installed.
     """
     path = _pointed_to(path)
     if not path.stem.isprintable():

@@ -34,12 +34,22 @@ class ModelEntry:
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
-    """Load every model of a folder, in the order of names; targets of broken aliases are included.
+    """Load every model of a folder, and list the targets of broken aliases too.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+
+    Returns
+    -------
+    list of ModelEntry
+        By name; one that cannot be used says why.
 
     Raises
     ------
     ModelError
-        If there is no such folder.
+        If there is no such folder, or an alias is no link to a model file of it.
     """
     _check_folder(folder)
     named = {alias: target(folder, alias) for alias in ALIASES}
@@ -54,10 +64,17 @@ def list_models(folder: Path) -> list[ModelEntry]:
 def target(folder: Path, alias: str) -> str | None:
     """Return the name of the model that an alias points to; None if there is no such alias.
 
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    alias : str
+        `champion` or `candidate`.
+
     Raises
     ------
     ModelError
-        If a file of this name is not a link to a file of the folder.
+        If a file of this name is not a link to a model file of the folder.
     """
     link = _path(folder, alias)
     if not os.path.lexists(link):
@@ -72,12 +89,20 @@ def target(folder: Path, alias: str) -> str | None:
 
 
 def resolve(folder: Path, name: str) -> str:
-    """Return the name of a model, which may be given as an alias or as the name of its file.
+    """Return the name of the model that a name or an alias means.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    name : str
+        Name of a model, of its file, or an alias. That there is such a model is not checked.
 
     Raises
     ------
     ModelError
-        If the alias does not exist, or the name is not one of the folder.
+        If the alias does not exist or is no link to a model file, or the name is one of another
+        folder.
     """
     name = name.removesuffix(SUFFIX)
     if name in ALIASES:
@@ -91,19 +116,33 @@ def resolve(folder: Path, name: str) -> str:
 
 
 def load(folder: Path, name: str) -> Model:
-    """Load a model of a folder, by its name or an alias; raises ModelError."""
+    """Load a model of a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    name : str
+        Name of a model, of its file, or an alias.
+
+    Raises
+    ------
+    ModelError
+        If there is no such folder, or `resolve` or `load_model` refuses the model.
+    """
     _check_folder(folder)
     return load_model(_path(folder, resolve(folder, name)))
 
 
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
-    """Point an alias to a model, if that can be used.
+    """Point an alias to a model, if that model can be used.
 
     Parameters
     ----------
     folder : Path
+        Folder of model files.
     name : str
-        A model, or another alias.
+        Name of a model, of its file, or an alias.
     alias : str
         `champion` or `candidate`.
 
@@ -116,7 +155,8 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
     Raises
     ------
     ModelError
-        If the model cannot be used, or the folder cannot be written.
+        If the model cannot be used, if the folder does not exist or cannot be written, or if a file
+        in the place of the alias is no link to a model file.
     """
     with _locked(folder):
         before = target(folder, alias)
@@ -131,6 +171,11 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 def rollback(folder: Path) -> tuple[Model, str]:
     """Make the last earlier champion that can still be used the champion again.
 
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+
     Returns
     -------
     model : Model
@@ -141,7 +186,8 @@ def rollback(folder: Path) -> tuple[Model, str]:
     Raises
     ------
     ModelError
-        If there is none, or the folder cannot be written.
+        If there is no champion, or none before it that can be used, or the folder does not exist or
+        cannot be written.
     """
     with _locked(folder):
         before = resolve(folder, CHAMPION)

@@ -44,6 +44,9 @@ class FeatureExtractor:
     def __call__(self, frames: Float32) -> Float32:
         """Compute the features of successive frames.
 
+        The definitions are those of the paper (section 3.2.2) and, where the paper and its library
+        differ, of pyAudioAnalysis; see docs/features.md.
+
         Parameters
         ----------
         frames : np.ndarray [shape=(n, 800)], float32
@@ -98,14 +101,30 @@ class FeatureExtractor:
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
-    """Return sign changes per step from sample to sample (a step to or from 0 counts half)."""
+    """Count sign changes per step from sample to sample; a step to or from 0 counts half.
+
+    The paper (section 3.2.2) divides by the samples of a frame; this divides by the steps, as
+    pyAudioAnalysis does.
+
+    Parameters
+    ----------
+    frames : np.ndarray [shape=(n, 800)], float32
+        Samples; one that is NaN counts as 0.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+        From 0 to 1.
+    """
     sign = (frames > 0).view(np.int8) - (frames < 0).view(np.int8)
     steps = sign[:, 1:] - sign[:, :-1]
     return np.abs(steps, out=steps).sum(axis=1, dtype=np.int16) / (2.0 * (FRAME_SAMPLES - 1))
 
 
 def mel_bank() -> Float64:
-    """Return triangular filters of peak 1 on the Slaney mel scale, 0 to 8 kHz.
+    """Return triangular filters of peak 1 on the mel scale, 0 to 8 kHz.
+
+    The scale is that of Slaney's Auditory Toolbox.
 
     Returns
     -------
@@ -122,7 +141,13 @@ def mel_bank() -> Float64:
 
 
 def mel_centres() -> Float64:
-    """Return the frequencies in hertz at which the filters of `mel_bank` peak, shape (32,)."""
+    """Return the frequencies at which the filters of `mel_bank` peak.
+
+    Returns
+    -------
+    np.ndarray [shape=(32,)], float64
+        In hertz.
+    """
     return _mel_corners()[1:-1]
 
 

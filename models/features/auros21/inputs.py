@@ -1,6 +1,6 @@
 """Inputs of classifiers from the features of `auros21`.
 
-`statistics` are those of the paper (section 3.2): mean and standard deviation of the features.
+`statistics` are those of the paper (section 3.2.1): mean and standard deviation of the features.
 `bands` makes more of the same features: logarithms of energy and flux, the smooth mel bands that
 the cepstra represent, and the mean change of all values from frame to frame.
 """
@@ -20,7 +20,17 @@ _FLOOR = 1e-7
 
 
 def features_themselves(features: Float32) -> Float32:
-    """Return the features as they are."""
+    """Return the features as they are.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 21)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 21)], float32
+        The same array.
+    """
     return features
 
 
@@ -48,11 +58,12 @@ def band_values(features: Float32) -> Float64:
 
 
 def bands_of(cepstra: Float32) -> Float64:
-    """Turn mel cepstra back into mel bands, smoothed by the cepstra that are left out.
+    """Turn mel cepstra back into mel bands, which are smooth since the higher cepstra are left out.
 
     Parameters
     ----------
     cepstra : np.ndarray [shape=(n, 13)], float32
+        In dB, the features `mfcc_1` to `mfcc_13`.
 
     Returns
     -------
@@ -64,7 +75,13 @@ def bands_of(cepstra: Float32) -> Float64:
 
 @cache
 def dct_weights() -> Float64:
-    """Return the weights of the first 13 coefficients of an orthonormal DCT-II of the mel bands."""
+    """Return the weights of an orthonormal DCT-II from mel bands to cepstra.
+
+    Returns
+    -------
+    np.ndarray [shape=(32, 13)], float64
+        One column for each of the first 13 coefficients; its transpose turns cepstra into bands.
+    """
     band = np.arange(MEL_BANDS)[:, np.newaxis]
     order = np.arange(_WIDTH - _SCALARS)
     weights = np.sqrt(2.0 / MEL_BANDS) * np.cos(np.pi / MEL_BANDS * (band + 0.5) * order)

@@ -1,4 +1,4 @@
-"""The values of feature set `auros21`: the paper's 21, in its order (section 3.1)."""
+"""The values of feature set `auros21`: the paper's 21, in its order (section 3.2.2)."""
 
 MFCC_COUNT = 13
 MEL_BANDS = 32  # of which the cepstra are made
