@@ -89,7 +89,7 @@ class Dataset:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the segments, their classes and their groups."""
+        """SHA-256 of the segments, their classes and their groups, in hexadecimal."""
         digest = hashlib.sha256("\n".join(self.classes).encode())
         for array in (self.windows, self.target.astype("<i8"), self.group.astype("<i8")):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -115,17 +115,23 @@ def build_dataset(
     home: Iterable[Recording] = (),
     features: FeatureSet = DEFAULT,
 ) -> Dataset:
-    """Cut the clips of a scenario's labels into segments, as `cut_recordings` does.
+    """Cut clips, and recordings of a home, into the segments of a scenario.
 
     Parameters
     ----------
     clips : sequence of LabelledClip
     scenario : Scenario
     progress : callable
-        Told the share of the clips that is done.
+        Is told the share of the clips that is done, 0 to 1.
     home : iterable of Recording
-        Further recordings.
+        Further recordings; their labels may be names of classes.
     features : FeatureSet
+        The features to compute; those of `home` are of the same set.
+
+    Returns
+    -------
+    Dataset
+        As `cut_recordings` makes it.
 
     Raises
     ------
@@ -149,7 +155,21 @@ def clip_recordings(
     progress: Progress,
     features: FeatureSet = DEFAULT,
 ) -> Iterator[Recording]:
-    """Read the features of clips; those of labels outside of the scenario get no features.
+    """Read clips and compute their features; clips of labels outside the scenario have none.
+
+    Parameters
+    ----------
+    clips : sequence of LabelledClip
+    scenario : Scenario
+    progress : callable
+        Is told the share of the clips that is done, 0 to 1.
+    features : FeatureSet, optional
+        The features to compute.
+
+    Yields
+    ------
+    Recording
+        In the order of the clips.
 
     Raises
     ------
@@ -168,11 +188,26 @@ def clip_recordings(
 def cut_recordings(
     recordings: Iterable[Recording], scenario: Scenario, features: FeatureSet = DEFAULT
 ) -> Dataset:
-    """Cut recordings into segments of a window, half a second apart.
+    """Cut recordings into segments of one window, half a second apart.
 
     Segments of silence are all kept, others if they are above -60 dBFS and at most 12 dB below the
     mean level of their recording. Of each class and source group at most 24 segments, times their
     weight, are kept, evenly spaced.
+
+    Parameters
+    ----------
+    recordings : iterable of Recording
+        Their labels may be names of classes.
+    scenario : Scenario
+        Which class a label belongs to.
+    features : FeatureSet, optional
+        Of the recordings; one with another number of features is skipped.
+
+    Returns
+    -------
+    Dataset
+        Its classes are those of the scenario, some of which may have no segments; `skipped` says
+        why recordings gave none.
     """
     classes = tuple(scenario.classes)
     groups: dict[str, int] = {}
@@ -217,12 +252,22 @@ def cut_recordings(
 
 
 def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
-    """Compute the features of a clip, shape (n, d).
+    """Compute the features of a clip.
+
+    Parameters
+    ----------
+    clip : LabelledClip
+    features : FeatureSet
+
+    Returns
+    -------
+    np.ndarray [shape=(n, d)], float32
+        A row for each frame; units as in `features.units`.
 
     Raises
     ------
     SourceError
-        If it cannot be read.
+        If the clip cannot be read.
     """
     extract = features.extractor()
     values = [np.empty((0, features.width), np.float32)]

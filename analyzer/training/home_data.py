@@ -25,19 +25,24 @@ HOME = "this home"
 def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
-    A mark shorter than a window is extended to one. All marks of a day are of one source.
+    A mark shorter than a window is extended to one. All marks of a UTC day are of one group.
 
     Parameters
     ----------
     folder : Path
         Folder of logs, with review layers beside them, and of enrolled sounds.
-    features : FeatureSet
-        Recordings of other sets have no features.
+    features : FeatureSet, optional
+        Marks in logs of another set give recordings without features.
+
+    Yields
+    ------
+    Recording
+        A mark, or a part of one that lies between gaps; log by log.
 
     Raises
     ------
     LogError
-        If a log or a layer is damaged.
+        If there is no log, or if a log or a layer is damaged.
     """
     for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
@@ -52,18 +57,24 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
-    """Read the sequences of classes in a home, from marks that follow each other without a gap.
+    """Read the sequences of classes in a home from marks that follow each other without a gap.
 
     Parameters
     ----------
     folder : Path
         Folder of logs, with review layers beside them.
     classes : sequence of str
+        Their names; the index of a name is its number in the sequences.
 
     Returns
     -------
     list of np.ndarray [shape=(n,)], int64
-        Classes of successive frames; marks on their own are left out.
+        Numbers of the classes of successive frames; marks on their own are left out.
+
+    Raises
+    ------
+    LogError
+        If there is no log, or if a layer is damaged.
     """
     numbers = {name: number for number, name in enumerate(classes)}
     sequences: list[Int64] = []

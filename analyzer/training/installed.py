@@ -10,13 +10,18 @@ _METHODS = Extensions("hearthlog.methods", Method, "method", [BANDS, PAPER], Dat
 
 
 def method_named(name: str) -> Method:
-    """Return a method by its name.
+    """Return the method of a name.
+
+    Parameters
+    ----------
+    name : str
+        `bands`, `paper`, or the name of an entry point in the group `hearthlog.methods`.
 
     Raises
     ------
     DataError
-        If there is none of this name.
+        If there is no method of this name.
     ModelError
-        If it cannot be imported.
+        If the entry point cannot be imported, or is no method of this name.
     """
     return _METHODS.get(name)

@@ -46,11 +46,17 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     labels : collection of str
         Allowed labels; other names of the same sounds (`hearthlog.models.classes`) are allowed too.
 
+    Returns
+    -------
+    list of LabelledClip
+        In the order of the file; at least one.
+
     Raises
     ------
     DataError
         With file and line, if a column, a value or an audio file is missing, a label is unknown,
-        a clip is listed twice, or the file is no CSV in UTF-8.
+        or a clip is listed twice; if the file lists no clip, or is no CSV in UTF-8; if it cannot
+        be read, or is larger than 64 MiB.
     """
     lines = csv_records(path, read_text(path, "manifest", _SIZE_LIMIT))
     first = next(lines, None)

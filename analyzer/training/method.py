@@ -45,13 +45,13 @@ class Learned(Protocol):
     """A classifier that was learned from segments."""
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values, as `Machine.decide` of the kind gives them.
+        """Return decision values as `Machine.decide` gives them, for a classifier of this kind.
 
         Parameters
         ----------
         inputs : np.ndarray [shape=(n, width)], float32
         classes : int
-            C.
+            C, the number of all classes.
 
         Returns
         -------
@@ -63,7 +63,7 @@ class Learned(Protocol):
         """Return the arrays of a model file; all classes were learned."""
 
     def parameters(self) -> dict[str, Any]:
-        """Return the field `parameters` of the model's description."""
+        """Return the values of the field `parameters` in the description of a model."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Method(ABC):
 
     @property
     def features(self) -> FeatureSet:
-        """The feature set; raises ModelError if it is not installed."""
+        """Feature set of the classifier; raises ModelError if it is not installed."""
         return feature_set(self.feature_set)
 
     @property
@@ -112,29 +112,45 @@ class Method(ABC):
         ----------
         examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
-            Segments to learn from; all by default.
+            Indices of the segments to learn from; all by default.
         home : np.ndarray [shape=(h,)], intp
-            Those among them that belong to the home to which the classifier is adapted.
+            Indices of those among them that belong to the home to which the classifier is adapted.
+
+        Returns
+        -------
+        Learned
+            The classes that it has not seen have decision values of -inf.
         """
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with other parameters.
 
+        Parameters
+        ----------
+        values : mapping of str to float
+            By name of the parameter, as in `parameters`; those not named stay.
+
         Raises
         ------
         DataError
-            If it has no such parameter.
+            If the method has no such parameter.
         """
         if values:
             raise DataError(f"method {self.name} has no {min(values)} to choose")
         return self
 
     def variations(self) -> list[Self]:
-        """Return the methods of a search, this one among them."""
+        """Return the methods that a grid search compares, this one among them."""
         return [self]
 
     def as_of(self, description: Description) -> Self:
-        """Return the method with the parameters of a model."""
+        """Return this method with the parameters of a model.
+
+        Parameters
+        ----------
+        description : Description
+            Of a model that this method has learned.
+        """
         del description
         return self
 
@@ -142,10 +158,23 @@ class Method(ABC):
 def prepare(method: Method, data: Dataset) -> Examples:
     """Compute the inputs of segments for a method; the same segments give the same inputs.
 
+    Parameters
+    ----------
+    method : Method
+    data : Dataset
+        Segments of the method's feature set.
+
+    Returns
+    -------
+    Examples
+        All segments of `data`, in their order, unchanged and in `method.copies` augmented copies.
+
     Raises
     ------
     DataError
         If the method wants augmented copies and its feature set has none.
+    ModelError
+        If the feature set is not installed.
     """
     features, rng = method.features, np.random.default_rng(_SEED)
     if method.copies and features.augmented is None:
@@ -170,17 +199,18 @@ def cross_validate(
     Parameters
     ----------
     methods : sequence of Method
-        All of the inputs and the number of copies of the examples.
+        All with the inputs and the number of copies that the examples have.
     examples : Examples
     classes : int
-        C.
+        C, the number of classes.
     folds : iterable of Fold
+        Indices of the segments to learn from, and of those to test on.
     progress : callable
-        Told the share of the fits that is done.
+        Is told the share of the fits that is done, 0 to 1.
 
     Returns
     -------
-    np.ndarray [shape=(methods, n, C)]
+    np.ndarray [shape=(len(methods), n, C)], float64
         Decision values; -inf for a class that was not learned, NaN for segments that no fold tests.
     """
     folds = list(folds)
@@ -203,12 +233,19 @@ def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Fl
 
 
 def inverse_temperature(decisions: Float64, target: Indices) -> float:
-    """Calibrate decision values: find the factor that minimises the log loss of their softmax.
+    """Find the factor of decision values that minimises the log loss of their softmax.
 
     Parameters
     ----------
-    decisions : np.ndarray [shape=(n, C)]
-    target : np.ndarray [shape=(n,)]
+    decisions : np.ndarray [shape=(n, C)], float64
+        Decision values; -inf for a class that was not learned.
+    target : np.ndarray [shape=(n,)], intp
+        Indices of the true classes.
+
+    Returns
+    -------
+    float
+        From exp(-5) to exp(5); the inverse of the temperature.
 
     References
     ----------
@@ -224,6 +261,17 @@ def inverse_temperature(decisions: Float64, target: Indices) -> float:
 
 
 def softmax(values: Float64) -> Float64:
-    """Turn rows of decision values into probabilities; -inf becomes 0."""
+    """Turn decision values into probabilities.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, C)], float64
+        Decision values; -inf is allowed, but not for a whole row.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        Every row sums up to 1; 0 where the decision value is -inf.
+    """
     grown = np.exp(values - values.max(axis=1, keepdims=True))
     return grown / grown.sum(axis=1, keepdims=True)

@@ -42,7 +42,7 @@ class Scenario:
         return {label: name for name, labels in self.classes.items() for label in labels}
 
     def find(self, label: str, *, marked: bool = False) -> str | None:
-        """Return the class that a label belongs to; None if it is ignored, or in no class.
+        """Find the class that a label belongs to.
 
         It is the class that lists this very label. If none does, it is the one that lists another
         name of the same sound (see `hearthlog.models.classes`), unless two classes do.
@@ -50,8 +50,14 @@ class Scenario:
         Parameters
         ----------
         label : str
+            As in a manifest, or as a reviewer gives it.
         marked : bool
-            Whether a reviewer says it: then the names of the classes are labels, too.
+            Whether a reviewer gives it: then the names of the classes are labels, too.
+
+        Returns
+        -------
+        str or None
+            Name of the class; None if the label is ignored, or in no class.
         """
         classes: dict[str, str | None] = dict.fromkeys(self.ignored)
         classes |= {name: name for name in self.classes} if marked else {}
@@ -61,7 +67,7 @@ class Scenario:
 
     @property
     def labels(self) -> frozenset[str]:
-        """Labels a manifest may use, besides other names of them: built in, in a class, ignored."""
+        """Labels that a manifest may use: built-in labels, those in a class, and ignored ones."""
         return LABELS | self.class_of.keys() | self.ignored
 
 
@@ -86,10 +92,17 @@ def load_scenario(name: str) -> Scenario:
     The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
     ...]` above it.
 
+    Parameters
+    ----------
+    name : str
+        `bathroom`, `general`, or the path of a `.toml` file, whose stem becomes the name.
+
     Raises
     ------
     DataError
-        If there is no such scenario, or the file does not say what it must.
+        If there is no such scenario, or if the file cannot be read, is no TOML, has an unknown
+        key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name, something else than a
+        list of labels, or one label in two places.
     """
     if name in BUILTIN:
         return BUILTIN[name]

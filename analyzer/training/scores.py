@@ -115,13 +115,14 @@ def score(
 
     Parameters
     ----------
-    target, predicted : np.ndarray [shape=(n,)]
-        Indices of classes.
-    group : np.ndarray [shape=(n,)]
+    target, predicted : np.ndarray [shape=(n,)], int
+        Indices of the true classes and of the predicted ones.
+    group : np.ndarray [shape=(n,)], int
         Numbers of the source groups, which are resampled as a whole for the intervals.
     classes : sequence of str
+        Names of the C classes.
     weight : np.ndarray [shape=(n,)], int64, optional
-        How many segments a row stands for; one by default.
+        How many segments a row stands for; one by default. At least 0.
 
     Raises
     ------
@@ -162,16 +163,18 @@ def difference(
     group: Integers,
     classes: Sequence[str],
 ) -> F1Difference:
-    """Compare two models on the same segments: macro F1 of b minus that of a.
+    """Compare the macro F1 of two models on the same segments: that of b minus that of a.
 
     Parameters
     ----------
-    target : np.ndarray [shape=(n,)]
-        Indices of classes.
-    probabilities_a, probabilities_b : np.ndarray [shape=(n, C)]
-    group : np.ndarray [shape=(n,)]
-        Numbers of the sources.
+    target : np.ndarray [shape=(n,)], int
+        Indices of the true classes.
+    probabilities_a, probabilities_b : np.ndarray [shape=(n, C)], float
+        Of the two models; the class of the highest one is the predicted one.
+    group : np.ndarray [shape=(n,)], int
+        Numbers of the source groups, which are resampled as a whole for the interval.
     classes : sequence of str
+        Names of the C classes.
 
     Raises
     ------
@@ -197,8 +200,15 @@ def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> 
 
     Parameters
     ----------
-    probabilities : np.ndarray [shape=(n, C)]
-    target : np.ndarray [shape=(n,)]
+    probabilities : np.ndarray [shape=(n, C)], float
+        Of the classes, 0 to 1; at least one row.
+    target : np.ndarray [shape=(n,)], int
+        Indices of the true classes.
+
+    Returns
+    -------
+    float
+        0 (calibrated) to 1.
 
     References
     ----------
@@ -213,8 +223,15 @@ def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[B
 
     Parameters
     ----------
-    probabilities : np.ndarray [shape=(n, C)]
-    target : np.ndarray [shape=(n,)]
+    probabilities : np.ndarray [shape=(n, C)], float
+        Of the classes, 0 to 1.
+    target : np.ndarray [shape=(n,)], int
+        Indices of the true classes.
+
+    Returns
+    -------
+    list of Bin
+        By confidence, ascending.
     """
     place, confidence, right = _binned(probabilities, target)
     count = np.bincount(place, minlength=_BINS)

@@ -24,7 +24,10 @@ _GAMMA_TIMES = (0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class SvmMethod(Method):
-    """A support vector machine with RBF kernel, classes weighted against their number.
+    """A support vector machine with RBF kernel, whose classes are weighted against their number.
+
+    Support vector machines are the classifiers of "A ROS framework for audio-based activity
+    recognition", section 4.
 
     Attributes
     ----------
@@ -50,7 +53,17 @@ class SvmMethod(Method):
     def fit(
         self, examples: Examples, seen: Indices | slice = slice(None), home: Indices = NO_HOME
     ) -> "LearnedSvm":
-        """Learn from some segments; see `Method.fit`."""
+        """Learn from some segments.
+
+        Parameters
+        ----------
+        examples : Examples
+        seen : np.ndarray [shape=(m,)], intp, or slice
+            Indices of the segments to learn from; all by default.
+        home : np.ndarray [shape=(h,)], intp
+            Indices of those among them that belong to the home to which the classifier is adapted:
+            unchanged, they get votes of their own.
+        """
         copies, _, width = examples.inputs.shape
         inputs = examples.inputs[:, seen].reshape(-1, width).astype(np.float64)
         machine = SVC(
@@ -67,21 +80,43 @@ class SvmMethod(Method):
         return LearnedSvm(fitted, examples.inputs[0, home], examples.target[home])
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """Return this method with another cost or gamma; raises DataError for anything else."""
+        """Return this method with another cost or gamma.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            `cost` and `gamma`, as in the attributes; one that is not named stays.
+
+        Raises
+        ------
+        DataError
+            If another parameter is named.
+        """
         if unknown := values.keys() - {"cost", "gamma"}:
             raise DataError(f"method {self.name} has no {min(unknown)} to choose")
         cost, gamma = values.get("cost", self.cost), values.get("gamma", self.gamma)
         return replace(self, cost=cost, gamma=gamma)
 
     def variations(self) -> list[Self]:
-        """Return methods with less, as much and more cost and gamma."""
+        """Return nine methods: cost times 0.25, 1 and 4, each with gamma times 0.5, 1 and 2."""
         return [
             replace(self, cost=self.cost * cost, gamma=self.gamma * gamma)
             for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
         ]
 
     def as_of(self, description: Description) -> Self:
-        """Return the method with the parameters of a model."""
+        """Return this method with cost, gamma and number of copies of a model.
+
+        Parameters
+        ----------
+        description : Description
+            Of a support vector machine.
+
+        Raises
+        ------
+        ModelError
+            If the feature set of the method is not installed.
+        """
         width = self.features.inputs[description.inputs].width
         cost, gamma = description.parameters["cost"], description.parameters["gamma"]
         return replace(self, cost=cost, gamma=gamma * width, copies=description.copies)
@@ -106,7 +141,20 @@ class LearnedSvm:
         self._home_target = home_target
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
-        """Return decision values, as `SvmMachine` gives them; see `Learned.decide`."""
+        """Return decision values, as `SvmMachine` gives them.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+        classes : int
+            C, the number of all classes.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, C)], float64
+            That of the weakest pair of the class, plus the votes of the home's segments; -inf for
+            a class that was not learned.
+        """
         values = self.machine.decision_function(inputs.astype(np.float64))
         pairs = -values[:, np.newaxis] if values.ndim == 1 else values
         decision = np.full((len(inputs), classes), -np.inf)
@@ -143,7 +191,7 @@ class LearnedSvm:
         return arrays
 
     def parameters(self) -> dict[str, Any]:
-        """Return cost, and gamma of the kernel itself."""
+        """Return `cost`, and as `gamma` that of the kernel itself."""
         svc = self.machine[-1]
         return {"cost": float(svc.C), "gamma": float(svc.gamma)}
 

@@ -54,23 +54,27 @@ def train_model(
     method: Method = DEFAULT,
     smoothing: str = "hmm",
 ) -> Model:
-    """Learn a model; calibrate and measure it on folds that never split a source group.
+    """Learn a model, and calibrate and measure it on folds that never split a source group.
 
     Parameters
     ----------
     data : Dataset
     scenario : Scenario
-        Of the data.
+        That of the data.
     progress : callable
-        Told the share of the fits that is done.
-    method : Method
+        Is told the share of the fits that is done, 0 to 1.
+    method : Method, optional
     smoothing : str
-        Field `method` of `Smoothing`.
+        `hmm` or `merge`, as field `method` of `Smoothing` has it.
 
     Raises
     ------
     DataError
-        If a class has too few source groups to be cross-validated, or all segments are alike.
+        If a class comes from fewer than two source groups, if no division into folds leaves every
+        class something to learn from, if all segments are alike, or if the method wants augmented
+        copies and its feature set has none.
+    ModelError
+        If the feature set of the method is not installed.
     """
     check_varied(data)
     folds = group_folds(data)
@@ -113,7 +117,8 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
     home : Dataset
         Of the same classes, some of which may have no segments.
     sequences : sequence of np.ndarray [shape=(n,)], int64
-        Classes of successive frames in the home, to estimate transitions from.
+        Indices of the classes of successive frames in the home, to estimate transitions from. By
+        default the model keeps its transitions.
 
     Returns
     -------
@@ -124,8 +129,11 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
     Raises
     ------
     DataError
-        If the base model has no training windows, the home has no segments, or the method of the
-        base model is not installed.
+        If the base model has no training windows, the home has no segments, the method of the
+        base model is not installed, or that method wants augmented copies and its feature set has
+        none.
+    ModelError
+        If the method cannot be imported, or its feature set is not installed.
     """
     description = base.description
     if not len(base.training_windows):
@@ -163,7 +171,13 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
 
 
 def check_varied(data: Dataset) -> None:
-    """Raise DataError if all segments are alike."""
+    """Check that not all segments are alike.
+
+    Raises
+    ------
+    DataError
+        If there are segments, and their features never change.
+    """
     if len(data) and (np.ptp(data.windows.reshape(-1, data.windows.shape[2]), axis=0) == 0).all():
         raise DataError("all segments are alike: their features never change; is this sound?")
 
@@ -174,7 +188,7 @@ def group_folds(data: Dataset) -> list[Fold]:
     Returns
     -------
     list of Fold
-        Indices of segments to learn from and to test on; every class is among the former.
+        Indices of the segments to learn from, among which every class is, and of those to test on.
 
     Raises
     ------

@@ -19,17 +19,29 @@ def default_transitions(classes: Sequence[str]) -> Float64:
     Parameters
     ----------
     classes : sequence of str
+        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 5 s.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
-        As of `transitions_from_durations`.
+        Probability that a frame of the row's class is followed by one of the column's class.
     """
     return transitions_from_durations(expected_durations(classes), FRAME_SECONDS)
 
 
 def expected_durations(classes: Sequence[str]) -> Float64:
-    """Return the expected durations of classes in seconds, shape (C,)."""
+    """Return the expected durations of classes.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 5 s.
+
+    Returns
+    -------
+    np.ndarray [shape=(C,)], float64
+        In seconds.
+    """
     rows = map(find_class, classes)
     return np.array([_SECONDS if row is None else row.seconds for row in rows])
 
@@ -44,6 +56,7 @@ def transitions_from_durations(durations: Float64, frame_seconds: float) -> Floa
     durations : np.ndarray [shape=(C,)], float64
         In seconds; less than a frame counts as a frame.
     frame_seconds : float
+        Length of a frame, in seconds.
 
     Returns
     -------
@@ -64,21 +77,23 @@ def transitions_from_sequences(
     durations: Float64,
     frame_seconds: float = FRAME_SECONDS,
 ) -> Float64:
-    """Estimate transition probabilities from labelled sequences, with expected durations as prior.
+    """Estimate transition probabilities from labelled sequences; expected durations are the prior.
 
     The prior counts as one visit to each class; a class that is in no sequence keeps its duration.
 
     Parameters
     ----------
     sequences : sequence of np.ndarray [shape=(n,)], int64
-        Classes of successive frames.
+        Indices of the classes of successive frames.
     durations : np.ndarray [shape=(C,)], float64
-        In seconds.
+        Expected durations, in seconds; less than a frame counts as a frame.
     frame_seconds : float
+        Length of a frame, in seconds.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
+        Probability that a frame of the row's class is followed by one of the column's class.
     """
     count = len(durations)
     frames = np.maximum(durations / frame_seconds, 1.0)

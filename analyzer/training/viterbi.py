@@ -11,14 +11,23 @@ from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 
 def viterbi(probabilities: Float32, transitions: Float64) -> Indices:
-    """Return the likeliest path through a sound, shape (n,).
+    """Decode the likeliest path through a whole sound; all classes are equally likely to begin it.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float32
-        Of a classifier, frame by frame.
+        Of the classes, frame by frame, 0 to 1.
     transitions : np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], intp
+        Index of the class of each frame.
+
+    References
+    ----------
+    Viterbi, "Error bounds for convolutional codes", 1967.
     """
     count = len(transitions)
     model = _LikelihoodHMM(count)
