@@ -166,7 +166,7 @@ def prepare(method: Method, data: Dataset) -> Examples:
 
     Returns
     -------
-    Examples
+    inputs : Examples
         All segments of `data`, in their order, unchanged and in `method.copies` augmented copies.
 
     Raises

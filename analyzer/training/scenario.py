@@ -101,8 +101,8 @@ def load_scenario(name: str) -> Scenario:
     ------
     DataError
         If there is no such scenario, or if the file cannot be read, is no TOML, has an unknown
-        key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name, something else than a
-        list of labels, or one label in two places.
+        key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name of a class, or one
+        label in two places, or if the labels of a class are no list of texts.
     """
     if name in BUILTIN:
         return BUILTIN[name]
