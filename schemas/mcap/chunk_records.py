@@ -20,7 +20,22 @@ CHUNK_HEAD_LIMIT = 64  # bytes, in which the head of a compressed chunk and its 
 def iterate_records(
     content: bytes | memoryview, start: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Go from record to record in the content of a chunk: yield opcode, start and end of each.
+    """Go from record to record in the content of a chunk.
+
+    Parameters
+    ----------
+    content : bytes-like
+        Records, uncompressed.
+    start : int
+        Byte of the content at which the first record begins.
+    end : int, optional
+        Byte before which the last record ends; None for the end of the content.
+
+    Yields
+    ------
+    opcode : int
+    start, end : int
+        Bytes of the content at which the record begins, with its opcode, and before which it ends.
 
     Raises
     ------
@@ -42,7 +57,14 @@ def iterate_records(
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
-    """Make the message index of a chunk, given where its messages begin, ascending.
+    """Make the message index of a chunk.
+
+    Parameters
+    ----------
+    content : bytes-like
+        Records of the chunk, uncompressed.
+    starts : np.ndarray [shape=(n,)], int64
+        Bytes of the content at which whole message records begin, with their opcodes, ascending.
 
     Returns
     -------
@@ -66,7 +88,19 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
 
 
 def find_chunk_heads(window: bytes) -> Iterator[int]:
-    """Yield the bytes at which the head of a compressed chunk may begin, damaged or not."""
+    """Search for the heads of compressed chunks, damaged or not.
+
+    Parameters
+    ----------
+    window : bytes
+        Any part of a file. A head is found if `CHUNK_HEAD_LIMIT` bytes are there from its beginning
+        on.
+
+    Yields
+    ------
+    int
+        Bytes of the window at which the opcode of a chunk may stand, ascending.
+    """
     for match in _COMPRESSED.finditer(window):
         if match.start() >= _BEFORE_COMPRESSED:
             yield match.start() - _BEFORE_COMPRESSED

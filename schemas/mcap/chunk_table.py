@@ -51,12 +51,21 @@ class ChunkRow:
         return self.offset, self.length, self.index_length, self.size, self.start, self.end
 
     def continues(self, location: RecordLocation) -> bool:
-        """Tell whether a message belongs to this run."""
+        """Tell whether a message record belongs to this run of messages.
+
+        It does if it begins where the run ends, and the run is not too long yet.
+        """
         is_next = self.offset + self.length == location.offset
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT
 
     def extend(self, message: "ChunkRow") -> None:
-        """Add a message to this run."""
+        """Add a message to this run.
+
+        Parameters
+        ----------
+        message : ChunkRow
+            Row of that one message, which begins where the run ends.
+        """
         self.length += message.length
         self.size += message.size
         self.start = min(self.start, message.start)
@@ -66,10 +75,23 @@ class ChunkRow:
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Describe a chunk, or a message outside of chunks, from the beginning of its record.
 
+    Parameters
+    ----------
+    location : RecordLocation
+        Of the chunk or of the message.
+    head : bytes
+        Beginning of the record, with opcode and length: up to the compression's name, or to the
+        payload.
+
+    Returns
+    -------
+    ChunkRow
+        Without channels; `index_length` is 0 for a chunk and -1 for a message.
+
     Raises
     ------
     McapError
-        If it is too short, or a number in it is out of range.
+        If it is too short, or a log time or a size is 2**63 or more.
     """
     opcode, offset, length = location
     try:
@@ -87,9 +109,19 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
 
 
 def read_chunk_index(content: bytes) -> ChunkRow:
-    """Describe a chunk from the content of its chunk index.
+    """Describe a chunk from its chunk index.
 
-    Raise McapError if a number is out of range, struct.error if the content is too short.
+    Parameters
+    ----------
+    content : bytes
+        The chunk index's record, without opcode and length.
+
+    Raises
+    ------
+    McapError
+        If a place, a log time or a size is 2**63 or more.
+    struct.error
+        If the content is shorter than it claims, or holds a part of an index offset.
     """
     start, end, offset, length, entries = formats.CHUNK_INDEX.unpack_from(content)
     first = formats.CHUNK_INDEX.size
@@ -105,5 +137,15 @@ def read_chunk_index(content: bytes) -> ChunkRow:
 
 
 def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Sort chunks by the log times of their first messages."""
+    """Sort chunks by the log times of their first messages.
+
+    Parameters
+    ----------
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], of dtype `CHUNKS`
+        A sorted copy; chunks of the same time keep their order.
+    """
     return chunks[np.argsort(chunks["start"], kind="stable")]

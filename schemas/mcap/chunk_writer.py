@@ -28,6 +28,13 @@ class ChunkWriter:
     """Writes an MCAP file, chunks compressed with Zstandard and indexed.
 
     The methods that it shares with `mcap.writer.Writer` do the same.
+
+    Parameters
+    ----------
+    stream : binary file
+        Writable, and at its beginning.
+    chunk_size : int
+        Bytes of records, uncompressed; the message that goes beyond them is the last of its chunk.
     """
 
     def __init__(self, stream: BinaryIO, chunk_size: int = CHUNK_SIZE) -> None:
@@ -47,23 +54,54 @@ class ChunkWriter:
         return self.__dict__ | {"_stream": None}
 
     def continue_on(self, stream: BinaryIO) -> None:
-        """Go on with a stream that has, and is behind, all that was flushed."""
+        """Go on with another stream.
+
+        Parameters
+        ----------
+        stream : binary file
+            Holds all that was written to the last one, and is positioned behind it.
+        """
         self._stream = stream
 
     def start(self, profile: str, library: str) -> None:
-        """Begin the file."""
+        """Begin the file.
+
+        Parameters
+        ----------
+        profile : str
+            Profile of the header: `ros2`, or empty for none.
+        library : str
+            Program that writes the file.
+        """
         self._stream.write(formats.MAGIC)
         self._write(records.Header(profile, library))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Write a metadata record."""
+        """Write a metadata record.
+
+        Parameters
+        ----------
+        name : str
+        data : dict of str to str
+            Values by key.
+        """
         offset, length = self._write(records.Metadata(name, data))
         self._metadata.append(records.MetadataIndex(offset, length, name))
 
     def add_attachment(
         self, create_time: int, log_time: int, name: str, media_type: str, data: bytes
     ) -> None:
-        """Write an attachment."""
+        """Write an attachment.
+
+        Parameters
+        ----------
+        create_time, log_time : int
+            Nanoseconds of UTC.
+        name : str
+        media_type : str
+            Such as `application/json`.
+        data : bytes
+        """
         record = records.Attachment(create_time, log_time, name, media_type, data)
         self.copy_attachment(
             encode(record),
@@ -71,13 +109,36 @@ class ChunkWriter:
         )
 
     def copy_attachment(self, record: bytes | memoryview, index: records.AttachmentIndex) -> None:
-        """Write an attachment as another file holds it; its place in the index is set here."""
+        """Write an attachment as another file holds it.
+
+        Parameters
+        ----------
+        record : bytes-like
+            The whole record, with opcode and length.
+        index : mcap.records.AttachmentIndex
+            What the index will say of it; offset and length are replaced by those in this file.
+        """
         offset = self._stream.tell()
         self._stream.write(record)
         self._attachments.append(replace(index, offset=offset, length=len(record)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a schema and return its number."""
+        """Add a schema.
+
+        Parameters
+        ----------
+        name : str
+            Name of the message type.
+        encoding : str
+            Such as `ros2msg`.
+        data : bytes
+            Definition of the message type in this encoding.
+
+        Returns
+        -------
+        int
+            Number of the schema, from 1 on.
+        """
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas.append(schema)
         self._chunk.content += encode(schema)
@@ -86,7 +147,23 @@ class ChunkWriter:
     def register_channel(
         self, topic: str, message_encoding: str, schema_id: int, metadata: dict[str, str]
     ) -> int:
-        """Add a channel and return its number."""
+        """Add a channel.
+
+        Parameters
+        ----------
+        topic : str
+        message_encoding : str
+            Such as `cdr`.
+        schema_id : int
+            Number of its schema; 0 if it has none.
+        metadata : dict of str to str
+            Values by key.
+
+        Returns
+        -------
+        int
+            Number of the channel, from 1 on.
+        """
         channel = records.Channel(
             len(self._channels) + 1, topic, message_encoding, metadata, schema_id
         )
@@ -97,10 +174,17 @@ class ChunkWriter:
     def define(
         self, schemas: Sequence[records.Schema], channels: Sequence[records.Channel]
     ) -> None:
-        """Set the schemas and channels of the index, whose numbers they have already.
+        """Set the schemas and channels of the index.
 
         They are not written anywhere else: chunks that were copied contain them, or
         `write_definition` has put them before their first message.
+
+        Parameters
+        ----------
+        schemas : sequence of mcap.records.Schema
+            With the numbers that the copied chunks use.
+        channels : sequence of mcap.records.Channel
+            With the numbers that the copied chunks use.
         """
         self._schemas = list(schemas)
         self._channels = list(channels)
@@ -112,7 +196,21 @@ class ChunkWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Append a message."""
+        """Append a message.
+
+        Parameters
+        ----------
+        channel_id : int
+            Number of its channel.
+        log_time : int
+            Nanoseconds of UTC.
+        data : bytes
+            Payload, encoded.
+        publish_time : int
+            Nanoseconds of UTC.
+        sequence : int
+            0 to 2**32 - 1.
+        """
         fields = channel_id, sequence, log_time, publish_time
         head = formats.MESSAGE.pack(Opcode.MESSAGE, formats.MESSAGE_FIXED + len(data), *fields)
         self._chunk.add_message(channel_id, log_time, head, data)
@@ -120,7 +218,13 @@ class ChunkWriter:
             self.flush()
 
     def write(self, blocks: Sequence[Block]) -> None:
-        """Append blocks of messages, in the order of their log times."""
+        """Append blocks of messages, merged in the order of their log times.
+
+        Parameters
+        ----------
+        blocks : sequence of Block
+            Empty ones are left out.
+        """
         blocks = [block for block in blocks if len(block.log_times)]
         if blocks:
             self._append(merge_blocks(blocks))
@@ -132,7 +236,10 @@ class ChunkWriter:
             self._chunk = ChunkBuilder()
 
     def copy_chunk(self, chunk: StoredChunk) -> None:
-        """Write a chunk of another file as it is, and its message index behind it."""
+        """Write a chunk of another file as it is, and its message index behind it.
+
+        The chunk in progress is written before it.
+        """
         self.flush()
         self._put(chunk)
 

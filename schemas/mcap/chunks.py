@@ -37,18 +37,28 @@ def read_chunks(
 ) -> list[RawMessages]:
     """Read the messages of some topics, or of all, from some chunks of a log.
 
-    Channels and schemas that the chunks define are added to those of the file.
-
     Parameters
     ----------
+    file : LogFile
+        Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+        Rows of `file.chunks`.
+    topics : collection of str, optional
+        Topics to read: all of them if None; none if empty, which only adds definitions.
     check : bool
         Whether to compare chunks with their checksums, which takes longer than to decompress.
+
+    Returns
+    -------
+    list of RawMessages
+        One for each channel that has messages of these topics in the chunks.
 
     Raises
     ------
     LogError
-        If a chunk is damaged, or its index does not belong to it.
+        If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
+        is of a channel that is not defined; or if another chunk is damaged in which such a channel
+        was looked for.
     """
     if not len(chunks):
         return []
@@ -68,25 +78,67 @@ def read_in_batches(
     *,
     check: bool = False,
 ) -> Iterator[list[RawMessages]]:
-    """Read chunks as `read_chunks` does, a few megabytes at a time."""
+    """Read chunks as `read_chunks` does, a few megabytes at a time.
+
+    Parameters
+    ----------
+    file : LogFile
+        Log of the chunks. Channels and schemas that the chunks define are added to its own.
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+        Rows of `file.chunks`.
+    topics : collection of str, optional
+        Topics to read: all of them if None; none if empty, which only adds definitions.
+    check : bool
+        Whether to compare chunks with their checksums, which takes longer than to decompress.
+
+    Yields
+    ------
+    list of RawMessages
+        Messages of the next chunks, in the order of `chunks`: one for each channel that has some.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
+        is of a channel that is not defined; or if another chunk is damaged in which such a channel
+        was looked for.
+    """
     batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
         yield read_chunks(file, batch, topics, check=check)
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
-    """Compare chunks with their checksums; raise LogError if one is damaged."""
+    """Compare chunks with their checksums.
+
+    Parameters
+    ----------
+    file : LogFile
+        Log of the chunks. Channels and schemas that the chunks define are added to its own.
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+        Rows of `file.chunks`.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, a chunk is damaged, or what follows one is no message index.
+    """
     for _ in read_in_batches(file, chunks, topics=(), check=True):
         pass
 
 
 def read_definitions(file: LogFile) -> None:
-    """Add the schemas and channels to a file that only its chunks define.
+    """Add the schemas and channels to a log that only its chunks define.
+
+    Parameters
+    ----------
+    file : LogFile
+        Its `schemas` and `channels` are added to.
 
     Raises
     ------
     LogError
-        If one of these chunks is damaged.
+        If the log cannot be read, or one of these chunks is damaged.
     """
     for number, channels in enumerate(file.chunks["channels"].tolist()):
         identities = file.channel_sets[channels]

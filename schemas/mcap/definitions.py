@@ -6,7 +6,10 @@ Definition = Schema | Channel
 
 
 class Definitions:
-    """Schemas and channels by number, wherever a file defines them, and which contradict others."""
+    """Schemas and channels by number, wherever a file defines them.
+
+    Notes which numbers have contradictory definitions.
+    """
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -14,17 +17,43 @@ class Definitions:
         self._doubtful: set[tuple[type, int]] = set()
 
     def add(self, record: Definition) -> bool:
-        """Add a definition; return False if its number has another meaning already."""
+        """Add a definition, unless its number is taken.
+
+        Parameters
+        ----------
+        record : mcap.records.Schema or mcap.records.Channel
+
+        Returns
+        -------
+        bool
+            False if its number has another meaning already, which it keeps.
+        """
         if isinstance(record, Schema):
             return self.schemas.setdefault(record.id, record) == record
         return self.channels.setdefault(record.id, record) == record
 
     def doubt(self, record: Definition) -> None:
-        """Note that the number of a definition has another meaning, too."""
+        """Note that a definition contradicts another one of its number.
+
+        Parameters
+        ----------
+        record : mcap.records.Schema or mcap.records.Channel
+        """
         self._doubtful.add((type(record), record.id))
 
     def defines(self, number: int) -> bool:
-        """Tell whether it is certain what the messages of a channel are."""
+        """Tell whether it is certain what the messages of a channel are.
+
+        Parameters
+        ----------
+        number : int
+            Number of the channel.
+
+        Returns
+        -------
+        bool
+            Whether the channel and its schema, if it has one, are defined without contradiction.
+        """
         channel = self.channels.get(number)
         if channel is None or (Channel, number) in self._doubtful:
             return False
@@ -33,5 +62,16 @@ class Definitions:
         return is_defined and (Schema, schema) not in self._doubtful
 
     def topic(self, number: int) -> str:
-        """Name the topic of a channel, or the channel if that is not certain."""
+        """Name the topic of a channel.
+
+        Parameters
+        ----------
+        number : int
+            Number of the channel.
+
+        Returns
+        -------
+        str
+            The topic, or `channel <number>` if `defines` is False.
+        """
         return self.channels[number].topic if self.defines(number) else f"channel {number}"

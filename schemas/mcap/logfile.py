@@ -100,24 +100,64 @@ class LogFile:
         return self._file.size
 
     def is_at(self, path: Path) -> bool:
-        """Tell whether the file of this name is this one."""
+        """Tell whether a path leads to this open file, and not to another one or none."""
         return self._file.is_at(path)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read some bytes; fewer at the end of the file."""
+        """Read bytes from an offset on.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file.
+        length : int
+            Bytes to read.
+
+        Returns
+        -------
+        bytes
+            Fewer than `length` at the end of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
+        """
         return self._file.read(offset, length)
 
     def read_into(self, out: memoryview, offset: int) -> None:
-        """Read as many bytes as there is room for, or fewer at the end of the file."""
+        """Read bytes from an offset on into a buffer.
+
+        Parameters
+        ----------
+        out : memoryview
+            Filled from its beginning; only in part at the end of the file.
+        offset : int
+            Byte of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
+        """
         self._file.read_into(out, offset)
 
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another one that holds no messages.
 
+        Parameters
+        ----------
+        location : RecordLocation
+
+        Returns
+        -------
+        McapRecord or None
+            None for a chunk, a message, a message index, and a kind that MCAP does not define.
+
         Raises
         ------
         LogError
-            If it is too large, or damaged.
+            If it is larger than `LIMIT`, damaged, or cannot be read.
         """
         if location.length > LIMIT:
             raise self.damaged(location.offset, "a record claims to be too large")
@@ -128,7 +168,20 @@ class LogFile:
             raise self.damaged(location.offset, error) from error
 
     def damaged(self, offset: int, what: object) -> LogError:
-        """Make the error that says where this file is damaged."""
+        """Make the error that says where this file is damaged.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the damaged record begins.
+        what : object
+            What is wrong there: a text, or an error.
+
+        Returns
+        -------
+        LogError
+            For the caller to raise.
+        """
         return LogError(
             f"{self.path}: damaged at byte {offset} ({what}); `hearthlog recover` saves the rest"
         )
@@ -191,8 +244,16 @@ class LogFile:
     def scan_new(self) -> NDArray[np.void]:
         """Walk through the records that were written since the last scan.
 
-        Return the chunks among them, and runs of messages outside of chunks, by start time. Raise
-        LogError if a record is damaged.
+        Returns
+        -------
+        np.ndarray [shape=(n,)], of dtype `CHUNKS`
+            The chunks among them, and runs of messages outside of chunks, by start time. They are added
+            to `chunks`, too.
+
+        Raises
+        ------
+        LogError
+            If a record is damaged, or the file cannot be read.
         """
         rows = array("q")
         row: ChunkRow | None = None

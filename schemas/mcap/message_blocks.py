@@ -17,7 +17,10 @@ class Block(NamedTuple):
 
     Attributes
     ----------
+    channel : int
+        Number of the channel in the file that is written.
     log_times, publish_times : np.ndarray [shape=(n,)], int64
+        Nanoseconds of UTC.
     sequences : np.ndarray [shape=(n,)], uint32
     payloads : np.ndarray [shape=(n,)], of a dtype of the payloads' size
     rank : np.ndarray [shape=(n,)], int64
@@ -32,7 +35,13 @@ class Block(NamedTuple):
     rank: Int64
 
     def records(self) -> NDArray[np.void]:
-        """Return the message records, of dtype V`size`."""
+        """Encode the message records.
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], of dtype V`size`
+            One record in each row, with opcode and length; `size` is that of a whole record.
+        """
         size = self.payloads.dtype.itemsize
         records = np.empty(len(self.payloads), [("head", MESSAGE_HEAD), ("payload", f"V{size}")])
         head = records["head"]
@@ -47,9 +56,20 @@ class Block(NamedTuple):
 
 
 def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> Iterator[Block]:
-    """Group messages by the sizes of their payloads, to write them as they are to a channel.
+    """Group messages by the sizes of their payloads, to write them unchanged to a channel.
 
-    The first of them has the rank `first_rank`, the others follow.
+    Parameters
+    ----------
+    messages : RawMessages
+    channel : int
+        Number of the channel in the file that is written.
+    first_rank : int
+        Rank of the first message; those of the others count up from it, in the order of `messages`.
+
+    Yields
+    ------
+    Block
+        Messages of one size, in the order of their log times; sizes ascend.
     """
     for size in np.unique(messages.sizes).tolist():
         rows = np.flatnonzero(messages.sizes == size)
@@ -65,7 +85,21 @@ def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> 
 
 
 class MessageRecords(NamedTuple):
-    """Message records one behind the other: where each ends, its bytes, channel and log time."""
+    """Message records of several channels.
+
+    Attributes
+    ----------
+    data : np.ndarray [shape=(b,)], uint8
+        The records, one behind the other.
+    ends : np.ndarray [shape=(n,)], int64
+        Bytes of the data before which each record ends.
+    sizes : np.ndarray [shape=(n,)], int64
+        Bytes of each record.
+    channels : np.ndarray [shape=(n,)], int64
+        Number of the channel of each.
+    times : np.ndarray [shape=(n,)], int64
+        Log time of each in nanoseconds, ascending.
+    """
 
     data: Bytes
     ends: Int64
@@ -75,7 +109,13 @@ class MessageRecords(NamedTuple):
 
 
 def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
-    """Encode the messages of some blocks, none of them empty, in the order of their log times."""
+    """Encode the messages of several blocks in the order of their log times.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        One or more, none of them empty. Messages of the same log time are sorted by their ranks.
+    """
     times = np.concatenate([block.log_times for block in blocks])
     order = np.lexsort((np.concatenate([block.rank for block in blocks]), times))
     counts = [len(block.log_times) for block in blocks]

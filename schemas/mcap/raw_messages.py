@@ -34,7 +34,20 @@ class RawMessages:
         return self.heads["log_time"]
 
     def between(self, start: int | None, end: int | None) -> "RawMessages":
-        """Return the messages with start <= log time < end."""
+        """Select the messages with start <= log time < end.
+
+        Parameters
+        ----------
+        start : int or None
+            Nanoseconds of UTC; None for the first message on.
+        end : int or None
+            Nanoseconds of UTC; None for up to the last message.
+
+        Returns
+        -------
+        RawMessages
+            With the same buffer.
+        """
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
@@ -42,14 +55,40 @@ class RawMessages:
 
 
 def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
-    """Return where in ascending times those with start <= time < end begin and stop."""
+    """Find the times with start <= time < end.
+
+    Parameters
+    ----------
+    times : np.ndarray [shape=(n,)], int64
+        Ascending, in any unit.
+    start : int or None
+        In the same unit; None for no lower limit.
+    end : int or None
+        In the same unit; None for no upper limit.
+
+    Returns
+    -------
+    first, last : int
+        Places of the first of these times, and behind the last of them; equal if there are none.
+    """
     first = 0 if start is None else int(np.searchsorted(times, start))
     last = len(times) if end is None else int(np.searchsorted(times, end))
     return first, max(first, last)
 
 
 def gather_heads(buffer: Bytes | bytes, starts: Int64) -> NDArray[np.void]:
-    """Copy the heads (`MESSAGE_HEAD`) of the messages that begin at some bytes of a buffer."""
+    """Copy the heads of messages out of a buffer.
+
+    Parameters
+    ----------
+    buffer : bytes or np.ndarray [shape=(b,)], uint8
+    starts : np.ndarray [shape=(n,)], int64
+        Bytes of the buffer at which the message records begin, with their opcodes.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
+    """
     if not len(starts):
         return np.empty(0, MESSAGE_HEAD)
     array = np.frombuffer(buffer, np.uint8)

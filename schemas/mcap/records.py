@@ -48,7 +48,18 @@ class _Content(ReadDataStream):
 
 
 def parse(opcode: int, content: bytes) -> McapRecord | None:
-    """Parse a record that holds no messages; None if this is not one of them.
+    """Parse a record of a kind that holds no messages.
+
+    Parameters
+    ----------
+    opcode : int
+    content : bytes
+        The record, without opcode and length.
+
+    Returns
+    -------
+    McapRecord or None
+        None for a chunk, a message, a message index, and a kind that MCAP does not define.
 
     Raises
     ------
@@ -69,7 +80,21 @@ def encode(record: McapRecord) -> bytes:
 
 
 class ChunkHead(NamedTuple):
-    """The head of a chunk; size and CRC (0: none) of its records, and which bytes are its data."""
+    """The head of a chunk.
+
+    Attributes
+    ----------
+    start, end : int
+        Log times of the first and the last message, in nanoseconds.
+    size : int
+        Bytes of the records, uncompressed.
+    crc : int
+        CRC-32 of the same; 0 if there is none.
+    compression : bytes
+        `zstd`, `lz4`, or empty if the records are stored as they are.
+    data : slice
+        Which bytes of the chunk's content are its compressed records.
+    """
 
     start: int
     end: int
@@ -82,10 +107,15 @@ class ChunkHead(NamedTuple):
 def chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from its content.
 
+    Parameters
+    ----------
+    content : bytes-like
+        The chunk's record, without opcode and length.
+
     Raises
     ------
     McapError
-        If it contradicts itself, or claims to be larger than `LIMIT`.
+        If it is shorter than it claims, or claims records larger than `LIMIT`.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
@@ -113,10 +143,15 @@ def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = Fa
     check : bool
         Whether to compare with the checksum, which takes longer than to decompress.
 
+    Returns
+    -------
+    bytes
+        The records, one behind the other: `head.size` bytes.
+
     Raises
     ------
     McapError
-        If the data are damaged.
+        If the compression is unknown, or the data are damaged.
     """
     out = bytearray(head.size)
     decompress_into(memoryview(out), head, content, check=check)
@@ -126,9 +161,22 @@ def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = Fa
 def decompress_into(
     out: memoryview, head: ChunkHead, content: bytes | memoryview, *, check: bool = False
 ) -> None:
-    """Decompress the records of a chunk to where there is room for `head.size` bytes.
+    """Decompress the records of a chunk into a buffer.
 
-    Parameters and errors are those of `decompress`.
+    Parameters
+    ----------
+    out : memoryview
+        Exactly `head.size` bytes, which are overwritten.
+    head : ChunkHead
+    content : bytes-like
+        The chunk's record, without opcode and length.
+    check : bool
+        Whether to compare with the checksum, which takes longer than to decompress.
+
+    Raises
+    ------
+    McapError
+        If the compression is unknown, or the data are damaged.
     """
     try:
         size = _DECOMPRESS[head.compression](content[head.data], out)

@@ -20,12 +20,22 @@ _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 
 
 def time_span(path: Path) -> tuple[int, int] | None:
-    """Return the first and the last log time of a log in nanoseconds; None without messages.
+    """Find the first and the last log time of a log.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Returns
+    -------
+    tuple of int, or None
+        The two log times in nanoseconds of UTC; None if the log has no messages.
 
     Raises
     ------
     LogError
-        If it is no MCAP file, or is damaged.
+        If it cannot be read, is no MCAP file, or is damaged.
     """
     try:
         with closing(open_file(path)) as file:
@@ -42,7 +52,19 @@ def time_span(path: Path) -> tuple[int, int] | None:
 
 
 def topic_counts(path: Path) -> Counter[str]:
-    """Count the messages of each topic as a finished log claims, so far as that can be true."""
+    """Count the messages of each topic by the statistics of a finished log.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Returns
+    -------
+    Counter of str
+        Messages by topic, as the log claims, but no more of a channel than the log has bytes. Nothing
+        is counted if the log has no statistics, they are damaged, or it cannot be read.
+    """
     topics: Counter[str] = Counter()
     with (
         suppress(LogError, McapError, UnicodeDecodeError, struct.error),

@@ -38,7 +38,17 @@ _LOCAL = _Local()
 
 
 class ChunkBuilder:
-    """A chunk in progress: its records, its message index by channel, its span of log times."""
+    """A chunk in progress.
+
+    Attributes
+    ----------
+    content : bytearray
+        Its records, uncompressed, one behind the other.
+    entries : dict of int to bytearray
+        Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
+    start, end : int
+        Log times of the first and the last message, in nanoseconds; `LATEST` and 0 without messages.
+    """
 
     def __init__(self) -> None:
         self.content = bytearray()
@@ -46,14 +56,35 @@ class ChunkBuilder:
         self.start, self.end = LATEST, 0
 
     def add_message(self, channel: int, log_time: int, head: bytes, payload: bytes) -> None:
-        """Append one message: the beginning of its record, and its payload."""
+        """Append one message.
+
+        Parameters
+        ----------
+        channel : int
+            Number of its channel.
+        log_time : int
+            Nanoseconds.
+        head : bytes
+            Beginning of its record, up to the payload (`MESSAGE`).
+        payload : bytes
+        """
         entry = INDEX_ENTRY.pack(log_time, len(self.content))
         self.entries.setdefault(channel, bytearray()).extend(entry)
         self.content += head + payload
         self.start, self.end = min(self.start, log_time), max(self.end, log_time)
 
     def add_messages(self, data: Bytes, channels: Int64, entries: NDArray[np.void]) -> None:
-        """Append message records, with the channel and the `INDEX_ENTRIES` of each."""
+        """Append message records.
+
+        Parameters
+        ----------
+        data : np.ndarray [shape=(b,)], uint8
+            The records, one behind the other.
+        channels : np.ndarray [shape=(n,)], int64
+            Number of the channel of each; n is 1 or more.
+        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
+            Log time of each, and its offset in the content of the whole chunk.
+        """
         self.content += data.data
         numbers, firsts = np.unique(channels, return_index=True)
         for channel in numbers[np.argsort(firsts)].tolist():
