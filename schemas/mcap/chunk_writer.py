@@ -203,7 +203,7 @@ class ChunkWriter:
         channel_id : int
             Number of its channel.
         log_time : int
-            Nanoseconds of UTC.
+            Nanoseconds of UTC, 0 to 2**63 - 1.
         data : bytes
             Payload, encoded.
         publish_time : int

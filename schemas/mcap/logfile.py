@@ -247,8 +247,8 @@ class LogFile:
         Returns
         -------
         np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            The chunks among them, and runs of messages outside of chunks, by start time. They are added
-            to `chunks`, too.
+            The chunks among them, and runs of messages outside of chunks, by start time. They are
+            added to `chunks`, too.
 
         Raises
         ------

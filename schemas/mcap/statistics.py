@@ -62,8 +62,8 @@ def topic_counts(path: Path) -> Counter[str]:
     Returns
     -------
     Counter of str
-        Messages by topic, as the log claims, but no more of a channel than the log has bytes. Nothing
-        is counted if the log has no statistics, they are damaged, or it cannot be read.
+        Messages by topic, as the log claims, but no more of a channel than the log has bytes.
+        Nothing is counted if the log has no statistics, they are damaged, or it cannot be read.
     """
     topics: Counter[str] = Counter()
     with (

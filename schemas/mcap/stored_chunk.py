@@ -47,7 +47,7 @@ class ChunkBuilder:
     entries : dict of int to bytearray
         Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
     start, end : int
-        Log times of the first and the last message, in nanoseconds; `LATEST` and 0 without messages.
+        First and last log time of its messages, in nanoseconds; `LATEST` and 0 without messages.
     """
 
     def __init__(self) -> None:

@@ -65,7 +65,17 @@ class DamageList:
         self._damages: list[tuple[Damage, dict[int, int]]] = []
 
     def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
-        """Add a damage, behind all others, and its lost messages by channel."""
+        """Add a damage, which must be behind all others in the file.
+
+        All from the thousandth on count as one, with the lost messages of the first of them.
+
+        Parameters
+        ----------
+        damage : Damage
+            Its own `messages` are replaced.
+        messages : dict of int to int, optional
+            Lost messages by channel; None for none.
+        """
         if len(self._damages) == _DAMAGES:
             last, lost = self._damages.pop()
             lossless = damage.lossless and last.lossless and not messages and not lost
@@ -76,13 +86,36 @@ class DamageList:
     def add_unnamed(
         self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
     ) -> None:
-        """Add messages of a channel that is not defined so far, and the record they are in."""
+        """Add messages of a channel that is not defined so far.
+
+        Parameters
+        ----------
+        channel : int
+            Number of the channel.
+        messages : int
+            How many there are.
+        times : tuple of int
+            First and last log time of them, in nanoseconds.
+        whole : WholeRecord
+            The record they are in, which must be behind those of the channel that were added before.
+        """
         count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))
         span = min(span[0], times[0]), max(span[1], times[1])
         self.unnamed[channel] = count + messages, span, (start, whole.end)
 
     def resolve(self, definitions: Definitions) -> list[Damage]:
-        """List the damages by offset, then the unnamed messages, with the names of topics."""
+        """List the damages, then the messages without a definition, with the names of topics.
+
+        Parameters
+        ----------
+        definitions : Definitions
+            Tell the topics of channels.
+
+        Returns
+        -------
+        list of Damage
+            Damages by offset, then one for each channel that was added as unnamed.
+        """
         damages = []
         for damage, lost in self._damages:
             messages: dict[str, int] = {}
@@ -117,7 +150,14 @@ class Index(NamedTuple):
 class DamagedRange(NamedTuple):
     """Bytes of a file that hold no whole record.
 
-    `opcode` is the first of them, and `ends` where the record should end that may have been here.
+    Attributes
+    ----------
+    start, end : int
+        Bytes of the file at which the range begins, and before which it ends.
+    opcode : int
+        The first byte of the range.
+    ends : tuple of int
+        Bytes at which the record should end that may have been here.
     """
 
     start: int
@@ -139,9 +179,19 @@ _NOTHING = Loss({}, exact=True)
 
 
 def read_index(reader: RecordVerifier, limit: int) -> Index | None:
-    """Read the index of a finished file; None if there is none, or if it may be damaged.
+    """Read the index of a finished file.
 
-    An index of more bytes than the limit is not read.
+    Parameters
+    ----------
+    reader : RecordVerifier
+        Of the file, up to its end.
+    limit : int
+        Bytes; a larger index is not read.
+
+    Returns
+    -------
+    Index or None
+        None if the file has no index, if it is larger than the limit, or if it may be damaged.
     """
     end = reader.end - FOOTER_SIZE
     tail = reader.read(max(end, 0), FOOTER_SIZE)
@@ -196,7 +246,17 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
 
 
 def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) -> Loss:
-    """Find out what was lost in a damaged range."""
+    """Find out what was lost in a damaged range.
+
+    Parameters
+    ----------
+    reader : RecordVerifier
+        Of the file.
+    damaged : DamagedRange
+    index : Index or None
+        Index of the file. None if the file has none that is whole: the bytes of the range and the
+        message indexes behind it then tell what was lost.
+    """
     if index is None:
         return _loss_by_neighbours(reader, damaged)
     others = tuple(

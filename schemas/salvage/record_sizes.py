@@ -35,7 +35,18 @@ LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
 
 
 def find_record_heads(window: bytes) -> list[int]:
-    """Search for the bytes at which opcode and length of a record may stand, ascending."""
+    """Search for the heads of records, damaged or not.
+
+    Parameters
+    ----------
+    window : bytes
+        Any part of a file.
+
+    Returns
+    -------
+    list of int
+        Bytes of the window at which an opcode and a length may stand that go together, ascending.
+    """
     count = len(window) - HEAD.size + 1
     if count <= 0:
         return []

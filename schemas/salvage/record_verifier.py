@@ -25,7 +25,19 @@ from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
 class RecordVerifier:
     """Reads whole records of a file from any byte on.
 
-    `end` is where the part of the file ends that is read.
+    Parameters
+    ----------
+    descriptor : int
+        Of the file, open for reading; the caller closes it.
+    end : int
+        Byte of the file before which reading ends.
+
+    Attributes
+    ----------
+    work : int
+        Bytes that were read and decompressed so far.
+    inner : int
+        Records inside of chunks that were gone through so far.
     """
 
     def __init__(self, descriptor: int, end: int) -> None:
@@ -35,13 +47,43 @@ class RecordVerifier:
         self._descriptor = descriptor
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read some bytes; fewer at the end of the file."""
+        """Read bytes from an offset on.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file.
+        length : int
+            Bytes to read.
+
+        Returns
+        -------
+        bytes
+            Fewer than `length` at the end of what is read of the file.
+        """
         data = os.pread(self._descriptor, max(min(length, self.end - offset), 0), offset)
         self.work += len(data)
         return data
 
     def head(self, offset: int) -> tuple[int, int]:
-        """Read opcode and length, whatever they claim; raise McapError if the file ends before."""
+        """Read the opcode and the length of a record, whatever they claim.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the record begins.
+
+        Returns
+        -------
+        opcode : int
+        length : int
+            Bytes of its content, by its own claim.
+
+        Raises
+        ------
+        McapError
+            If the file ends before that.
+        """
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
             raise McapError("the file ends within a record")
@@ -49,10 +91,25 @@ class RecordVerifier:
         return opcode, length
 
     def ends(self, offset: int) -> tuple[int, int]:
-        """Say where a record ends by the length before it, and by the lengths inside of it.
+        """Find where a record ends by the length before it, and by the lengths inside of it.
 
-        For a message, and for what is no record, both are the same; where the file ends before
-        that is said, the second is beyond all files.
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the record begins.
+
+        Returns
+        -------
+        outer : int
+            End by the length before it: byte of the file.
+        inner : int
+            End by the lengths inside of it. The same as `outer` for a message, and for what is no record;
+            `UNKNOWN` if the file ends before one of these lengths.
+
+        Raises
+        ------
+        McapError
+            If the file ends within opcode and length.
         """
         opcode, length = self.head(offset)
         outer = offset + HEAD.size + length
@@ -68,7 +125,13 @@ class RecordVerifier:
         return outer, inner
 
     def like_message_index(self, offset: int) -> bool:
-        """Whether the record that begins here could be a message index, but for its opcode."""
+        """Tell whether a record could be a message index, whatever its opcode says.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the record begins.
+        """
         data = self.read(offset, HEAD.size + MESSAGE_INDEX.size)
         if len(data) < HEAD.size + MESSAGE_INDEX.size:
             return False
@@ -77,7 +140,13 @@ class RecordVerifier:
         return bool(length == size + MESSAGE_INDEX.size and size % INDEX_ENTRIES.itemsize == 0)
 
     def plausible(self, offset: int) -> bool:
-        """Whether a record may begin here, or the file may be cut here."""
+        """Tell whether a record may begin at a byte, or the file may be cut there.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file.
+        """
         if offset >= self.end:
             return offset == self.end
         data = self.read(offset, HEAD.size)
@@ -87,10 +156,15 @@ class RecordVerifier:
         return bool(SHORTEST[opcode] <= length <= LIMIT) or data.startswith(MAGIC)
 
     def whole(self, offset: int, chained: int = 1) -> WholeRecord:
-        """Read the record that begins here, if it is whole.
+        """Read a record, if it is whole.
 
-        A message outside of chunks has nothing else to be known by than the plausible records that
-        must follow it: so many as `chained`.
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the record begins.
+        chained : int
+            How many plausible records must follow a message outside of chunks, which has nothing else to
+            be known by. The count ends at the first of them that is no message.
 
         Raises
         ------
@@ -124,12 +198,22 @@ class RecordVerifier:
         return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
 
     def chunk(self, offset: int) -> WholeRecord:
-        """Read a chunk that should begin here, if its content is proved, whatever its head says.
+        """Read a chunk whose content is proved, whatever its head says.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which the chunk should begin.
+
+        Returns
+        -------
+        WholeRecord
+            With a WholeChunk, whose times and message index are made from its content.
 
         Raises
         ------
         McapError
-            If it is not.
+            If no chunk begins here, or its content is not proved.
         UnicodeDecodeError
             If a text in it is not UTF-8.
         """
@@ -209,12 +293,25 @@ class RecordVerifier:
         return WholeRecord(offset, end, whole_records.read_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
-        """Read a message index: its channel, its entries, and where it ends.
+        """Read a message index.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file at which it begins.
+
+        Returns
+        -------
+        channel : int
+            Number of its channel.
+        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
+        end : int
+            Byte of the file before which it ends.
 
         Raises
         ------
         McapError
-            If there is none.
+            If there is none, or it is damaged.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")

@@ -30,10 +30,14 @@ def recover_log(
 
     Parameters
     ----------
+    source : Path
+        Damaged log, on this machine.
+    copy : Path
+        New log, on this machine; overwrites a file of this name.
     name : str
-        Name that the copy will have in the end.
+        File name that the copy will have in the end.
     progress : callable, optional
-        Called with the share that is done, 0 to 1.
+        Called with the share that is done, 0 to 1; starts again if a second attempt is needed.
 
     Returns
     -------
@@ -72,7 +76,14 @@ def recover_log(
 
 
 def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
-    """Put a log in the place of a damaged one, which is kept beside it as `*.damaged`.
+    """Put a whole log in the place of a damaged one, which is kept beside it as `*.damaged`.
+
+    Parameters
+    ----------
+    log : Path
+        Damaged log, on this machine, finished or not.
+    progress : callable, optional
+        Called with the share that is done, 0 to 1.
 
     Returns
     -------
@@ -83,8 +94,11 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
 
     Raises
     ------
+    NothingWholeError
+        If the log is no MCAP file, or nothing in it is whole.
     LogError
-        As `recover_log`, or if the log is being written, or there is a file of a name needed here.
+        If it is being written, cannot be read, or there is a file of a name needed here; or if the
+        copy cannot be written, or does not hold what was written to it.
     """
     path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")
@@ -120,10 +134,17 @@ def _keep(log: Path, name: Path) -> None:
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     """Read a recovered log with all its checksums, and count its messages.
 
+    Parameters
+    ----------
+    path : Path
+        The recovered log.
+    topics : dict of str to TopicRecovery
+        What was saved, by topic; only `messages` is compared.
+
     Raises
     ------
     LogError
-        If it is damaged, or does not hold the messages that were recovered.
+        If it is damaged or cannot be read, or does not hold the messages that were recovered.
     """
     expected = Counter({name: topic.messages for name, topic in topics.items() if topic.messages})
     counts: Counter[str] = Counter()
@@ -141,7 +162,23 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
 
 @contextmanager
 def lock_abandoned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a log, unless a recorder that writes it does; yield whether it is held."""
+    """Hold the lock of a log, unless the recorder that writes the log holds it.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine.
+
+    Yields
+    ------
+    bool
+        Whether the lock is held, so that nobody writes the log.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read.
+    """
     try:
         stream = os.fdopen(open_regular(path), "rb")
     except OSError as error:

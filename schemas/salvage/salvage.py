@@ -49,6 +49,8 @@ class Salvage:
 
     Parameters
     ----------
+    path : Path
+        On this machine.
     definitions : iterable of mcap.records.Schema and mcap.records.Channel, optional
         What an earlier salvage of the same file met too late.
 
@@ -58,10 +60,19 @@ class Salvage:
         Whether it begins as such a file does.
     complete : bool
         Whether it is finished, and its index is whole.
+    header : mcap.records.Header or None
+        The first one met so far.
     definitions : Definitions
         Those met so far.
     expected : dict of int to int, or None
         How many messages each channel should have, if an index says so that is whole.
+    unnamed : dict of int to tuple
+        By channel that was not defined when its messages were met: how many these are, their first
+        and last log time, and the bytes of the file between which they are.
+    size : int
+        Bytes of the file.
+    offset : int
+        Bytes that `pieces` has passed so far.
 
     Raises
     ------
@@ -111,9 +122,12 @@ class Salvage:
     def pieces(self) -> Iterator[Piece]:
         """Read whatever is whole, in the order of the file.
 
-        Chunks have been compared with their checksums, and have the message index that they
-        should have. They hold no messages of undefined channels: where there are such, the other
-        messages come one by one.
+        Yields
+        ------
+        mcap.records.Metadata, mcap.records.Message, WholeAttachment or WholeChunk
+            Chunks have been compared with their checksums, and have the message index that they should
+            have. They hold no messages of undefined channels: where there are such, the other messages
+            come one by one.
         """
         self.offset = len(MAGIC) if self.is_mcap else 0
         while self.offset < self._reader.end:

@@ -50,8 +50,14 @@ class Recovery:
 class SalvagedCopy:
     """Copies the whole pieces of a damaged log into a new one.
 
-    `profile` is what the header of the new log says if that of the old one is lost; `pieces` counts
-    what was copied.
+    Parameters
+    ----------
+    stream : binary file
+        The new log: writable, and at its beginning.
+    salvage : Salvage
+        Of the damaged log; `write` goes through all its pieces.
+    profile : str
+        What the header of the new log says if that of the old one is lost.
     """
 
     def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
@@ -66,7 +72,15 @@ class SalvagedCopy:
         self._span = (1 << 63, 0)
 
     def write(self, name: str, progress: Progress) -> None:
-        """Write all pieces, and complete the file, which will have this name."""
+        """Write all pieces, and complete the file.
+
+        Parameters
+        ----------
+        name : str
+            File name that the new log will have in the end, for rosbag2.
+        progress : callable
+            Called after each piece with the share of the damaged log that is passed, 0 to 1.
+        """
         for piece in self._salvage.pieces():
             self._add(piece)
             progress(self._salvage.offset / self._salvage.size)
@@ -89,7 +103,13 @@ class SalvagedCopy:
         return late or (self._salvage.header is None and self.profile() != self._profile)
 
     def profile(self) -> str:
-        """Guess the profile, where the header is lost, from how messages are encoded."""
+        """Guess the profile of a log without header by how its messages are encoded.
+
+        Returns
+        -------
+        str
+            `ros2` if a channel is encoded as CDR; else an empty text.
+        """
         channels = self._salvage.definitions.channels.values()
         return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
 

@@ -46,7 +46,19 @@ class WholeRecord(NamedTuple):
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
-    """Go through the records of a chunk, and return where messages and definitions begin.
+    """Find where the messages and the definitions of a chunk begin.
+
+    Parameters
+    ----------
+    content : bytes
+        Records of the chunk, uncompressed.
+
+    Returns
+    -------
+    messages : np.ndarray [shape=(m,)], int64
+        Bytes of the content at which messages begin, with their opcodes, ascending.
+    definitions : np.ndarray [shape=(d,)], int64
+        The same of schemas and channels.
 
     Raises
     ------
@@ -68,12 +80,24 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 
 
 def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
-    """Read the schemas and channels that begin at some bytes of a chunk.
+    """Read the schemas and channels of a chunk.
+
+    Parameters
+    ----------
+    content : bytes
+        Records of the chunk, uncompressed.
+    starts : np.ndarray [shape=(d,)], int64
+        Bytes of the content at which they begin, with their opcodes.
+
+    Returns
+    -------
+    list of mcap.records.Schema and mcap.records.Channel
+        In the order of `starts`.
 
     Raises
     ------
     McapError
-        If one is damaged, or they are too many.
+        If one is damaged, or there are more than 524288.
     UnicodeDecodeError
         If a text in it is not UTF-8.
     """
@@ -89,12 +113,22 @@ def read_definitions(content: bytes, starts: Int64) -> list[Definition]:
 
 
 def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
-    """Return the first and last log time of a message index; 0 and 0 if it is empty.
+    """Find the first and the last log time of a message index.
+
+    Parameters
+    ----------
+    entries : mapping of int to bytes
+        By channel: rows of dtype `INDEX_ENTRIES`.
+
+    Returns
+    -------
+    first, last : int
+        Log times in nanoseconds; 0 and 0 if the index is empty.
 
     Raises
     ------
     McapError
-        If a log time is out of range.
+        If a log time is 2**63 or more.
     """
     if not entries:
         return 0, 0
@@ -105,7 +139,18 @@ def span_of(entries: Mapping[int, bytes]) -> tuple[int, int]:
 
 
 def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
-    """Read the messages of a chunk that is proved, one by one."""
+    """Read the messages of a chunk one by one.
+
+    Parameters
+    ----------
+    chunk : StoredChunk
+        A chunk whose content is proved.
+
+    Yields
+    ------
+    mcap.records.Message
+        In the order of the chunk.
+    """
     head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
     content = decompress(head, chunk.data)
     for opcode, start, end in iterate_records(content):
@@ -114,7 +159,18 @@ def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
 
 
 def read_message(raw: bytes) -> records.Message:
-    """Read a message from its record; raise McapError if its log time is out of range."""
+    """Read a message from its record.
+
+    Parameters
+    ----------
+    raw : bytes
+        The whole record, with opcode and length.
+
+    Raises
+    ------
+    McapError
+        If its log time is 2**63 or more.
+    """
     _, _, channel, sequence, log_time, publish_time = MESSAGE.unpack_from(raw)
     if log_time >= 1 << 63:
         raise McapError("a log time is out of range")
@@ -122,7 +178,17 @@ def read_message(raw: bytes) -> records.Message:
 
 
 def read_attachment(raw: bytes) -> WholeAttachment:
-    """Read an attachment from its record, whose lengths add up.
+    """Read an attachment from its record.
+
+    Parameters
+    ----------
+    raw : bytes
+        The whole record, with opcode and length; the lengths inside of it add up to that.
+
+    Returns
+    -------
+    WholeAttachment
+        With an index record whose offset and length are 0.
 
     Raises
     ------
