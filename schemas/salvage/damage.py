@@ -97,7 +97,7 @@ class DamageList:
         times : tuple of int
             First and last log time of them, in nanoseconds.
         whole : WholeRecord
-            The record they are in, which must be behind those of the channel that were added before.
+            The record they are in, which must be behind those added before for the channel.
         """
         count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))
         span = min(span[0], times[0]), max(span[1], times[1])

@@ -103,8 +103,8 @@ class RecordVerifier:
         outer : int
             End by the length before it: byte of the file.
         inner : int
-            End by the lengths inside of it. The same as `outer` for a message, and for what is no record;
-            `UNKNOWN` if the file ends before one of these lengths.
+            End by the lengths inside of it. The same as `outer` for a message, and for what is no
+            record; `UNKNOWN` if the file ends before one of these lengths.
 
         Raises
         ------
@@ -163,8 +163,8 @@ class RecordVerifier:
         offset : int
             Byte of the file at which the record begins.
         chained : int
-            How many plausible records must follow a message outside of chunks, which has nothing else to
-            be known by. The count ends at the first of them that is no message.
+            How many plausible records must follow a message outside of chunks, which has nothing
+            else to be known by. The count ends at the first of them that is no message.
 
         Raises
         ------

@@ -125,9 +125,9 @@ class Salvage:
         Yields
         ------
         mcap.records.Metadata, mcap.records.Message, WholeAttachment or WholeChunk
-            Chunks have been compared with their checksums, and have the message index that they should
-            have. They hold no messages of undefined channels: where there are such, the other messages
-            come one by one.
+            Chunks have been compared with their checksums, and have the message index that they
+            should have. They hold no messages of undefined channels: where there are such, the
+            other messages come one by one.
         """
         self.offset = len(MAGIC) if self.is_mcap else 0
         while self.offset < self._reader.end:
