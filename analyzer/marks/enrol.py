@@ -63,10 +63,10 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     home : Path
         Folder of the training set; the log goes to its folder `enrolled`.
     label : str
-        Class of the sound.
+        Class of the sound: lower-case letters, digits and `_`.
     audio : Path
     seconds : float, optional
-        How much of it; all by default.
+        How much of it; at least 1. All of it by default.
 
     Returns
     -------
@@ -76,11 +76,12 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
     Raises
     ------
     DataError
-        If the label is no valid class, or there is less than a second of sound, or only silence.
+        If the label cannot be the name of a class, if there is less than a second of sound, or if
+        the sound is only silence and the label is not.
     SourceError
-        If the file is no audio.
+        If the file is missing, or is no audio.
     LogError
-        If the log cannot be written.
+        If an enrolled log is damaged, or the new one cannot be written.
     """
     _check_label(label)
     length = audio_seconds(audio)
@@ -97,18 +98,35 @@ def enrol_microphone(
     seconds: float = SECONDS,
     listening: Callable[[], None] = lambda: None,
 ) -> list[Enrolled]:
-    """Enrol what a microphone hears now; returns and raises as `enrol_file`.
+    """Enrol what a microphone hears now.
 
     Parameters
     ----------
     home : Path
+        Folder of the training set; the log goes to its folder `enrolled`.
     label : str
-        As of `enrol_file`.
+        Class of the sound: lower-case letters, digits and `_`.
     device : str
         As `hearthlog devices` lists it; empty for the default one.
     seconds : float
+        How long to listen; at least 1.
     listening : callable
-        Is called when the microphone is open.
+        Is called without arguments when the microphone is open.
+
+    Returns
+    -------
+    list of Enrolled
+        One, or two where the times cross midnight.
+
+    Raises
+    ------
+    DataError
+        If the label cannot be the name of a class, if there is less than a second of sound, or if
+        the sound is only silence and the label is not.
+    SourceError
+        If the microphone cannot be opened, or gives no sound.
+    LogError
+        If the log cannot be written.
     """
     _check_label(label)
     with closing(MicrophoneSource(device)) as source:
@@ -123,21 +141,24 @@ def enrol_microphone(
 
 
 def enrol_log(home: Path, label: str, log: Path, start: int, end: int) -> Enrolled:
-    """Enrol a span of a log, or of a folder of logs: its features, message for message.
+    """Enrol a span of time of a log, or of a folder of logs: its features, message for message.
 
     Parameters
     ----------
     home : Path
+        Folder of the training set; the log goes to its folder `enrolled`.
     label : str
-        As of `enrol_file`.
+        Class of the sound: lower-case letters, digits and `_`.
     log : Path
     start, end : int
-        In nanoseconds of UTC: the frames from `start` on, before `end`.
+        Nanoseconds of UTC: the frames from `start` on, before `end`.
 
     Raises
     ------
     DataError
-        As `enrol_file`, and if the log is of several microphones.
+        If the label cannot be the name of a class, if the log is of several microphones or has no
+        features with an energy, if there is less than a second of sound, or if the sound is only
+        silence and the label is not.
     LogError
         If there is no such log, if one is damaged, or if nothing can be written.
     """

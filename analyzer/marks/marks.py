@@ -81,7 +81,8 @@ def read_marks(log: Path) -> list[Mark]:
     Raises
     ------
     LogError
-        If the layer is damaged, or its marks are invalid.
+        If the review layer cannot be read, is damaged or cut off, holds other topics, or has marks
+        that are invalid or overlap.
     """
     path = review_path(log)
     if not path.exists():
@@ -111,7 +112,7 @@ def read_marks(log: Path) -> list[Mark]:
 
 
 def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] = ()) -> Path:
-    """Add marks to the review layer of a log; where they overlap older marks, they win.
+    """Add marks to the review layer of a log; where they overlap older marks, they replace these.
 
     The layer is replaced in one step. Processes that write to the same folder wait for each other.
 
@@ -120,19 +121,20 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] 
     log : Path
     marks : iterable of Mark
     deleted : iterable of MarkedSpan
-        Where older marks are deleted, or cut off.
+        Where older marks are deleted, or cut off; before the new marks are added.
 
     Returns
     -------
     Path
-        The layer, which is deleted if no marks are left.
+        The layer; without marks there is no such file.
 
     Raises
     ------
     DataError
         If the new marks overlap each other, or are invalid.
     LogError
-        If there is no such log, if its layer is damaged, or if it cannot be written.
+        If there is no such log, if its layer cannot be read or is damaged, if the name of a
+        microphone is invalid, or if the layer cannot be written.
     """
     new = _checked(marks)
     path = review_path(log)

@@ -8,10 +8,22 @@ from hearthlog.analyzer.marks.marks import Mark
 
 
 def new_marks(marks: Iterable[Mark], existing: Sequence[Mark]) -> list[Mark]:
-    """Return the marks that are not among existing ones, up to rounding of their times.
+    """Return the marks that are not among existing ones, up to 1 ms of rounding of their times.
 
     A mark without reviewer, time or labelling equals one that has them: so a file that has no
     place for them does not make marks anonymous, nor one with rounded times move them.
+
+    Parameters
+    ----------
+    marks : iterable of Mark
+        Of a file.
+    existing : sequence of Mark
+        In any order.
+
+    Returns
+    -------
+    list of Mark
+        In the order of `marks`.
     """
     ordered = sorted(existing)
     keys = [mark[:2] for mark in ordered]

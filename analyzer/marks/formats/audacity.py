@@ -11,7 +11,20 @@ from hearthlog.schemas.times import seconds_text
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the labels of a track."""
+    """Yield the labels of a track.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If a line is not start, end and label with tabs between them.
+    """
     for number, line in enumerate(text.split("\n"), 1):
         if not line.strip() or line.startswith("\\"):  # the pitch of a spectral selection
             continue
@@ -22,7 +35,27 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
-    """Write a track, which has no place for microphones and reviewers."""
+    """Write a track, which has no place for microphones and reviewers.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    marks : sequence of Mark
+        At least one; all of one microphone.
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+
+    Returns
+    -------
+    str
+        The text of the file.
+
+    Raises
+    ------
+    DataError
+        If the marks are of several microphones.
+    """
     microphones = sorted({mark.microphone for mark in marks})
     if len(microphones) > 1:
         names = ", ".join(microphones)

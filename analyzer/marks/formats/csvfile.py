@@ -17,7 +17,21 @@ _COLUMNS = (*_REQUIRED, "microphone", "reviewer", "made", "corrects")
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the labels of a table."""
+    """Yield the labels of a table.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If the text is not CSV, if the first line does not name the columns, or if a line has more
+        or fewer fields.
+    """
     columns: list[str] = []
     for number, record in csv_records(path, text):
         values = [value.strip() for value in record]
@@ -33,7 +47,21 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table with all fields of the marks; its times are UTC."""
+    """Write a table with all fields of the marks.
+
+    Parameters
+    ----------
+    path : Path
+        Not used.
+    marks : sequence of Mark
+    coverage : mapping of str to Coverage
+        Not used: times are written in UTC.
+
+    Returns
+    -------
+    str
+        The text of the file.
+    """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(_COLUMNS)

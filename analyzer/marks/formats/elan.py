@@ -113,7 +113,21 @@ class _Document(ContentHandler):
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the annotations of the top tiers."""
+    """Yield the annotations of the top tiers.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If the text is not XML, declares a DTD, is no document of ELAN, has times in another unit
+        or a recording with an offset, or if an annotation has no valid time.
+    """
     document = _Document()
     endless = _ENDLESS.search(text)
     if endless is not None:
@@ -152,7 +166,22 @@ def _seconds(path: Path, annotation: _Annotation, milliseconds: str | None) -> s
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a document whose times begin with the first frame of all its microphones."""
+    """Write a document whose times begin with the first frame of all its microphones.
+
+    Parameters
+    ----------
+    path : Path
+        Not used.
+    marks : sequence of Mark
+        At least one.
+    coverage : mapping of str to Coverage
+        By microphone; has all those of the marks.
+
+    Returns
+    -------
+    str
+        The text of the file; its times are whole milliseconds.
+    """
     marks = [mark._replace(reviewer=mark.reviewer.translate(_NO_XML)) for mark in marks]
     zero = min(coverage[mark.microphone].starts[0] for mark in marks)
     root = ET.Element(

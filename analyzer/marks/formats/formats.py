@@ -40,6 +40,6 @@ PATTERNS = listed([each.pattern for each in FORMATS])
 
 
 def find_format(path: Path) -> LabelFormat | None:
-    """Return the format of a file by its name; None if it is none of them."""
+    """Return the format of a file by the end of its name; None if it is none of `FORMATS`."""
     fitting = [each for each in FORMATS if path.name.endswith(each.suffix)]
     return max(fitting, key=lambda each: len(each.suffix), default=None)

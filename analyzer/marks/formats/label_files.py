@@ -27,10 +27,38 @@ class LabelCodec(Protocol):
     """The functions of the module of a format."""
 
     def read(self, path: Path, text: str) -> Iterator[FileLabel]:
-        """Yield the labels of a file; raise DataError with file and place if it is none."""
+        """Yield the labels of a file.
+
+        Parameters
+        ----------
+        path : Path
+            Of the file, for messages.
+        text : str
+            All of it.
+
+        Raises
+        ------
+        DataError
+            With file and place, if the text is not of this format.
+        """
 
     def write(self, path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
-        """Return the text of a file that `read` reads again."""
+        """Return the text of a file that `read` reads again.
+
+        Parameters
+        ----------
+        path : Path
+            Of the file, for messages.
+        marks : sequence of Mark
+            At least one.
+        coverage : mapping of str to Coverage
+            By microphone; has all those of the marks.
+
+        Raises
+        ------
+        DataError
+            If the format has no place for several microphones.
+        """
 
 
 def read_labels(
@@ -41,12 +69,12 @@ def read_labels(
     Parameters
     ----------
     path : Path
-        Of one of the formats in `table.FORMATS`, by its suffix; a `*.txt` is a table of Raven or
+        Of one of the formats in `formats.FORMATS`, by its suffix; a `*.txt` is a table of Raven or
         a label track of Audacity by its first line.
     coverage : mapping of str to Coverage
-        Of each microphone.
+        By microphone.
     microphone : str, optional
-        Of labels that do not name theirs; not needed if there is only one.
+        The microphone of labels that do not name theirs; not needed if there is only one.
 
     Returns
     -------
@@ -56,8 +84,9 @@ def read_labels(
     Raises
     ------
     DataError
-        With file and place, if the file is no label file, a time or a label is invalid, labels
-        overlap, or one lies where nothing was recorded.
+        With file and place, if the file cannot be read, is too large, is no label file or holds no
+        labels, if a label cannot be a mark, if labels of one microphone overlap, or if one lies
+        where nothing was recorded.
     """
     placed = read_lines(path, coverage, microphone)
     check_overlaps(path, placed)
@@ -79,12 +108,25 @@ def read_lines(
 ) -> list[PlacedMark]:
     """Read a label file whose labels may overlap, and may lie where nothing was recorded.
 
-    Parameters and errors are otherwise those of `read_labels`.
+    Parameters
+    ----------
+    path : Path
+        As of `read_labels`.
+    coverage : mapping of str to Coverage
+        By microphone.
+    microphone : str, optional
+        The microphone of labels that do not name theirs; not needed if there is only one.
 
     Returns
     -------
     list of PlacedMark
-        With their lines, or their places in a file that has none.
+        In the order of the file, with their lines, or their places in a file that has none.
+
+    Raises
+    ------
+    DataError
+        With file and place, if the file cannot be read, is too large, is no label file or holds no
+        labels, or if a label cannot be a mark.
     """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
@@ -103,15 +145,16 @@ def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Cover
     Parameters
     ----------
     path : Path
-        With a suffix of `table.FORMATS`. Must not exist.
+        With a suffix of `formats.FORMATS`. Must not exist.
     marks : sequence of Mark
     coverage : mapping of str to Coverage
-        Of each microphone.
+        By microphone; has all those of the marks.
 
     Raises
     ------
     DataError
-        If there are no marks, too many, or those of several microphones have no place in the file.
+        If there are no marks, if the file would be too large, or if the marks are of several
+        microphones and the format has no place for them.
     LogError
         If the file exists, or cannot be written.
     """

@@ -57,14 +57,22 @@ class PlacedMark(NamedTuple):
 
 
 def place_text(path: Path, place: int | str) -> str:
-    """Write the place of a label for an error: `file:line`, or `file: place`."""
+    """Write the place of a label for an error: `file:line`, or `file: place`.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    place : int or str
+        The line, or the place in a file without lines.
+    """
     return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
 def make_mark(
     path: Path, label: FileLabel, coverage: Mapping[str, Coverage], microphone: str | None
 ) -> PlacedMark:
-    """Make a mark of a label.
+    """Make a mark of a label in a file.
 
     Parameters
     ----------
@@ -72,14 +80,16 @@ def make_mark(
         Of the file, for errors.
     label : FileLabel
     coverage : mapping of str to Coverage
-        Of each microphone.
+        By microphone.
     microphone : str or None
-        Of a label that names none; not needed if there is only one.
+        The microphone of a label that names none; not needed if there is only one.
 
     Raises
     ------
     DataError
-        With file and place, if it is no valid mark.
+        With file and place, if the microphone is not in the logs or must be named, if a time, the
+        label or a name is invalid, if the label is a point, ends before it starts or starts before
+        the first frame, or if it is of a recording of another length.
     """
     where = place_text(path, label.place)
     only = next(iter(coverage)) if len(coverage) == 1 else ""
@@ -106,7 +116,20 @@ def make_mark(
 
 
 def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
-    """Raise DataError if marks of one microphone overlap."""
+    """Check that marks of one microphone do not overlap.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    placed : sequence of PlacedMark
+        In the order of the file.
+
+    Raises
+    ------
+    DataError
+        With file and place, if two of them overlap.
+    """
     order = sorted(range(len(placed)), key=lambda i: placed[i].mark)
     for one, other in pairwise(order):
         earlier, later = placed[one].mark, placed[other].mark
@@ -119,10 +142,17 @@ def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
 def read_seconds(where: str, text: str) -> Decimal:
     """Read a number of seconds.
 
+    Parameters
+    ----------
+    where : str
+        File and place, for the message.
+    text : str
+        A decimal number, with or without an exponent.
+
     Raises
     ------
     DataError
-        If it is no number.
+        If the text is no number, or has more than 10 digits before the point or 18 behind it.
     """
     if not _SECONDS.fullmatch(text):
         raise DataError(f"{where}: {text[:64]!r} is no number of seconds")
@@ -130,7 +160,7 @@ def read_seconds(where: str, text: str) -> Decimal:
 
 
 def made_text(mark: Mark) -> str:
-    """Write the time at which a mark was made; empty if it is unknown."""
+    """Write the time at which a mark was made in ISO 8601; empty if it is unknown."""
     return time_text(mark.made) if mark.made else ""
 
 

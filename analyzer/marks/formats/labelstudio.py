@@ -16,7 +16,21 @@ _TYPE = "labels"
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the items of a file that Label Studio exports as JSON, or that it would import."""
+    """Yield the items of a file that Label Studio exports as JSON, or that it would import.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If the text is not JSON or holds something else than tasks, if a task has no annotations
+        and no predictions, or if an item is no label of a span of sound or has several labels.
+    """
     try:
         # Numbers stay text: nothing is lost, and none is too long.
         tasks = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
@@ -30,7 +44,21 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a task for each microphone."""
+    """Write a task for each microphone.
+
+    Parameters
+    ----------
+    path : Path
+        Not used.
+    marks : sequence of Mark
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+
+    Returns
+    -------
+    str
+        The text of the file.
+    """
     tasks = [
         _task(name, [mark for mark in marks if mark.microphone == name], coverage[name])
         for name in sorted({mark.microphone for mark in marks})

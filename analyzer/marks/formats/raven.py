@@ -30,12 +30,32 @@ _ORIGIN = [name.casefold() for name in _COLUMNS[8:]]
 
 
 def is_table(text: str) -> bool:
-    """Tell by the first line whether this is a selection table."""
+    """Tell whether a text is a selection table, by its first line.
+
+    Parameters
+    ----------
+    text : str
+        All of the file.
+    """
     return set(_TIMES) <= set(_names(text.lstrip().split("\n", 1)[0]))
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the selections of a table, each once: Raven may list it for every view and channel."""
+    """Yield the selections of a table, each once: Raven may list it for every view and channel.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If there is no column Annotation, if a column is named twice, or if a line has too many
+        fields.
+    """
     columns: list[str] = []
     seen: set[tuple[str, ...]] = set()
     for number, line in enumerate(text.split("\n"), 1):
@@ -59,7 +79,21 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a table; Raven keeps the columns of ours."""
+    """Write a table with columns for all fields of the marks, which Raven keeps.
+
+    Parameters
+    ----------
+    path : Path
+        Not used.
+    marks : sequence of Mark
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+
+    Returns
+    -------
+    str
+        The text of the file.
+    """
     channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
     lines = ["\t".join(_COLUMNS)]
     for number, mark in enumerate(marks, 1):

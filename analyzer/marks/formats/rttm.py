@@ -14,7 +14,20 @@ _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
 
 
 def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the labels; lines of other types, and comments, are left out."""
+    """Yield the labels; lines of other types, and comments, are left out.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If a line has fewer than 9 fields or more than 10, or its onset or duration is no number.
+    """
     for number, line in enumerate(text.split("\n"), 1):
         fields = line.split()
         if not fields or fields[0].startswith(";;"):
@@ -30,7 +43,21 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Write a line for each mark."""
+    """Write a line for each mark.
+
+    Parameters
+    ----------
+    path : Path
+        Not used.
+    marks : sequence of Mark
+    coverage : mapping of str to Coverage
+        By microphone; times are written as seconds since its first frame.
+
+    Returns
+    -------
+    str
+        The text of the file, which has no place for reviewers.
+    """
     lines = []
     for mark in marks:
         onset = seconds_text(mark.start - coverage[mark.microphone].starts[0])
