@@ -4,7 +4,7 @@ from hearthlog.schemas.text import printable
 
 
 class HearthlogError(Exception):
-    """Base of all of them; the command line prints the message and exits with 1."""
+    """Base of hearthlog's errors; the command line prints the message and exits with 1."""
 
     def __str__(self) -> str:
         return printable(super().__str__())  # it may quote a file
@@ -17,7 +17,12 @@ class LogError(HearthlogError):
 class HearthlogWarning(UserWarning):
     """Something is read in part only; the command line prints the line once, and exits with 3.
 
-    The text names no file, for Python shows each text once; `where` is the file or the topic.
+    Parameters
+    ----------
+    text : str
+        Names no file, because Python shows each text once.
+    where : object
+        The file or the topic.
     """
 
     def __init__(self, text: str, where: object) -> None:

@@ -36,7 +36,7 @@ class RecordLocation(NamedTuple):
 
 @dataclass
 class ChunkRow:
-    """A row of `CHUNKS` in the making, and the channels whose message indexes follow."""
+    """A row of `CHUNKS` in the making, and the channels whose message indexes follow the chunk."""
 
     offset: int
     length: int

@@ -54,7 +54,7 @@ class ChunkWriter:
         return self.__dict__ | {"_stream": None}
 
     def continue_on(self, stream: BinaryIO) -> None:
-        """Go on with another stream.
+        """Write to another stream from here on.
 
         Parameters
         ----------
@@ -64,7 +64,7 @@ class ChunkWriter:
         self._stream = stream
 
     def start(self, profile: str, library: str) -> None:
-        """Begin the file.
+        """Write the magic bytes and the header.
 
         Parameters
         ----------
@@ -230,7 +230,7 @@ class ChunkWriter:
             self._append(merge_blocks(blocks))
 
     def flush(self) -> None:
-        """End the chunk in progress."""
+        """End the chunk in progress, if it has messages, and write it."""
         if self._chunk.entries:
             self._put(self._chunk.compress())
             self._chunk = ChunkBuilder()
@@ -244,7 +244,7 @@ class ChunkWriter:
         self._put(chunk)
 
     def finish(self) -> None:
-        """Complete the file; the stream stays open."""
+        """Write the chunk in progress, the index and the footer; the stream stays open."""
         self.flush()
         self._write(records.DataEnd(0))
         summary_start = self._stream.tell()

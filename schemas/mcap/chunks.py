@@ -128,7 +128,7 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
 
 
 def read_definitions(file: LogFile) -> None:
-    """Add the schemas and channels to a log that only its chunks define.
+    """Add to a log the schemas and channels that only its chunks define.
 
     Parameters
     ----------

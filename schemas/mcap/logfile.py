@@ -47,6 +47,8 @@ class LogFile:
         Whether the file was finished.
     ended : bool
         Whether `scan_new` came to the end of a finished log.
+    header : mcap.records.Header or None
+        None as long as none was met.
     schemas, channels : dict of int to mcap.records.Schema, mcap.records.Channel
         Of a file without an index, those inside chunks are not among them.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
@@ -55,6 +57,8 @@ class LogFile:
         Channels with messages in a chunk; the empty set if the file does not tell which.
     record_locations : list of RecordLocation
         Of metadata records and attachments.
+    statistics : mcap.records.Statistics or None
+        None for a file without a sound index.
 
     Raises
     ------

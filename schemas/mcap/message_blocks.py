@@ -35,7 +35,7 @@ class Block(NamedTuple):
     rank: Int64
 
     def records(self) -> NDArray[np.void]:
-        """Encode the message records.
+        """Encode the messages as MCAP records.
 
         Returns
         -------
@@ -85,7 +85,7 @@ def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> 
 
 
 class MessageRecords(NamedTuple):
-    """Message records of several channels.
+    """Message records of one or more channels, in the order of their log times.
 
     Attributes
     ----------

@@ -94,7 +94,7 @@ class ChunkBuilder:
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
 
     def compress(self) -> StoredChunk:
-        """Return the chunk as a file will hold it."""
+        """Compress the records; return the chunk as a file will hold it."""
         data, crc = _LOCAL.zstd.compress(self.content), zlib.crc32(self.content)
         span = self.start, self.end
         return StoredChunk(b"zstd", data, len(self.content), crc, *span, self.entries)

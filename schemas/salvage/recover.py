@@ -20,13 +20,13 @@ from hearthlog.schemas.storage.regular_file import open_regular
 
 
 class NothingWholeError(LogError):
-    """A log of which nothing is whole."""
+    """Nothing in a log is whole."""
 
 
 def recover_log(
     source: Path, copy: Path, name: str, progress: Progress = ignore_progress
 ) -> Recovery:
-    """Copy what is whole in a log to a new one, read that again and count it.
+    """Copy what is whole in a log to a new one, and check the copy.
 
     Parameters
     ----------

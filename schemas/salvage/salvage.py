@@ -45,7 +45,7 @@ Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
 
 
 class Salvage:
-    """A file whose whole pieces are looked for.
+    """Reads the whole pieces of an MCAP file that was cut or damaged.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Salvage:
         os.close(self._descriptor)
 
     def damages(self) -> list[Damage]:
-        """List the damages met so far, by offset, and then the messages of undefined channels."""
+        """List the damages met so far by offset, then the messages of undefined channels."""
         return self._damages.resolve(self.definitions)
 
     def pieces(self) -> Iterator[Piece]:

@@ -97,7 +97,7 @@ class SalvagedCopy:
         self._writer.finish()
 
     def could_be_better(self) -> bool:
-        """Tell whether another attempt would have definitions that this one met too late."""
+        """Tell whether another attempt would know definitions, or a profile, that this one met too late."""
         defines = self._salvage.definitions.defines
         late = any(defines(channel) for channel in self._salvage.unnamed)
         return late or (self._salvage.header is None and self.profile() != self._profile)
@@ -114,7 +114,7 @@ class SalvagedCopy:
         return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
 
     def recovery(self) -> Recovery:
-        """Count what was saved, and list what was not."""
+        """Count what was saved, and list what was lost."""
         topics: dict[str, TopicRecovery] = {}
         expected = self._salvage.expected
         for number, channel, kind in self._channel_types():

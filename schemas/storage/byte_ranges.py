@@ -183,7 +183,7 @@ class StoredFile:
         self._block: Callable[[int], bytes] = lru_cache(_KEPT)(self._read_block)
 
     def close(self) -> None:
-        """Forget what was read: nothing else is open between two reads."""
+        """Forget what was read; nothing else stays open between two reads."""
         self._block = self._read_block
 
     def is_at(self, path: Path) -> bool:
@@ -303,7 +303,7 @@ class Section(io.RawIOBase):
         self._position = start
 
     def readable(self) -> bool:
-        """Tell that it can be read from."""
+        """Return True: a section is there to be read."""
         return True
 
     def readinto(self, out: Any) -> int:
