@@ -58,7 +58,7 @@ class LogFile:
     record_locations : list of RecordLocation
         Of metadata records and attachments.
     statistics : mcap.records.Statistics or None
-        None for a file without a sound index.
+        None unless the file has a sound index, with statistics.
 
     Raises
     ------

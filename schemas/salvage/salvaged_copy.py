@@ -97,7 +97,7 @@ class SalvagedCopy:
         self._writer.finish()
 
     def could_be_better(self) -> bool:
-        """Tell whether another attempt would know definitions, or a profile, that this one met too late."""
+        """Tell whether another attempt would know definitions or a profile from the start."""
         defines = self._salvage.definitions.defines
         late = any(defines(channel) for channel in self._salvage.unnamed)
         return late or (self._salvage.header is None and self.profile() != self._profile)

@@ -303,7 +303,7 @@ class Section(io.RawIOBase):
         self._position = start
 
     def readable(self) -> bool:
-        """Return True: a section is there to be read."""
+        """Return True: a section can be read."""
         return True
 
     def readinto(self, out: Any) -> int:
