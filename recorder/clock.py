@@ -49,7 +49,15 @@ class SampleClock:
         return -self._fitted_slope * 1e6
 
     def observe(self, index: int, time: float) -> None:
-        """Add an observation: a sample was taken no later than a time (s, CLOCK_MONOTONIC)."""
+        """Add an observation: a time by which a sample had been taken.
+
+        Parameters
+        ----------
+        index : int
+            Number of the sample.
+        time : float
+            Seconds of CLOCK_MONOTONIC.
+        """
         nominal = index / self._rate
         if self._origin is None:
             self._origin = time - nominal
@@ -62,7 +70,18 @@ class SampleClock:
             self._earliest, self._earliest_steered = (nominal, late), steered
 
     def time(self, index: Float64 | float) -> Float64:
-        """Return the times of samples on the clock of the observations, in seconds."""
+        """Compute the times at which samples were taken.
+
+        Parameters
+        ----------
+        index : float or np.ndarray [shape=(n,)], float64
+            Numbers of the samples, or places between them. There must have been an observation.
+
+        Returns
+        -------
+        np.ndarray [shape=() or (n,)], float64
+            Seconds of CLOCK_MONOTONIC.
+        """
         assert self._origin is not None
         nominal = np.asarray(index) / self._rate
         return self._origin + nominal + self._late + self._slope * (nominal - self._anchor)

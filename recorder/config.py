@@ -96,7 +96,21 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Put the file, which arrives as one of the arguments, below the environment."""
+        """Put the file, which arrives as one of the arguments, below the environment.
+
+        Parameters
+        ----------
+        settings_cls : type of Settings
+        init_settings : InitSettingsSource
+            The arguments; `file`, the content of the file, is taken out of them.
+        env_settings, dotenv_settings, file_secret_settings : PydanticBaseSettingsSource
+            Not used.
+
+        Returns
+        -------
+        tuple of PydanticBaseSettingsSource
+            Arguments, environment, file: the first that has a value gives it.
+        """
         del env_settings, dotenv_settings, file_secret_settings
         assert isinstance(init_settings, InitSettingsSource)
         file = init_settings.init_kwargs.pop("file", {})
@@ -106,21 +120,22 @@ class Settings(BaseSettings):
 def load_settings(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> Settings:
-    """Combine the sources of configuration.
+    """Combine the command line, the environment, the file and the defaults, in this order.
 
     Parameters
     ----------
     file : Path or None
-        The TOML file.
+        The TOML file; None for no file.
     command_line : dict
-        Values given there, by field name.
+        Values given there, by field name of `Settings`.
     microphone : dict
-        Values given there for the microphone, by field name.
+        Values given there for the microphone, by field name of `MicrophoneSettings`.
 
     Raises
     ------
     ConfigurationError
-        Naming the key that is unknown or whose value makes no sense.
+        If the file cannot be read or is no TOML, if a variable of the environment is unknown or no
+        JSON, or if a key is unknown or its value makes no sense; the message names it.
     """
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     try:

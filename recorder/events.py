@@ -58,11 +58,32 @@ class SoundSource(Protocol):
     device: str  # its name
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield what the source gives, until it ends or `stop` is set."""
+        """Yield what the source gives.
+
+        Parameters
+        ----------
+        stop : threading.Event
+            Ends the source when it is set.
+
+        Yields
+        ------
+        Event
+            Frames, gaps and health, in the order of time.
+        """
 
 
 def event_time(event: Event) -> int:
-    """Return the last time that an event speaks of, in nanoseconds of UTC."""
+    """Return the last time that an event speaks of, in nanoseconds of UTC.
+
+    Parameters
+    ----------
+    event : Event
+
+    Returns
+    -------
+    int
+        Start of the last frame, end of a gap, or time of a report of health.
+    """
     if isinstance(event, Frames):
         return int(event.stamps[-1])
     return event.end if isinstance(event, Gap) else event.stamp

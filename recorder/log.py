@@ -25,7 +25,21 @@ _NEVER = (1 << 63) - 1
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What every file of a recording says of itself."""
+    """What every file of a recording says of itself.
+
+    Attributes
+    ----------
+    root : Path
+        Folder of the logs.
+    node : str
+        Name of the node.
+    topics : sequence of Topic
+    infos : sequence of message
+        `AudioStreamInfo` of each microphone; each file sets their stamps.
+    metadata : mapping of str to str
+        The `hearthlog` record.
+    attachments : sequence of Attachment
+    """
 
     root: Path  # folder of the logs
     node: str
@@ -73,14 +87,20 @@ class RollingLog:
         self._begun: deque[tuple[int, Path]] = deque(maxlen=_FILES)
 
     def write(self, messages: Sequence[EncodedMessage]) -> None:
-        """Append messages, in the order of their log times.
+        """Append messages.
 
         Where time runs backwards, because the clock was set, another file begins.
+
+        Parameters
+        ----------
+        messages : sequence of EncodedMessage
+            In the order of their log times.
 
         Raises
         ------
         LogError
-            If the disk refuses; what was written stays, for the next start to complete.
+            If the disk refuses: what was written stays, for the next start to complete. Also if there
+            is a file already with the name of one that begins.
         """
         with self._keeping_what_was_written():
             for message in messages:
@@ -93,13 +113,25 @@ class RollingLog:
                 self.sync()
 
     def flush(self) -> None:
-        """Hand what was written over to the operating system."""
+        """Hand what was written over to the operating system.
+
+        Raises
+        ------
+        OSError
+            If the disk refuses.
+        """
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
             self._flush_at = None
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk."""
+        """Wait until what was written is on the disk.
+
+        Raises
+        ------
+        OSError
+            If the disk refuses.
+        """
         self.flush()
         if self._writer is not None:
             self._writer.sync()
@@ -107,6 +139,11 @@ class RollingLog:
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
         """Append the last messages to the open file, and complete it.
+
+        Parameters
+        ----------
+        messages : sequence of EncodedMessage
+            In the order of their log times; dropped if no file is open.
 
         Raises
         ------
@@ -120,7 +157,13 @@ class RollingLog:
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
-        """Tell whether a file may begin at a time: names are one a second."""
+        """Tell whether a file may begin at a time: each second has one name.
+
+        Parameters
+        ----------
+        stamp : int
+            In nanoseconds of UTC.
+        """
         path = log_path(self._description.root, self._description.node, stamp)
         return not (path.exists() or active_path(path).exists())
 
@@ -135,6 +178,7 @@ class RollingLog:
         Returns
         -------
         path : Path
+            Name of the finished file.
         end : int
             When the next file begins, in nanoseconds of UTC.
         """
@@ -153,7 +197,7 @@ class RollingLog:
         description : LogDescription
             Of the files to come.
         messages : sequence of EncodedMessage
-            The last ones of the open file.
+            The last ones of the open file, in the order of their log times.
 
         Raises
         ------

@@ -63,7 +63,13 @@ class ModelWatch:
         self._thread.start()
 
     def refusals(self) -> Iterator[str]:
-        """Yield why models were refused since the last call, and set `ready`."""
+        """Yield why models were refused since the last call, and set `ready`.
+
+        Yields
+        ------
+        str
+            A sentence about one file.
+        """
         with suppress(Empty):
             while True:
                 result = self._results.get_nowait()

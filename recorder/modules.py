@@ -10,5 +10,10 @@ def module_command(module: str) -> list[str]:
     ----------
     module : str
         Full name of a module, or of a package with a `__main__`.
+
+    Returns
+    -------
+    list of str
+        The program and its arguments.
     """
     return [sys.executable, "-P", "-m", module]

@@ -37,7 +37,23 @@ class EncodedMessage(NamedTuple):
 
 
 def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
-    """Make the `AudioStreamInfo` of a microphone; its stamp is still zero."""
+    """Make the `AudioStreamInfo` of a microphone, with a stamp of zero.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    device : str
+        Name of the source.
+    features : FeatureSet
+    model : Model or None
+        The model that labels the sound; None for no labels.
+
+    Returns
+    -------
+    message
+        A `hearthlog_msgs/msg/AudioStreamInfo`.
+    """
     return message(
         message_types.STREAM_INFO,
         header=header(0, microphone),
@@ -54,7 +70,18 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 
 
 def opening_messages(info: Any) -> list[EncodedMessage]:
-    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words."""
+    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words.
+
+    Parameters
+    ----------
+    info : message
+        `AudioStreamInfo`, with the start of the file as its stamp.
+
+    Returns
+    -------
+    list of EncodedMessage
+        Both at that time.
+    """
     stamp = nanoseconds(info.header.stamp)
     return [
         EncodedMessage(stamp, topic(info.header.frame_id, "info"), encode(info)),
@@ -110,7 +137,17 @@ class Pipeline:
         return None if self._labeller is None else self._labeller.classes
 
     def push(self, event: Event) -> list[EncodedMessage]:
-        """Turn an event of a source into messages, in the order of their log times."""
+        """Turn an event of a source into messages.
+
+        Parameters
+        ----------
+        event : Event
+
+        Returns
+        -------
+        list of EncodedMessage
+            In the order of their log times.
+        """
         if isinstance(event, Frames):
             return self.push_features(self._features(event.samples), event.first, event.stamps)
         if isinstance(event, Gap):
@@ -147,7 +184,13 @@ class Pipeline:
         return messages
 
     def finish(self) -> list[EncodedMessage]:
-        """End the open segment where the sound ends."""
+        """End the open segment where the sound ends.
+
+        Returns
+        -------
+        list of EncodedMessage
+            The last segments; empty without a model.
+        """
         return self._close(self._end)
 
     def change_model(
@@ -158,7 +201,7 @@ class Pipeline:
         Parameters
         ----------
         model : Model or None
-            For the same feature set.
+            For the same feature set; None for no labels.
         classifier : Classifier or None
             Of that model.
         frame, stamp : int
@@ -187,8 +230,13 @@ class Pipeline:
         subject : str
             What it is about: "model" or "clips".
         stamp : int
-            In nanoseconds of UTC.
+            Time of the notice, in nanoseconds of UTC.
         notice : Notice
+
+        Returns
+        -------
+        list of EncodedMessage
+            One for `/diagnostics`, one for `/rosout`.
         """
         name = f"hearthlog: {self.microphone} {subject}"
         return [

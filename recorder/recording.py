@@ -64,14 +64,15 @@ def record_files(
     Raises
     ------
     SourceError
-        If one of the files turns out to be damaged.
+        If one of the files turns out to be damaged, or all together are shorter than a frame.
     ModelError
-        If the model cannot be used.
+        If the model cannot be used, or the configured feature set is not installed.
     ConfigurationError
         If the model is for another feature set than the configured one, or sound is to be kept
         and the model cannot tell what must not be.
     LogError
-        If the log cannot be written; what was written stays, for the next start to complete.
+        If the log cannot be written, in which case what was written stays, for the next start to
+        complete; or if an earlier log cannot be completed.
     """
     recovered = recover_active(settings.output, settings.node)
     summary = record(settings, microphone, source, stop, reload_requests)
@@ -87,12 +88,19 @@ def record_microphone(
 ) -> RecordingSummary:
     """Record a microphone until `stop` is set, whatever happens to it.
 
-    The parameters are those of `record_files`.
+    Parameters
+    ----------
+    settings : Settings
+    microphone : MicrophoneSettings
+    stop : threading.Event
+        Once set, the log is completed.
+    reload_requests : SimpleQueue or None
+        An item makes the recorder check at once whether the model's file has been replaced.
 
     Raises
     ------
     SourceError
-        If it gives no sound at the start.
+        If the microphone cannot be opened at the start.
     ModelError, ConfigurationError, LogError
         As `record_files`.
     """
@@ -133,7 +141,22 @@ def record(
 ) -> RecordingSummary:
     """Record a source until it ends or `stop` is set.
 
-    The parameters and the errors are those of `record_files`.
+    Parameters
+    ----------
+    settings : Settings
+    microphone : MicrophoneSettings
+    source : SoundSource
+    stop : threading.Event
+        Once set, the log is completed.
+    reload_requests : SimpleQueue or None
+        An item makes the recorder check at once whether the model's file has been replaced.
+
+    Raises
+    ------
+    SourceError
+        If the source raises it.
+    ModelError, ConfigurationError, LogError
+        As `record_files`.
     """
     with ExitStack() as stack:
         watch = None
@@ -165,6 +188,14 @@ class RecordingSession:
     Attributes
     ----------
     summary : RecordingSummary
+
+    Raises
+    ------
+    ModelError
+        If the configured feature set is not installed.
+    ConfigurationError
+        If the model is for another feature set than the configured one, or sound is to be kept
+        and the model cannot tell what must not be.
     """
 
     def __init__(
@@ -187,7 +218,13 @@ class RecordingSession:
         self.summary = RecordingSummary(self._log.finished)
 
     def add(self, event: Event) -> None:
-        """Record one event of the source."""
+        """Record one event of the source.
+
+        Raises
+        ------
+        LogError
+            As `RollingLog.write`.
+        """
         if isinstance(event, Gap):
             self.summary.gaps += 1
             self.summary.frames_lost += event.frames_lost
@@ -200,7 +237,13 @@ class RecordingSession:
         self._log.write(self._clip_messages(notices))
 
     def finish(self) -> None:
-        """Complete the log and its clips."""
+        """Complete the log and its clips.
+
+        Raises
+        ------
+        LogError
+            If the log cannot be written; what was written stays, for the next start to complete.
+        """
         notices = self._clips.finish()
         self._log.finish([*self._pipeline.finish(), *self._clip_messages(notices)])
 
@@ -259,7 +302,7 @@ def describe_log(
         `AudioStreamInfo` of the logs.
     features : FeatureSet
     model : Model or None
-        That labels the sound.
+        The model that labels the sound; None for no labels.
     """
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)

@@ -39,17 +39,29 @@ class Recovered:
 
 
 def recover_active(root: Path, node: str) -> list[Recovered]:
-    """Complete all logs of a node that nobody writes any more.
+    """Complete all logs of a node that no recorder writes any more.
 
     What is whole is copied to the final name, read again and counted; only then the original is
     removed. A log that is damaged, or holds no message, is kept beside it as `*.damaged`. Layers
     of sound are not kept, for they are to be forgotten some day, and none of them keeps the
     recorder from starting.
 
+    Parameters
+    ----------
+    root : Path
+        Folder of the logs.
+    node : str
+        Name of the node.
+
+    Returns
+    -------
+    list of Recovered
+        By name; a log without a message is not there.
+
     Raises
     ------
     LogError
-        If a log cannot be completed.
+        If a log cannot be read or completed.
     """
     completed = []
     for active in sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}"))):

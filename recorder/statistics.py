@@ -16,6 +16,7 @@ class RollingStatistics:
     Parameters
     ----------
     window_frames : int
+        Frames of the window.
     """
 
     def __init__(self, window_frames: int) -> None:

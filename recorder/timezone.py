@@ -14,7 +14,12 @@ _DATABASE = "zoneinfo/"
 
 
 def time_zone(name: str) -> tzinfo:
-    """Return a zone by its name in the IANA database, such as Europe/Berlin.
+    """Return a time zone by its name.
+
+    Parameters
+    ----------
+    name : str
+        As in the IANA database, such as "Europe/Berlin", or "UTC".
 
     Raises
     ------
@@ -32,13 +37,24 @@ def time_zone(name: str) -> tzinfo:
 
 
 def check_time_zone(name: str) -> str:
-    """Return the name of a zone if this machine knows it; raises as `time_zone`."""
+    """Return the name of a time zone if this machine knows it.
+
+    Parameters
+    ----------
+    name : str
+        As `time_zone` takes it.
+
+    Raises
+    ------
+    LogError
+        If this machine has no such zone.
+    """
     time_zone(name)
     return name
 
 
 def machine_zone() -> str:
-    """Name the zone of this machine; UTC where that cannot be told."""
+    """Return the name of this machine's time zone; UTC where none is set or known."""
     for name in (os.environ.get("TZ", "").removeprefix(":"), _name_in_file(), _name_of_link()):
         if name and not name.startswith("/"):
             try:

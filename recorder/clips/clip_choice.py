@@ -84,8 +84,14 @@ class ClipFinder:
         Parameters
         ----------
         frames : Frames
+            Where they do not follow the frames before, those are decided first, as by `close`.
         labels : FrameLabels or None
             Of the last of these frames; their classes include all that are never kept.
+
+        Returns
+        -------
+        list of KeptSound
+            In the order of time.
         """
         sounds = []
         if frames.first != self._next:
@@ -95,7 +101,13 @@ class ClipFinder:
         return [*sounds, *self._decide(len(self._samples) - self._ahead)]
 
     def close(self) -> list[KeptSound]:
-        """Return what is to be kept of a sound that ends, and begin anew."""
+        """Return what is to be kept of a sound that ends, and begin anew.
+
+        Returns
+        -------
+        list of KeptSound
+            In the order of time.
+        """
         self._private = np.append(self._private, self._unlabelled(self._ahead))
         self._worth = np.append(self._worth, np.zeros(self._ahead, bool))
         sounds = self._decide(len(self._samples))

@@ -45,7 +45,8 @@ class ClipWriter:
     microphone : str
         Its name.
     file_at : callable
-        Returns the log that contains a time, and the end of that log; see `RollingLog.file_at`.
+        Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
+        log; see `RollingLog.file_at`.
     """
 
     def __init__(
@@ -64,7 +65,18 @@ class ClipWriter:
         self._used = 0  # frames kept of the day
 
     def write(self, sounds: Sequence[KeptSound]) -> list[Notice]:
-        """Append sound to the layers of its logs."""
+        """Append sound to the layers of the logs that contain its time.
+
+        Parameters
+        ----------
+        sounds : sequence of KeptSound
+            In the order of time.
+
+        Returns
+        -------
+        list of Notice
+            One when sound begins to be refused, and one when it is kept again.
+        """
         notices = []
         for sound in sounds:
             first = 0
@@ -84,6 +96,11 @@ class ClipWriter:
         ----------
         now : int
             In nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Notice
+            One if the layer cannot be completed.
         """
         if self._writer is None or self._file_at(now)[0] == self._log:
             self._rolled = None
@@ -94,7 +111,13 @@ class ClipWriter:
         return []
 
     def finish(self) -> list[Notice]:
-        """Complete the layer that is open."""
+        """Complete the layer that is open.
+
+        Returns
+        -------
+        list of Notice
+            One if it cannot be completed.
+        """
         writer, self._writer = self._writer, None
         if writer is None:
             return []

@@ -24,7 +24,8 @@ class ClipRecorder:
     pipeline : Pipeline
         Of the microphone whose sound it is.
     file_at : callable
-        Returns the log that contains a time, and the end of that log; see `RollingLog.file_at`.
+        Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
+        log; see `RollingLog.file_at`.
 
     Raises
     ------
@@ -60,13 +61,18 @@ class ClipRecorder:
         return []
 
     def after(self, event: Event, labels: FrameLabels | None) -> list[Notice]:
-        """Keep the sound of an event that was logged.
+        """Keep the sound of an event that was logged, and delete what is old.
 
         Parameters
         ----------
         event : Event
         labels : FrameLabels or None
             Of its last frames, if they are labelled.
+
+        Returns
+        -------
+        list of Notice
+            What people should know: sound that cannot be kept or deleted, and what was deleted.
         """
         now = event_time(event)
         notices = self._retention.tick(now)

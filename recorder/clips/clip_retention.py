@@ -41,6 +41,11 @@ class ClipRetention:
         ----------
         now : int
             In nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Notice
+            At most two: how many layers were deleted, and the first failure.
         """
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
@@ -75,12 +80,14 @@ def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple
     root : Path
         Folder of logs.
     node : str
+        Name of the node.
     failures : list of OSError
         Errors of folders that cannot be read are appended.
 
     Yields
     ------
     path : Path
+        The layer.
     start : int
         When its log began, in nanoseconds of UTC.
     """

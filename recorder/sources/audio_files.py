@@ -30,14 +30,15 @@ class FileSource:
     start : int
         Time of the first sample in nanoseconds of UTC.
     realtime : bool
-        Yield each frame only once as much time has passed since the first one.
+        Whether to yield each frame only once as much time has passed since the first one.
     progress : callable
-        Told the share of the sound that was read.
+        Told the share of the sound that was read, 0 to 1.
 
     Raises
     ------
     SourceError
-        If one of the files is missing, or is not audio.
+        If one of the files is missing, is not audio, holds none, or has a sample rate that cannot
+        be recorded.
     """
 
     def __init__(
@@ -56,7 +57,17 @@ class FileSource:
         self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield the frames until the files end or `stop` is set.
+        """Yield the frames, and the health of the source every ten seconds of sound.
+
+        Parameters
+        ----------
+        stop : threading.Event
+            Ends the source when it is set.
+
+        Yields
+        ------
+        Event
+            `Frames` and `SourceHealth`, in the order of time.
 
         Raises
         ------

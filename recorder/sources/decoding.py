@@ -23,6 +23,10 @@ def read_audio(path: Path) -> Iterator[Float32]:
 
     Channels are averaged, other rates resampled; samples that are not finite become 0.
 
+    Parameters
+    ----------
+    path : Path
+
     Yields
     ------
     np.ndarray [shape=(n,)], float32
@@ -31,7 +35,8 @@ def read_audio(path: Path) -> Iterator[Float32]:
     Raises
     ------
     SourceError
-        If the file is missing, or is not audio.
+        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
+        768 kHz.
     """
     with _opened(path) as audio:
         yield from _resampled(_mono_blocks(audio), audio.samplerate)
@@ -43,9 +48,9 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     Parameters
     ----------
     sound : np.ndarray [shape=(n,) or (n, channels)]
-        Integers of the full range of their type, or floats in full scale, -1 to 1.
+        Integers of the full range of their type, signed, or floats in full scale, -1 to 1.
     rate : int
-        Samples per second.
+        Samples per second, 1000 to 768,000.
 
     Returns
     -------
@@ -55,7 +60,7 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     Raises
     ------
     SourceError
-        If there is no such sound.
+        If the array has another shape or type, or the rate lies beyond its limits.
     """
     sound = np.asarray(sound)
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
@@ -76,7 +81,8 @@ def audio_seconds(path: Path) -> float:
     Raises
     ------
     SourceError
-        If the file is missing, or is not audio.
+        If the file is missing, is not audio, holds none, or has a sample rate below 1 kHz or above
+        768 kHz.
     """
     with _opened(path) as audio:
         return float(audio.frames / audio.samplerate)

@@ -53,7 +53,18 @@ def load_portaudio() -> ModuleType:
 
 
 def list_devices(sounddevice: ModuleType) -> list[Device]:
-    """List the microphones, those of the same name numbered in the order of their cards."""
+    """List the microphones.
+
+    Parameters
+    ----------
+    sounddevice : module
+        As `load_portaudio` returns it.
+
+    Returns
+    -------
+    list of Device
+        In the order of PortAudio; the second one of a name is called `<name> #2`, and so on.
+    """
     default = sounddevice.default.device[0]
     devices = [
         _device(info, is_default=info["index"] == default)
@@ -72,18 +83,20 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 
 
 def find_device(devices: list[Device], name: str) -> Device:
-    """Choose a microphone.
+    """Choose a microphone by its name.
 
     Parameters
     ----------
     devices : list of Device
+        All microphones, as `list_devices` gives them.
     name : str
-        A name or a part of one; empty for the default microphone.
+        A name or a part of one, in which capitals make no difference; empty for the default
+        microphone.
 
     Raises
     ------
     SourceError
-        If none or several microphones match; the message lists all of them.
+        If there is no microphone, or none or several match; then the message lists all of them.
     """
     if not devices:
         raise SourceError("no microphone found: connect one and check `hearthlog devices`")

@@ -28,6 +28,7 @@ class FrameCutter:
         Parameters
         ----------
         samples : np.ndarray [shape=(m,)], float32
+            At the rate of the sound.
         last : bool
             Whether the sound ends with these samples.
 

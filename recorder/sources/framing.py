@@ -48,7 +48,18 @@ class SampleBlock:
         return abs(self.adc_time - self.arrival) < _ADC_CLOCK_SECONDS
 
     def taken_at(self, rate: float) -> float:
-        """Return when the first sample was taken, on CLOCK_MONOTONIC, at the latest."""
+        """Return the time at or before which the first sample was taken.
+
+        Parameters
+        ----------
+        rate : float
+            Samples per second.
+
+        Returns
+        -------
+        float
+            Seconds of CLOCK_MONOTONIC.
+        """
         return self.adc_time if self.has_adc_time else self.arrival - len(self.samples) / rate
 
 
@@ -118,7 +129,18 @@ class Framer:
         self._wall_offset = wall_offset
 
     def add(self, block: SampleBlock) -> list[Frames | Gap]:
-        """Add a block and return the frames that it completes, after the gap before them."""
+        """Add a block and return the frames that it completes.
+
+        Parameters
+        ----------
+        block : SampleBlock
+            The next one of the same capture process.
+
+        Returns
+        -------
+        list of Frames or Gap
+            At most one `Frames`, after the gap before it, if there is one.
+        """
         if block.index != self._expected:
             self._restart(block.index + self._lost, "the recorder was too slow")
         self._expected = block.index + len(block.samples)

@@ -50,7 +50,18 @@ class MicrophoneSource:
         self._wall_offset = _wall_offset()
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield frames, gaps and health until `stop` is set, even if the microphone is lost."""
+        """Yield frames, gaps and health until `stop` is set, even if the microphone is lost.
+
+        Parameters
+        ----------
+        stop : threading.Event
+            Ends the source when it is set.
+
+        Yields
+        ------
+        Event
+            In the order of time; health every ten seconds, and when it changes.
+        """
         reason = "the microphone was started"
         while not stop.is_set():
             if self._capture is None:

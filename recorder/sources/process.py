@@ -57,10 +57,15 @@ class CaptureProcess:
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
 
+    Attributes
+    ----------
+    format : CaptureFormat
+
     Raises
     ------
     SourceError
-        If the device cannot be opened, in the words of the capture process.
+        If the device cannot be opened, in the words of the capture process; or if PortAudio hangs
+        or crashes.
     """
 
     def __init__(self, device: str) -> None:
@@ -92,7 +97,7 @@ class CaptureProcess:
         Returns
         -------
         list of SampleBlock or None
-            None if the process has ended.
+            In the order of their samples, empty if none has come; None if the process has ended.
         """
         if not self._wait(timeout):
             return []
