@@ -81,7 +81,7 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
     Raises
     ------
     SimulationError
-        If the folder holds something, or cannot be written.
+        If the folder holds something or cannot be written, or if one of the numbers is too low.
     """
     if clips_per_class < 1:
         raise SimulationError(f"a training set has at least 1 clip a class, not {clips_per_class}")
@@ -132,7 +132,8 @@ def write_day(path: Path, minutes: float, seed: int) -> list[LabelledSpan]:
     Raises
     ------
     SimulationError
-        If one of the files exists, or cannot be written.
+        If one of the files exists or cannot be written, if the name does not end in `.flac`, or if
+        `minutes` or `seed` lies beyond its limits.
     """
     labels = path.with_suffix(".txt")
     if path.suffix != ".flac":

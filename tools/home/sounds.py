@@ -39,7 +39,13 @@ class SimulationError(HearthlogError):
 
 
 class RoomTone:
-    """Background noise of one room, -65 to -60 dBFS, as one endless stream."""
+    """Background noise of one room, -65 to -60 dBFS, as one endless stream.
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Chooses level and colour, and is drawn from with every call.
+    """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -49,7 +55,18 @@ class RoomTone:
         self._state = np.zeros(1)
 
     def __call__(self, samples: int) -> Float64:
-        """Return the next `samples` samples."""
+        """Return the next samples.
+
+        Parameters
+        ----------
+        samples : int
+            Their number.
+
+        Returns
+        -------
+        np.ndarray [shape=(samples,)], float64
+            Full scale is -1 to 1, at 16 kHz.
+        """
         noise = self._rng.standard_normal(samples)
         coloured, self._state = lfilter([self._gain], [1.0, -self._pole], noise, zi=self._state)
         return self._level * coloured
@@ -63,7 +80,7 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
     label : str
         One of `LABELS`.
     seconds : float
-        At most 300.
+        More than 0, at most 300.
     seed : int
         Not negative. The same arguments give the same samples.
 
@@ -75,7 +92,7 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
     Raises
     ------
     SimulationError
-        If there is no such sound, or it cannot last that long.
+        If there is no such sound, if it cannot last that long, or if the seed is negative.
     """
     samples = round(seconds * SAMPLE_RATE) if 0 < seconds <= _MAX_SECONDS else 0
     if samples < 1:
@@ -85,7 +102,18 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
 
 
 def generator(*seed: int) -> np.random.Generator:
-    """Return the random generator of a seed; further integers tell its uses apart."""
+    """Return the random generator of a seed.
+
+    Parameters
+    ----------
+    *seed : int
+        A seed, and further integers that tell its uses apart. None is negative.
+
+    Raises
+    ------
+    SimulationError
+        If one of them is negative.
+    """
     if min(seed) < 0:
         raise SimulationError(f"a seed is a whole number from 0, not {min(seed)}")
     return np.random.default_rng(seed)
@@ -94,10 +122,24 @@ def generator(*seed: int) -> np.random.Generator:
 def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
     """Make one sound without the room; its ends are faded.
 
+    Parameters
+    ----------
+    label : str
+        One of `LABELS`.
+    samples : int
+        At least 1, at 16 kHz.
+    rng : np.random.Generator
+        Drawn from.
+
     Returns
     -------
     np.ndarray [shape=(samples,)], float64
         Full scale is -1 to 1, at 16 kHz.
+
+    Raises
+    ------
+    SimulationError
+        If there is no such sound.
     """
     if label not in _SOUNDS:
         raise SimulationError(f"no sound is called {label!r}; there are {', '.join(LABELS)}")

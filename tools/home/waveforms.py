@@ -20,7 +20,30 @@ Range = tuple[float, float]
 
 
 class Train:
-    """Successive syllables, coughs or knocks: runs of them, and pauses between the runs."""
+    """Successive syllables, coughs or knocks: runs of them, and pauses between the runs.
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Draws the rhythm.
+    samples : int
+        Samples of the sound, at 16 kHz.
+    length, gap : (float, float)
+        Shortest and longest element, and gap between two elements of a run, in seconds.
+    run : (int, int)
+        Least and most elements of a run.
+    pause : (float, float)
+        Shortest and longest pause between two runs, in seconds.
+
+    Attributes
+    ----------
+    starts : np.ndarray [shape=(count,)], intp
+        Samples at which the elements start.
+    lengths : np.ndarray [shape=(count,)], float64
+        Samples that they last.
+    count : int
+        Number of elements.
+    """
 
     def __init__(  # noqa: PLR0913 - five ranges describe a rhythm
         self,
@@ -46,19 +69,41 @@ class Train:
         self.count = len(self.starts)
 
     def ends(self) -> Indices:
-        """Return the samples at which the elements end, inside the sound."""
+        """Return the samples at which elements end, inside the sound.
+
+        Returns
+        -------
+        np.ndarray [shape=(m,)], intp
+        """
         ends = (self.starts + self.lengths).astype(np.intp)
         return ends[ends < self._samples]
 
     def envelope(self, gains: Float64, attack: float, release: float) -> Float64:
-        """Return rises and falls; attack and release are shares of the lengths of the elements."""
+        """Return an envelope that rises and falls with each element.
+
+        Parameters
+        ----------
+        gains : np.ndarray [shape=(count,)], float64
+            Height of each element.
+        attack, release : float
+            Shares of an element in which it rises and falls, 0 to 1.
+
+        Returns
+        -------
+        np.ndarray [shape=(samples,)], float64
+        """
         corners = np.array([0.0, attack, 1.0 - release, 1.0])
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * corners
         height = gains[:, np.newaxis] * np.array([0.0, 1.0, 0.8, 0.0])
         return np.interp(np.arange(self._samples), at.ravel(), height.ravel())
 
     def position(self) -> Float64:
-        """Return the position in each element, 0 to 1."""
+        """Return the position in each element, from 0 at its start to 1 at its end.
+
+        Returns
+        -------
+        np.ndarray [shape=(samples,)], float64
+        """
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * np.array([0.0, 1.0])
         return np.interp(np.arange(self._samples), at.ravel(), np.tile([0.0, 1.0], self.count))
 
@@ -72,7 +117,29 @@ def voiced(  # noqa: PLR0913 - a voice is these
     tract: float,
     breath: float = 0.05,
 ) -> Float64:
-    """Pass a glottal source through formants that glide from vowel to vowel."""
+    """Pass a glottal source through formants that glide from vowel to vowel.
+
+    The formants are those of Peterson & Barney (1952).
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Draws breath, vowels and the size of the vocal tract.
+    train : Train
+        Syllables, each of which has one vowel.
+    pitch : np.ndarray [shape=(samples,)], float64
+        In hertz.
+    vowels : str
+        Of "aeiou", those that may come.
+    tract : float
+        Factor of the formants; 1 for a man.
+    breath : float
+        Standard deviation of the noise in the source, whose sawtooth reaches from -1 to 1.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     samples = len(pitch)
     source = sawtooth(pitch) + breath * rng.standard_normal(samples)
     tract *= rng.uniform(0.92, 1.08)
@@ -90,7 +157,18 @@ def voiced(  # noqa: PLR0913 - a voice is these
 
 
 def sawtooth(pitch: Float64) -> Float64:
-    """Return a sawtooth of a varying pitch, its edges rounded (polyBLEP) against aliases."""
+    """Return a sawtooth of a varying pitch, its edges rounded (polyBLEP) against aliases.
+
+    Parameters
+    ----------
+    pitch : np.ndarray [shape=(samples,)], float64
+        In hertz, below 8000.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+        From -1 to 1.
+    """
     step = pitch / SAMPLE_RATE
     phase = np.cumsum(step) % 1.0
     after, before = phase / step, (phase - 1.0) / step
@@ -105,7 +183,21 @@ def _resonance(frequency: float, bandwidth: float) -> tuple[float, float]:
 
 
 def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
-    """Return decaying sines of amplitude 1, as of struck objects."""
+    """Return decaying sines, as of struck objects.
+
+    Parameters
+    ----------
+    hits : np.ndarray [shape=(samples,)], float64
+        Amplitude of the sine that begins at each sample, mostly 0.
+    frequency : float
+        In hertz; silence from 8000 on.
+    seconds : float
+        Time in which a sine decays to 1/e.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     if frequency >= SAMPLE_RATE / 2:
         return np.zeros(len(hits))
     a1, a2 = _resonance(frequency, 1.0 / (np.pi * seconds))
@@ -114,31 +206,103 @@ def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
 
 
 def impulses(samples: int, at: Indices, gains: Float64) -> Float64:
-    """Return impulses of some heights at some samples."""
+    """Return impulses at some samples, and 0 elsewhere.
+
+    Parameters
+    ----------
+    samples : int
+        Samples of the sound.
+    at : np.ndarray [shape=(n,)], intp
+        Samples of the impulses, below `samples`.
+    gains : np.ndarray [shape=(n,)], float64
+        Their heights.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     hits = np.zeros(samples)
     hits[at] = gains
     return hits
 
 
 def decays(samples: int, at: Indices, seconds: float, gains: Float64 | None = None) -> Float64:
-    """Return an envelope that jumps at some samples and decays in `seconds` to 1/e."""
+    """Return an envelope that jumps at some samples and decays after each of them.
+
+    Parameters
+    ----------
+    samples : int
+        Samples of the sound, at 16 kHz.
+    at : np.ndarray [shape=(n,)], intp
+        Samples at which it jumps, below `samples`.
+    seconds : float
+        Time in which it decays to 1/e.
+    gains : np.ndarray [shape=(n,)], float64, optional
+        Heights of the jumps; 1 by default.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     hits = impulses(samples, at, np.ones(len(at)) if gains is None else gains)
     return lfilter([1.0], [1.0, -np.exp(-1.0 / (seconds * SAMPLE_RATE))], hits)
 
 
 def band_noise(rng: np.random.Generator, samples: int, low: float, high: float) -> Float64:
-    """Return noise between two frequencies, of about power 1."""
+    """Return noise between two frequencies, of about power 1.
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+    samples : int
+        Samples of the sound, at 16 kHz.
+    low, high : float
+        Edges of the band in hertz, above 0 and below 8000.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     sos = butter(2, (low, high), "bandpass", fs=SAMPLE_RATE, output="sos")
     return sosfilt(sos, rng.standard_normal(samples)) * np.sqrt(SAMPLE_RATE / 2 / (high - low))
 
 
 def wander(rng: np.random.Generator, samples: int, rate: float, depth: float) -> Float64:
-    """Return a factor about 1 that takes a new value `rate` times a second."""
+    """Return a random factor about 1 that changes slowly.
+
+    Parameters
+    ----------
+    rng : np.random.Generator
+    samples : int
+        Samples of the sound, at 16 kHz.
+    rate : float
+        New values a second, between which the factor glides.
+    depth : float
+        Standard deviation of the factor's natural logarithm.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     points = int(samples / SAMPLE_RATE * rate) + 2
     values = np.exp(depth * rng.standard_normal(points))
     return np.interp(np.arange(samples) * (rate / SAMPLE_RATE), np.arange(points), values)
 
 
 def vibrato(samples: int, rate: float, depth: float) -> Float64:
-    """Return a factor about 1 that swings `rate` times a second."""
+    """Return a factor about 1 that swings as a sine.
+
+    Parameters
+    ----------
+    samples : int
+        Samples of the sound, at 16 kHz.
+    rate : float
+        Swings a second.
+    depth : float
+        Largest distance from 1.
+
+    Returns
+    -------
+    np.ndarray [shape=(samples,)], float64
+    """
     return 1.0 + depth * np.sin(np.arange(samples) * (2.0 * np.pi * rate / SAMPLE_RATE))
