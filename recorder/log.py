@@ -99,8 +99,8 @@ class RollingLog:
         Raises
         ------
         LogError
-            If the disk refuses: what was written stays, for the next start to complete. Also if there
-            is a file already with the name of one that begins.
+            If the disk refuses: what was written stays, for the next start to complete. Also if
+            there is a file already with the name of one that begins.
         """
         with self._keeping_what_was_written():
             for message in messages:
