@@ -40,7 +40,13 @@ class JudgeableSpans:
         return len(self.starts)
 
     def take(self, rows: Int64) -> "JudgeableSpans":
-        """Return some of them."""
+        """Return some of the spans.
+
+        Parameters
+        ----------
+        rows : np.ndarray [shape=(m,)], int64
+            In the order of time, or they are no longer in it.
+        """
         return JudgeableSpans(
             self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
         )
@@ -56,7 +62,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     Parameters
     ----------
     segments : Events
-        In the order of time, one label at a time.
+        In nanoseconds of UTC, in the order of time, one label at a time.
 
     Raises
     ------
@@ -83,7 +89,15 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
 
 
 def without(segments: Events, starts: Int64, ends: Int64) -> Events:
-    """Return the parts of segments outside of spans that do not overlap."""
+    """Return the parts of segments outside of some spans.
+
+    Parameters
+    ----------
+    segments : Events
+        In the order of time, one label at a time.
+    starts, ends : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC; the spans ascend and do not overlap.
+    """
     spans, rows = remains(segments, Spans(starts, ends))
     return Events(*spans, segments.labels[rows])
 
@@ -91,12 +105,18 @@ def without(segments: Events, starts: Int64, ends: Int64) -> Events:
 def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
     """Compare spans with another labelling.
 
+    Parameters
+    ----------
+    spans : JudgeableSpans
+    others : Events
+        In the order of time, one label at a time; labels are indices of the same classes.
+
     Returns
     -------
     labels : np.ndarray [shape=(n,)], int64
         The other label of most of each span; -1 for none.
     differing : np.ndarray [shape=(n,)], float64
-        The share of each span that has another label.
+        The share of each span that has another label, 0 to 1.
     """
     own = Events(spans.starts, spans.ends, spans.labels)
     pieces = overlay([own, others]).in_all()

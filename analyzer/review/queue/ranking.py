@@ -57,12 +57,12 @@ class ReviewQueue:
 
     @property
     def weighted(self) -> Float64:
-        """The weighted parts of the scores, shape (3, n)."""
+        """The weighted parts of the scores: uncertainty, disagreement and novelty; shape (3, n)."""
         return _WEIGHTS * np.stack([self.uncertainty, self.disagreement, self.novelty])
 
     @property
     def scores(self) -> Float64:
-        """The scores, before spans are spread over days and classes."""
+        """The scores, before spans are spread over days and classes; shape (n,)."""
         return self.weighted.sum(axis=0)
 
 
@@ -82,6 +82,7 @@ def make_queue(  # noqa: PLR0913
     Parameters
     ----------
     sources : Labellings
+        Logs that cannot be read are added to its losses.
     microphone : str
     side : NamedLabelling
         The labelling to be reviewed.
@@ -92,14 +93,20 @@ def make_queue(  # noqa: PLR0913
     count : int
         Number of spans, at most.
     ranking : str, optional
-        One of `RANKINGS`, to rank by it alone.
+        One of `RANKINGS`, to rank by it alone; by default all but chance are weighed.
     progress : callable, optional
-        Is called with the share that is done.
+        Told the share of the logs that is read, 0 to 1.
+
+    Returns
+    -------
+    ReviewQueue
+        At most one span of each segment.
 
     Raises
     ------
     DataError
-        If nothing is left to review, or there is nothing to rank by.
+        If nothing is left to review, there is nothing to rank by, or there are more than five
+        million spans.
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))

@@ -58,7 +58,19 @@ class ReviewSpan(NamedTuple):
 
 
 def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
-    """List where two labellings differ: the longest first, at most `MOST_SPANS`."""
+    """List where two labellings differ.
+
+    Parameters
+    ----------
+    difference : Difference
+    microphone : str
+        That both labellings are of.
+
+    Returns
+    -------
+    list of ReviewSpan
+        The longest first, at most `MOST_SPANS`; without scores.
+    """
     a, b, classes = difference.a, difference.b, difference.classes
     rows = zip(*(column[:MOST_SPANS].tolist() for column in difference.disagreements), strict=True)
     return [
@@ -68,7 +80,23 @@ def disagreements(difference: Difference, microphone: str) -> list[ReviewSpan]:
 
 
 def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[ReviewSpan]:
-    """List what is to be reviewed of labelling a, in that order; the reason is what weighs most."""
+    """List the spans of a queue, in its order.
+
+    Parameters
+    ----------
+    queue : ReviewQueue
+    microphone : str
+        That it is of.
+    a : str
+        The labelling to be reviewed: `live`, or `relabel/<model>`.
+    b : str, optional
+        The labelling that it was compared with; empty without one.
+
+    Returns
+    -------
+    list of ReviewSpan
+        With the score, to three digits, and as the reason the part that weighs most in it.
+    """
     most = np.argmax(queue.weighted, axis=0).tolist()
     columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
     rows = zip(
@@ -107,10 +135,15 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
 def read_list(path: Path) -> list[ReviewSpan]:
     """Read a list of spans.
 
+    Returns
+    -------
+    list of ReviewSpan
+        In the order of the file, at least one.
+
     Raises
     ------
     DataError
-        With file and line, if it is none.
+        If the file cannot be read, is no list of spans, or holds none; the message has the line.
     """
     header: list[str] = []
     spans: list[ReviewSpan] = []

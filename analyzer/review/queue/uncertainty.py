@@ -20,6 +20,11 @@ class ModelUncertainty:
         At least one.
     classes : sequence of str
         The names behind their labels.
+
+    Attributes
+    ----------
+    uncertainty, novelty : SpanMeans
+        0 to 1.
     """
 
     def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
@@ -27,7 +32,13 @@ class ModelUncertainty:
         self.uncertainty, self.novelty = SpanMeans(len(spans)), SpanMeans(len(spans))
 
     def add(self, frames: Columns) -> None:
-        """Add frames; probabilities without names are left out."""
+        """Add the labels of frames; probabilities without names are left out.
+
+        Parameters
+        ----------
+        frames : Columns
+            Label messages with stamp, probabilities and novelty, in any order.
+        """
         stamps, probabilities = frames["header.stamp"], frames["probabilities"]
         row = np.searchsorted(self._spans.starts, stamps, side="right") - 1
         inside = (row >= 0) & (stamps < self._spans.ends[row])
@@ -49,13 +60,14 @@ def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64
 
     Parameters
     ----------
-    probabilities : np.ndarray [shape=(n, C)]
+    probabilities : np.ndarray [shape=(n, C)], float
+        Of each class, 0 to 1.
     labelled : np.ndarray [shape=(n,)], int64
         Columns of the labels; -1 for a label without a column, whose p is 0.
 
     Returns
     -------
-    np.ndarray [shape=(n,)]
+    np.ndarray [shape=(n,)], float64
         0 (certain) to 1; 0.5 where another class is as probable as the label.
     """
     others = probabilities.astype(np.float64)
@@ -67,13 +79,26 @@ def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64
 
 
 class SpanMeans:
-    """Means of the finite values in each span."""
+    """Means of the finite values in each span.
+
+    Parameters
+    ----------
+    count : int
+        Number of spans.
+    """
 
     def __init__(self, count: int) -> None:
         self._sums, self._counts = np.zeros(count), np.zeros(count)
 
     def add(self, row: Int64, values: Float64) -> None:
-        """Add values, and the rows of the spans that contain them."""
+        """Add values to their spans; those that are not finite are left out.
+
+        Parameters
+        ----------
+        row : np.ndarray [shape=(n,)], int64
+            Of the span that each value is in.
+        values : np.ndarray [shape=(n,)], float64
+        """
         finite = np.isfinite(values)
         row, values = row[finite], values[finite]
         if len(row):
@@ -88,5 +113,5 @@ class SpanMeans:
         return bool(self._counts.any())
 
     def values(self) -> Float64:
-        """Return the means; 0 where there is no value."""
+        """Return the means, shape (count,); 0 where there is no value."""
         return self._sums / np.maximum(self._counts, 1.0)

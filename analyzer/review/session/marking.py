@@ -47,7 +47,14 @@ class Marking:
     _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
 
     def mark(self, start: int, end: int, label: str) -> list[Mark]:
-        """Label a span of time, in nanoseconds of UTC.
+        """Label a span of time, in place of the marks that it has.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; what lies before or after all logs is cut off.
+        label : str
+            A name of a class.
 
         Returns
         -------
@@ -59,12 +66,30 @@ class Marking:
         DataError
             If a part of the span was not recorded, or the label is invalid.
         LogError
-            If a layer cannot be written; it is unchanged then.
+            If a layer is damaged or cannot be written; that layer is unchanged then.
         """
         return self._write(start, end, [(start, end, label)])
 
     def confirm(self, start: int, end: int) -> list[Mark]:
-        """Mark a span with the labels that it has; otherwise as `mark`."""
+        """Mark a span with the labels that it has, in place of its marks.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; what lies before or after all logs is cut off.
+
+        Returns
+        -------
+        list of Mark
+            The new marks: one for each label and log of the span.
+
+        Raises
+        ------
+        DataError
+            If the labelling has no label in this span, or a part of the span was not recorded.
+        LogError
+            If a layer is damaged or cannot be written; that layer is unchanged then.
+        """
         segments = self.labelled
         first = int(np.searchsorted(segments.ends, start, "right"))
         inside = slice(first, int(np.searchsorted(segments.starts, end)))
@@ -80,7 +105,25 @@ class Marking:
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
-        """Delete the marks of a span of time; otherwise as `mark`."""
+        """Delete the marks of a span of time.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; what lies before or after all logs is cut off.
+
+        Returns
+        -------
+        list of Mark
+            Empty, since there are no new marks.
+
+        Raises
+        ------
+        DataError
+            If a part of the span was not recorded.
+        LogError
+            If a layer is damaged or cannot be written; that layer is unchanged then.
+        """
         return self._write(start, end, [])
 
     def undo(self) -> tuple[int, int] | None:
@@ -90,6 +133,11 @@ class Marking:
         -------
         (int, int) or None
             Its span, in nanoseconds of UTC; None if there is nothing to undo.
+
+        Raises
+        ------
+        LogError
+            If a layer is damaged or cannot be written.
         """
         if not self._done:
             return None
@@ -100,7 +148,18 @@ class Marking:
         return changes[0].span.start, changes[-1].span.end
 
     def marks(self) -> LabelledSpans:
-        """Return all marks of the microphone in these logs."""
+        """Return all marks of the microphone in these logs.
+
+        Returns
+        -------
+        LabelledSpans
+            In the order of time.
+
+        Raises
+        ------
+        LogError
+            If a layer is damaged.
+        """
         for log in self.coverage.logs:
             if log not in self._marks:
                 self._marks[log] = read_marks(log)

@@ -21,19 +21,26 @@ def queue_items(
     Parameters
     ----------
     queue : str
-        One of `RANKINGS`, or the name of a list that `hearthlog diff` made.
+        One of `RANKINGS`, or the name of a list (`*.csv`) that `hearthlog diff` made.
     sources : Labellings
     labelled : (str, str)
         The microphone, and the labelling: `live`, or `relabel/` and a model.
     limits : (int or None, int or None)
-        In nanoseconds of UTC.
+        Start and end in nanoseconds of UTC; None for all that there is.
     count : int
         How many, at most.
+
+    Returns
+    -------
+    list of ReviewItem
+        The most useful first, or in the order of the list.
 
     Raises
     ------
     DataError
         If there is nothing to review, or no such list.
+    LogError
+        If the labelling has no segment in these limits, or its segments overlap or cannot be.
     """
     microphone, labelling = labelled
     if queue not in RANKINGS:

@@ -47,22 +47,43 @@ class Screen(Protocol):
     """A viewer, for a session; all methods may raise ConnectionError or TimeoutError."""
 
     def is_open(self) -> bool:
-        """Tell whether it is open."""
+        """Tell whether the viewer is open."""
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span that is selected with the mouse."""
+        """Return start and end of the selected span, in nanoseconds of UTC; None without one."""
 
     def cursor(self) -> int | None:
-        """Return the time of the cursor."""
+        """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor."""
 
     def show(self, start: int, end: int, margin: int) -> None:
-        """Select a span, and show it with a margin."""
+        """Select a span, and show it with a margin.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC.
+        margin : int
+            On either side, in nanoseconds.
+        """
 
     def play(self, start: int) -> None:
-        """Let the time cursor run from a time on."""
+        """Let the time cursor run from a time on.
+
+        Parameters
+        ----------
+        start : int
+            In nanoseconds of UTC.
+        """
 
     def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Draw the marks of a microphone again."""
+        """Draw the marks of a microphone again.
+
+        Parameters
+        ----------
+        microphone : str
+        marks : LabelledSpans
+            All that it has now.
+        """
 
 
 @dataclass
@@ -74,15 +95,16 @@ class Session:
     screen : Screen
     marking : Marking
     classes : sequence of str
-        Each gets a key.
+        Each gets a key, as far as there are keys.
     zone : tzinfo
         Of the home, for times in texts.
     say : callable
         Shows a line to the reviewer.
     look_closely : callable
-        Draws a span (start, end) at the resolution of its frames.
+        Draws a span (start, end in nanoseconds of UTC) at the resolution of its frames.
     listen : callable
-        Plays the kept sound of a span (start, end); returns a line for the reviewer.
+        Plays the kept sound of a span (start, end in nanoseconds of UTC); returns a line for the
+        reviewer.
     items : sequence of ReviewItem
         The spans to go through; empty where the reviewer chooses spans.
     """
@@ -102,7 +124,7 @@ class Session:
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """The keys, and what they do."""
+        """The keys, and what each does."""
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
@@ -113,10 +135,20 @@ class Session:
     def run(self, keys: "SimpleQueue[str]") -> int:
         """Obey keys until the reviewer quits or closes the viewer, or the last item is done.
 
+        Parameters
+        ----------
+        keys : queue.SimpleQueue of str
+            The keys that are pressed, one character each, from any thread.
+
         Returns
         -------
         int
             The number of marked spans.
+
+        Raises
+        ------
+        LogError
+            If a review layer is damaged when the session begins.
         """
         self._began = time.monotonic()
         self._redraw()
@@ -135,7 +167,13 @@ class Session:
         return self._marked
 
     def press(self, key: str) -> None:
-        """Obey one key. An error is shown to the reviewer, and changes nothing."""
+        """Obey one key. An error is shown to the reviewer, and changes nothing.
+
+        Parameters
+        ----------
+        key : str
+            One of `keys`; for another one the keys are shown, for white space nothing.
+        """
         try:
             self._press(key)
         except HearthlogError as error:

@@ -10,7 +10,20 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
-    """Start to play the kept sound of a span of time; return a line for the reviewer."""
+    """Start to play the kept sound of a span of time.
+
+    Parameters
+    ----------
+    clips : sequence of SoundClip
+        In the order of time.
+    start, end : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    str
+        A line for the reviewer: how long the sound is, or why there is none.
+    """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
         return "no sound of this span was kept"
@@ -24,9 +37,23 @@ def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
 
 
 def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
-    """Return the sample rate and the kept samples of a span of time, without the holes.
+    """Return the kept sound of a span of time, without the holes.
 
     Clips of another rate than the first are left out.
+
+    Parameters
+    ----------
+    clips : sequence of SoundClip
+        In the order of time.
+    start, end : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    rate : int
+        Samples per second; 0 if no sound was kept.
+    samples : np.ndarray [shape=(n,)], float32
+        -1 to 1.
     """
     parts, rate = [np.empty(0, np.float32)], 0
     for clip in clips:

@@ -102,7 +102,13 @@ class Collector:
         self._lines: list[LogLines] = []
 
     def add(self, rows: Rows) -> None:
-        """Add the rows of one topic, in the order of time."""
+        """Add the rows of one topic, in the order of time.
+
+        Parameters
+        ----------
+        rows : Rows
+            At least one, of any kind.
+        """
         match rows:
             case LogLines():
                 self._lines.append(rows)
@@ -123,7 +129,13 @@ class Collector:
         self._microphone(microphone).logs.add(log)
 
     def add_marks(self, marks: Iterable[Mark]) -> None:
-        """Add the marks that are in the span of the grid."""
+        """Add the marks that are in the span of the grid.
+
+        Parameters
+        ----------
+        marks : iterable of Mark
+            Of any microphones, in any order.
+        """
         for mark in marks:
             if mark.start < self._grid.end and mark.end > self._grid.start:
                 span = np.array([mark.start]), np.array([mark.end])
@@ -135,7 +147,7 @@ class Collector:
         self._microphone(microphone).clips.append(clip)
 
     def microphones(self) -> dict[str, MicrophoneTimeline]:
-        """Return the timelines of the microphones that have something to show."""
+        """Return the timelines of the microphones that have something to show, by name."""
         return {
             name: self._timeline(name, rows)
             for name, rows in sorted(self._microphones.items())
@@ -143,7 +155,13 @@ class Collector:
         }
 
     def logs(self, microphone: str) -> set[Path]:
-        """Return the logs and layers that have topics of a microphone."""
+        """Return the logs and layers that have topics of a microphone.
+
+        Parameters
+        ----------
+        microphone : str
+            One of `microphones`.
+        """
         return self._microphones[microphone].logs
 
     def lines(self) -> LogLines:

@@ -93,7 +93,7 @@ Rows = FeatureRows | LabelRows | SegmentRows | GapRows | StateRows | LogLines
 
 
 def read_rows(path: Path, columns: Columns) -> Rows | None:
-    """Take the fields out of messages of one topic; None if a timeline does not show the topic.
+    """Take the fields out of messages of one topic.
 
     Parameters
     ----------
@@ -102,10 +102,15 @@ def read_rows(path: Path, columns: Columns) -> Rows | None:
     columns : Columns
         At least one message, with the `FIELDS` of its type.
 
+    Returns
+    -------
+    FeatureRows, LabelRows, SegmentRows, GapRows, StateRows, LogLines or None
+        None if a timeline does not show the topic.
+
     Raises
     ------
     LogError
-        If a channel does not name its values.
+        If a channel does not name its values, or names another number of them.
     """
     if columns.type == message_types.LOG:
         return LogLines(columns["stamp"], columns["level"], columns["msg"])
@@ -132,7 +137,18 @@ def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
 
 
 def shown_topic(name: str) -> TopicName | None:
-    """Return the parts of a topic that a timeline shows; marks are read from their layers."""
+    """Return the parts of a topic that a timeline shows.
+
+    Parameters
+    ----------
+    name : str
+        Of the topic, as `/<microphone>/relabel/<model>/label`.
+
+    Returns
+    -------
+    TopicName or None
+        None for any other topic. Marks are not shown by their topic, but read from their layers.
+    """
     topic = parse_topic(name)
     if topic is None or topic.kind not in _KINDS or topic.labelling == REVIEW:
         return None
@@ -140,5 +156,16 @@ def shown_topic(name: str) -> TopicName | None:
 
 
 def decibel(energy: Any) -> Any:
-    """Return the level of a mean square, in dB relative to full scale."""
+    """Return the level of a mean square, in dB relative to full scale: 10 log10 of it.
+
+    Parameters
+    ----------
+    energy : float or np.ndarray
+        Mean square of samples from -1 to 1.
+
+    Returns
+    -------
+    float or np.ndarray
+        At least -100; 0 for a square wave of full scale.
+    """
     return 10 * np.log10(np.maximum(energy, _QUIETEST))

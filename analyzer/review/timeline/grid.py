@@ -38,7 +38,18 @@ class Grid:
         return edges[:-1] + (edges[1:] - edges[:-1]) // 2
 
     def find(self, times: Int64) -> NDArray[np.intp]:
-        """Return the index of the share that contains each time; the nearest one outside."""
+        """Find the share that contains each time.
+
+        Parameters
+        ----------
+        times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], int
+            0 to count - 1; for a time outside of the grid the nearest share.
+        """
         places = (times - self.start) * (self.count / (self.end - self.start))
         return np.clip(places.astype(np.int64), 0, self.count - 1)
 
@@ -64,6 +75,7 @@ class GridMeans:
         Parameters
         ----------
         times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC, at least one.
         values : np.ndarray [shape=(n, width)], float
         """
         share = self._grid.find(times)

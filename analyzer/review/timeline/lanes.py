@@ -93,7 +93,18 @@ class Lane(NamedTuple):
 
 
 def changes(spans: LabelledSpans) -> Changes:
-    """Begin each span with its text, and end it with None unless the next one follows at once."""
+    """Turn spans into changes of a lane.
+
+    Parameters
+    ----------
+    spans : LabelledSpans
+        In the order of time; they do not overlap.
+
+    Returns
+    -------
+    Changes
+        Each span begins with its text, and ends with None unless the next one follows at once.
+    """
     followed = np.append(spans.starts[1:], np.iinfo(np.int64).max)
     last = np.flatnonzero(spans.ends < followed)
     times = np.concatenate([spans.ends[last], spans.starts])
@@ -110,6 +121,11 @@ def timeline_lanes(timeline: Timeline, *, detail: bool) -> Iterator[Lane]:
     timeline : Timeline
     detail : bool
         Whether they show every segment, where there are any, or an `overview`.
+
+    Raises
+    ------
+    DataError
+        If there is no such time zone as the timeline's.
     """
     grid = timeline.grid
     hours = clock(grid, home_zone(timeline.zone))
@@ -143,7 +159,15 @@ def _microphone_lanes(
 def clock(grid: Grid, zone: tzinfo) -> LabelledSpans:
     """Divide a span of time into blocks whose text is the local time at which they begin.
 
-    They have the shortest length that gives about thirty of them or fewer.
+    A block lasts from a minute to a day: the shortest length that gives at most thirty of them. Spans
+    of more than a month have one for each day.
+
+    Parameters
+    ----------
+    grid : Grid
+        Its start and end count.
+    zone : tzinfo
+        Of the home.
     """
     seconds = (grid.end - grid.start) / NANOSECONDS
     tick = next((tick for tick in _TICKS if seconds / tick <= _MOST_TICKS), _TICKS[-1])

@@ -56,7 +56,17 @@ Update = Plot | Lane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
-    """Return the last log time of the log in a folder that was written to last; None without one.
+    """Return the last log time of the log in a folder that was written to last.
+
+    Parameters
+    ----------
+    folder : Path
+        That the recorder writes to.
+
+    Returns
+    -------
+    int or None
+        In nanoseconds of UTC; None if no log has a message yet.
 
     Raises
     ------
@@ -104,13 +114,20 @@ class LiveTimeline:
         Parameters
         ----------
         path : Path
+            The log, for errors.
         batch : sequence of RawMessages
             What was written to the log since the last call.
+
+        Yields
+        ------
+        Plot, Lane or LogLines
+            What is new in it.
 
         Raises
         ------
         LogError
-            If the messages are not of the types of their channels.
+            If the messages are not of the types of their channels, or a channel does not name its
+            values.
         """
         for columns in decode_types(path, batch, FIELDS):
             rows = read_rows(path, columns) if len(columns) else None

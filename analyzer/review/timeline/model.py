@@ -98,7 +98,7 @@ class SoundClip(NamedTuple):
 
     @property
     def end(self) -> int:
-        """The end, in nanoseconds of UTC."""
+        """End of the clip, in nanoseconds of UTC."""
         return self.start + len(self.samples) * 1_000_000_000 // self.rate
 
 

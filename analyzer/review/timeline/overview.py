@@ -17,6 +17,12 @@ def overview(labelling: LabellingTimeline, grid: Grid) -> LabelledSpans:
 
     Silence counts a quarter. Without segments it is the label with the highest mean probability.
 
+    Parameters
+    ----------
+    labelling : LabellingTimeline
+    grid : Grid
+        Its start and end count; there are `BLOCKS` blocks between.
+
     Returns
     -------
     LabelledSpans
@@ -51,9 +57,19 @@ def _shares(labelling: LabellingTimeline, grid: Grid) -> tuple[list[str], Float6
 
 
 def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
-    """Find the spans in which two labellings differ; their text is `<label> / <other label>`.
+    """Find the spans in which two labellings differ.
 
     Two names of one class (see `hearthlog.models.classes`) are no difference.
+
+    Parameters
+    ----------
+    one, other : LabelledSpans
+        In the order of time, one label at a time.
+
+    Returns
+    -------
+    LabelledSpans
+        With the text `<label> / <other label>`; none where only one of the two has a label.
     """
     if not len(one) or not len(other):
         return no_spans()

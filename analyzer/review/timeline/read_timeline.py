@@ -50,18 +50,23 @@ def read_timeline(
     paths : iterable of Path
         Logs, whose layers come with them, or folders of logs.
     start, end : int, optional
-        In nanoseconds of UTC.
+        In nanoseconds of UTC; by default from the first message to the last.
     zone : str, optional
         IANA name of the home's time zone; by default the one in the logs.
     progress : callable, optional
-        Is called with the share that is done.
+        Told the share of the logs that is read, 0 to 1.
+
+    Returns
+    -------
+    Timeline
+        What could not be read is in its `losses`.
 
     Raises
     ------
     LogError
         If there is no log.
     DataError
-        If there is nothing in this span of time.
+        If there is nothing in this span of time, or no such time zone.
     """
     losses: list[str] = []
     files = find_timed_files(paths, start, end, losses)
