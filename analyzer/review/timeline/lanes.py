@@ -159,8 +159,8 @@ def _microphone_lanes(
 def clock(grid: Grid, zone: tzinfo) -> LabelledSpans:
     """Divide a span of time into blocks whose text is the local time at which they begin.
 
-    A block lasts from a minute to a day: the shortest length that gives at most thirty of them. Spans
-    of more than a month have one for each day.
+    A block lasts from a minute to a day: the shortest length that gives at most thirty of them.
+    Spans of more than a month have one for each day.
 
     Parameters
     ----------

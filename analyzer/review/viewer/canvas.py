@@ -36,19 +36,47 @@ class Canvas:
         self.recording = recording
 
     def configure_lane(self, entity: str, colours: Mapping[str, Colour]) -> None:
-        """Give the states of a lane their colours."""
+        """Give the states of a lane their colours.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the lane in the recording.
+        colours : mapping of str to Colour
+            By state: red, green and blue, 0 to 255.
+        """
         style = rr.StateConfiguration(
             values=list(colours), labels=list(colours), colors=list(colours.values())
         )
         self.recording.log(entity, style, static=True)
 
     def change_states(self, entity: str, times: Int64, states: Sequence[str | None]) -> None:
-        """Put a lane into a state at each time; None is no state."""
+        """Put a lane into a state at each time.
+
+        Parameters
+        ----------
+        entity : str
+            Configured by `configure_lane`.
+        times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
+        states : sequence of (str or None)
+            n of them; None is no state.
+        """
         column = rr.StateChange.columns(state=pa.array(states, pa.string()))
         self.recording.send_columns(entity, [_time_column(times)], column)
 
     def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set names and colours of the bands of an entity, which gets a child for each layer."""
+        """Set names and colours of the bands of an entity, which gets a child for each layer.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the bands in the recording.
+        names : sequence of str
+            Of the k bands, the lowest first.
+        colours : sequence of Colour
+            Of each: red, green and blue, 0 to 255.
+        """
         for layer in range(_LAYERS):
             style = rr.Measurements.from_fields(
                 colors=colours, widths=[0.0] * len(names), names=names if layer == 0 else None
@@ -63,6 +91,7 @@ class Canvas:
         entity : str
             Configured by `configure_bands`.
         times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
         shares : np.ndarray [shape=(n, k)], float64
             0 to 1; NaN where there is nothing.
         """
@@ -76,12 +105,32 @@ class Canvas:
             self.recording.send_columns(f"{entity}/{layer}", [_time_column(times)], columns)
 
     def configure_lines(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set names and colours of the lines of an entity."""
+        """Set names and colours of the lines of an entity.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the lines in the recording.
+        names : sequence of str
+            Of the k lines.
+        colours : sequence of Colour
+            Of each: red, green and blue, 0 to 255.
+        """
         style = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
         self.recording.log(entity, style, static=True)
 
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
-        """Draw a line for each column of values, shape (n, k); NaN interrupts it."""
+        """Draw a line for each column of values.
+
+        Parameters
+        ----------
+        entity : str
+            Configured by `configure_lines`.
+        times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
+        values : np.ndarray [shape=(n, k)], float
+            NaN interrupts a line.
+        """
         width = values.shape[1]
         for first in range(0, len(times), _ROWS_AT_ONCE):
             part = values[first : first + _ROWS_AT_ONCE]
@@ -90,12 +139,30 @@ class Canvas:
             self.recording.send_columns(entity, [stamps], column)
 
     def draw_frames(self, entity: str, names: Sequence[str], parts: Iterable[FrameValues]) -> None:
-        """Draw frames as lines, interrupted where frames are missing."""
+        """Draw frames as lines, interrupted where frames are missing.
+
+        Parameters
+        ----------
+        entity : str
+            Configured by `configure_lines`.
+        names : sequence of str
+            Of its lines; every part has some of them.
+        parts : iterable of FrameValues
+            Each of at least one frame.
+        """
         for part in parts:
             self.draw_lines(entity, *_with_holes(part, names))
 
     def configure_heat_map(self, entity: str, names: Sequence[str]) -> None:
-        """Set the names of the rows of a heat map."""
+        """Set the names of the rows of a heat map.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the heat map in the recording.
+        names : sequence of str
+            Of the k rows, the lowest first.
+        """
         count = len(names)
         style = rr.SeriesPoints(
             names=names, markers=["square"] * count, marker_sizes=[_HEAT_SQUARE] * count
@@ -103,7 +170,17 @@ class Canvas:
         self.recording.log(entity, style, static=True)
 
     def add_shades(self, entity: str, times: Int64, shade: Float64) -> None:
-        """Draw squares of a heat map: shades of 0 (dark) to 1 (bright), shape (n, k)."""
+        """Draw squares of a heat map.
+
+        Parameters
+        ----------
+        entity : str
+            Configured by `configure_heat_map`.
+        times : np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
+        shade : np.ndarray [shape=(n, k)], float64
+            0 (dark) to 1 (bright).
+        """
         scale = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
         colours = np.stack([np.interp(shade, scale, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
         count = shade.shape[1]
@@ -117,14 +194,28 @@ class Canvas:
         self.recording.send_columns(entity, [_time_column(times)], columns)
 
     def write_lines(self, entity: str, lines: LogLines) -> None:
-        """Add lines of text."""
+        """Add lines of text, each at its time and with its level.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the text in the recording.
+        lines : LogLines
+        """
         if len(lines.times):
             levels = [_LEVELS.get(level, "INFO") for level in lines.levels.tolist()]
             column = rr.TextLog.columns(text=lines.texts.tolist(), level=levels)
             self.recording.send_columns(entity, [_time_column(lines.times)], column)
 
     def show_clip(self, entity: str, clip: SoundClip) -> None:
-        """Add a clip of sound at its start."""
+        """Add a clip of sound at its start.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the clip in the recording.
+        clip : SoundClip
+        """
         stream = io.BytesIO()
         soundfile.write(stream, clip.samples, clip.rate, format="FLAC", subtype="PCM_16")
         self.recording.set_time(TIMELINE, timestamp=np.datetime64(clip.start, "ns"))

@@ -17,7 +17,19 @@ CLOSE_UP = "/close_up"  # behind the name of a microphone
 
 
 def draw(timeline: Timeline, canvas: Canvas) -> None:
-    """Draw all of a timeline but the single frames."""
+    """Draw all of a timeline but the single frames.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    canvas : Canvas
+        Is drawn on.
+
+    Raises
+    ------
+    DataError
+        If there is no such time zone as the timeline's.
+    """
     for root in (OVERVIEW, DETAIL):
         for lane in timeline_lanes(timeline, detail=root == DETAIL):
             _draw_lane(lane, root, canvas)
@@ -29,14 +41,31 @@ def draw(timeline: Timeline, canvas: Canvas) -> None:
 
 
 def draw_close_up(timeline: Timeline, canvas: Canvas) -> None:
-    """Draw the plots of a short timeline beside those of the one that it is a part of."""
+    """Draw the plots of a short timeline beside those of the one that it is a part of.
+
+    Parameters
+    ----------
+    timeline : Timeline
+        The short one.
+    canvas : Canvas
+        Is drawn on.
+    """
     _draw_plots(timeline, canvas, CLOSE_UP)
 
 
 def draw_frames(
     timeline: Timeline, canvas: Canvas, start: int | None = None, end: int | None = None
 ) -> None:
-    """Draw every frame of a span (in nanoseconds of UTC), by default of the whole timeline."""
+    """Draw every frame of a span of a timeline.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    canvas : Canvas
+        Is drawn on.
+    start, end : int, optional
+        In nanoseconds of UTC: frames that begin from `start` on, before `end`; by default all.
+    """
     for microphone in timeline.microphones.values():
         for labelling in microphone.labellings:
             if labelling.probabilities is not None and labelling.frames:
@@ -51,13 +80,32 @@ def draw_frames(
 
 
 def redraw_marks(microphone: str, changes: Changes, canvas: Canvas) -> None:
-    """Draw the marks of a microphone again, in both lanes that show them."""
+    """Draw the marks of a microphone again, in both lanes that show them.
+
+    Parameters
+    ----------
+    microphone : str
+    changes : Changes
+        The label at each time, None for no mark.
+    canvas : Canvas
+        Is drawn on.
+    """
     for root in (OVERVIEW, DETAIL):
         _draw_lane(Lane(MARKS, microphone, REVIEW, changes), root, canvas)
 
 
 def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
-    """Set names and colours of what a plot shows."""
+    """Set names and colours of what a plot shows.
+
+    Parameters
+    ----------
+    plot : Plot
+        Its kind and names count.
+    entity : str
+        From `plot_entity`, or a child of it.
+    canvas : Canvas
+        Is drawn on.
+    """
     if plot.kind.style is Style.BANDS:
         canvas.configure_bands(entity, plot.names, [colour(name) for name in plot.names])
     elif plot.kind.style is Style.HEAT_MAP:
@@ -67,7 +115,17 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
 
 
 def add_to_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
-    """Draw values into a plot that is configured."""
+    """Draw values into a plot that is configured.
+
+    Parameters
+    ----------
+    plot : Plot
+        Of the same kind and names.
+    entity : str
+        Configured by `configure_plot`.
+    canvas : Canvas
+        Is drawn on.
+    """
     if plot.kind.style is Style.BANDS:
         canvas.add_bands(entity, plot.times, plot.values)
     elif plot.kind.style is Style.HEAT_MAP:
@@ -77,19 +135,50 @@ def add_to_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
 
 
 def lane_entity(root: str, lane: Lane) -> str:
-    """Name the entity of a lane; the viewer shows lanes in the order of their names."""
+    """Name the entity of a lane; the viewer shows lanes in the order of their names.
+
+    Parameters
+    ----------
+    root : str
+        `OVERVIEW` or `DETAIL`.
+    lane : Lane
+
+    Returns
+    -------
+    str
+        As `lanes/<microphone>/1_live`; the clock is in no microphone.
+    """
     folder = f"{root}/{lane.microphone}" if lane.microphone else root
     return f"{folder}/{lane.kind.place}_{_word(lane.name)}"
 
 
 def plot_entity(plot: Plot, close_up: str = "") -> str:
-    """Name the entity of a plot."""
+    """Name the entity of a plot.
+
+    Parameters
+    ----------
+    plot : Plot
+    close_up : str, optional
+        `CLOSE_UP` for a plot of a short span.
+
+    Returns
+    -------
+    str
+        As `<microphone>/live/shares`, or `<microphone>/level` for a plot of no labelling.
+    """
     labelling = f"/{_word(plot.labelling)}" if plot.labelling else ""
     return f"{plot.microphone}{close_up}{labelling}/{plot.kind.name}"
 
 
 def frames_entity(microphone: str, name: str) -> str:
-    """Name the entity of the frames of a labelling, or of the level."""
+    """Name the entity of the frames of a labelling, or of the level.
+
+    Parameters
+    ----------
+    microphone : str
+    name : str
+        Of the labelling (`live`, `relabel/<model>`), or `level`.
+    """
     return f"{microphone}/frames/{_word(name)}"
 
 

@@ -17,7 +17,14 @@ SUFFIX = ".rrd"
 
 
 def check_output(output: Path) -> None:
-    """Raise DataError unless a recording can be saved under this name."""
+    """Raise DataError unless a recording can be saved under this name.
+
+    Raises
+    ------
+    DataError
+        If the name does not end in `.rrd`, the file exists, or its folder does not exist
+        or cannot be written.
+    """
     if output.suffix != SUFFIX:
         raise DataError(f"{output}: the name of a Rerun recording must end in {SUFFIX}")
     try:
@@ -35,12 +42,12 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     ----------
     timeline : Timeline
     output : Path
-        Must not exist.
+        Must not exist, and must end in `.rrd`.
 
     Raises
     ------
     DataError
-        If it cannot be written.
+        If the name has another suffix, the file exists, or it cannot be written.
     """
     check_output(output)
     try:
@@ -59,7 +66,15 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
-    """Set the start of a recording, and name it after its span."""
+    """Set the start of a recording, and name it after its span.
+
+    Parameters
+    ----------
+    recording : rr.RecordingStream
+        Is told both.
+    timeline : Timeline
+        What it shows.
+    """
     start, end = timeline.grid.start, timeline.grid.end
     recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")

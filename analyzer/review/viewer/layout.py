@@ -44,7 +44,7 @@ class TimelineBlueprint(rrb.Blueprint):
         From above, with their heights in relation to each other.
     panel : rrb.TimePanel
     start, end : Boundary
-        The range.
+        The range: times, or seconds from the cursor.
     """
 
     def __init__(
@@ -59,29 +59,57 @@ class TimelineBlueprint(rrb.Blueprint):
 
 
 def stack(rows: Sequence[Row], name: str | None = None) -> rrb.Vertical:
-    """Put views one below the other."""
+    """Put views one below the other.
+
+    Parameters
+    ----------
+    rows : sequence of (int, View or Container)
+        From above, with their heights in relation to each other.
+    name : str, optional
+        Of the tab that they are in.
+    """
     heights = [height for height, _ in rows]
     return rrb.Vertical(*(view for _, view in rows), row_shares=heights, name=name)
 
 
 def tabs(views: Iterable[rrb.View | rrb.Container]) -> rrb.View | rrb.Container:
-    """Put views one behind the other; a single one needs no tab."""
+    """Put views one behind the other; a single one needs no tab.
+
+    Parameters
+    ----------
+    views : iterable of (View or Container)
+        The one in front first.
+    """
     views = list(views)
     return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
 
 def lanes_height(count: int) -> int:
-    """Return the height of a view of some lanes, in relation to that of other views."""
+    """Return the height of a view of some lanes, in relation to that of other views.
+
+    Parameters
+    ----------
+    count : int
+        Number of lanes.
+    """
     return _HEAD_HEIGHT + _LANE_HEIGHT * count
 
 
 def lanes_view(root: str, name: str) -> rrb.View:
-    """Show all lanes below an entity."""
+    """Make a view of all lanes below an entity.
+
+    Parameters
+    ----------
+    root : str
+        `OVERVIEW` or `DETAIL`.
+    name : str
+        Its title.
+    """
     return rrb.StateTimelineView(origin=root, name=name, time_view=_axis())
 
 
 def lines_view() -> rrb.View:
-    """Show the lines that the recorder logged."""
+    """Make a view of the lines that the recorder logged."""
     return rrb.TextLogView(origin=LINES, name="Events")
 
 
@@ -99,12 +127,12 @@ def plot_view(
     ----------
     kind : PlotKind
     entities : sequence of str
-        Of the plots.
+        Of the plots, at least one.
     names : sequence of str
-        Of the columns.
-    note : str
+        Of the columns, at least one.
+    note : str, optional
         Behind the title.
-    live : bool
+    live : bool, optional
         Whether new values come from the right.
     """
     last = len(names) - 1
@@ -145,10 +173,15 @@ def review_layout(
     ----------
     timeline : Timeline
         The time axes begin with the whole of it.
-    marking : bool
+    marking : bool, optional
         Whether the time panel is open, on whose ruler spans are marked with the mouse.
-    close_up : bool
+    close_up : bool, optional
         Whether short spans are looked at: there is room for what is drawn of them.
+
+    Raises
+    ------
+    DataError
+        If there is no such time zone as the timeline's.
     """
     sampled = "" if timeline.every == 1 else f" (a sample: one part in {timeline.every})"
     lanes = rrb.Tabs(

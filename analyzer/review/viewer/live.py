@@ -47,12 +47,13 @@ class LiveServer:
     Parameters
     ----------
     port : int
+        To listen on.
     bind : str
         Address to listen on; nothing is sent anywhere but to viewers that connect.
     minutes : float
-        That the time axes show.
-    memory : str
-        How much is kept for viewers that come later; then the oldest is dropped.
+        Length of the time axes, which end with the newest data.
+    memory : str, optional
+        How much is kept for viewers that come later, as `200MB`; then the oldest is dropped.
 
     Raises
     ------
@@ -86,7 +87,13 @@ class LiveServer:
         self._recording.disconnect()
 
     def show(self, updates: Iterable[Update]) -> None:
-        """Draw updates."""
+        """Draw updates, and lay out the views anew where there is a new plot.
+
+        Parameters
+        ----------
+        updates : iterable of (Plot, Lane or LogLines)
+            From `LiveTimeline.take`, in the order of time.
+        """
         for update in updates:
             if isinstance(update, LogLines):
                 self._canvas.write_lines(LINES, update)

@@ -28,24 +28,74 @@ def get_blueprint() -> bytes:
 
 
 def set_blueprint(blueprint: str) -> bytes:
-    """Make the request to replace the blueprint by one in JSON."""
+    """Make the request to replace the blueprint by another one.
+
+    Parameters
+    ----------
+    blueprint : str
+        In JSON.
+    """
     return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
 
 
 def set_time(nanoseconds: int, *, play: bool) -> bytes:
-    """Make the request to put the cursor on a time, in nanoseconds of UTC."""
+    """Make the request to put the cursor on a time.
+
+    Parameters
+    ----------
+    nanoseconds : int
+        Of UTC.
+    play : bool
+        Whether the cursor runs from there on.
+    """
     timeline = _field(2, _field(1, TIMELINE.encode()))
     time = _field(3, _field(1, nanoseconds))
     return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
 
 
 def read_blueprint(answer: bytes) -> str:
-    """Read the JSON of a blueprint."""
+    """Read the JSON of a blueprint.
+
+    Parameters
+    ----------
+    answer : bytes
+        To `get_blueprint`.
+
+    Returns
+    -------
+    str
+        Empty if the answer has none.
+
+    Raises
+    ------
+    ValueError
+        If the answer is no message of protobuf.
+    """
     return _text(_message(answer, _BLUEPRINT), 2)
 
 
 def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
-    """Read the version of a viewer, the errors of each of its views, and its cursor (ns of UTC)."""
+    """Read what a viewer says of its state.
+
+    Parameters
+    ----------
+    answer : bytes
+        To `get_state`.
+
+    Returns
+    -------
+    version : str
+        Of the viewer; empty if the answer has none.
+    reports : list of list of str
+        The errors of each view.
+    cursor : int or None
+        In nanoseconds of UTC; None if there is no cursor.
+
+    Raises
+    ------
+    ValueError
+        If the answer is no message of protobuf.
+    """
     state = _message(answer, _STATE)
     reports = [
         [f"{_text(view, 3)}: {_text(report, 2)}" for report in _messages(view, 6)]

@@ -45,13 +45,13 @@ def free_port(port: int | None = None, bind: str = HOST) -> int:
     ----------
     port : int, optional
         The only one that will do; by default any.
-    bind : str
-        Address to listen on.
+    bind : str, optional
+        Address to listen on, of IPv4 or IPv6.
 
     Raises
     ------
     DataError
-        If one cannot listen there.
+        If nothing can listen there.
     """
     family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     with socket.socket(family) as probe:
@@ -71,7 +71,18 @@ def free_port(port: int | None = None, bind: str = HOST) -> int:
 
 
 def check_display(instead: str) -> None:
-    """Raise DataError where no window can be opened; its message names `--web`, or `instead`."""
+    """Raise DataError where no window can be opened.
+
+    Parameters
+    ----------
+    instead : str
+        What the message advises beside `--web`: an option, and what it is for.
+
+    Raises
+    ------
+    DataError
+        If this is Linux without a display of X11 or Wayland.
+    """
     names = ("DISPLAY", "WAYLAND_DISPLAY")
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in names):
         raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
@@ -83,9 +94,14 @@ class ViewerProcess:
     Parameters
     ----------
     arguments : sequence of str
-        Of its command line.
+        Of its command line, beside the address and the port.
     port : int
         Where it listens, for this machine only.
+
+    Raises
+    ------
+    DataError
+        If the viewer is not installed.
     """
 
     def __init__(self, arguments: Sequence[str], port: int) -> None:
@@ -111,15 +127,15 @@ class ViewerProcess:
 
     @property
     def url(self) -> str:
-        """Where it takes data."""
+        """Where the viewer takes data: `rerun+http://…/proxy`."""
         return f"rerun+http://{HOST}:{self.port}/proxy"
 
     def is_running(self) -> bool:
-        """Tell whether it runs; its user may have closed the window."""
+        """Tell whether the viewer runs; its user may have closed the window."""
         return self._process.poll() is None
 
     def wait_until_it_listens(self) -> None:
-        """Wait until it takes data.
+        """Wait until the viewer takes data.
 
         Raises
         ------
@@ -137,12 +153,18 @@ class ViewerProcess:
         raise self.failed()
 
     def check(self) -> None:
-        """Raise DataError if it failed."""
+        """Raise DataError if the viewer failed.
+
+        Raises
+        ------
+        DataError
+            If it ended with an error; the message has the last one of its log.
+        """
         if (self._process.poll() or 0) > 0:
             raise self.failed()
 
     def failed(self) -> DataError:
-        """Return the error that says why it does not run, by its log."""
+        """Return the error that says why the viewer does not run, by its log."""
         lines = self._log.read_text(errors="replace").splitlines()
         lines = [line for line in lines if not _BACKTRACE.match(line)]
         errors = [
@@ -154,7 +176,7 @@ class ViewerProcess:
         )
 
     def close(self) -> None:
-        """Stop it."""
+        """Stop the viewer, and delete its log."""
         self._process.terminate()
         try:
             self._process.wait(_STOP_SECONDS)

@@ -54,25 +54,52 @@ class ViewerControl(Protocol):
     process: ViewerProcess
 
     def state(self) -> ViewerState:
-        """Return its state."""
+        """Return the state of the viewer."""
 
     def blueprint(self) -> Blueprint:
-        """Return its blueprint, which has the selection of the user."""
+        """Return the blueprint of the viewer, which has the selection of the user."""
 
     def set_blueprint(self, blueprint: Blueprint) -> None:
-        """Replace its blueprint."""
+        """Replace the blueprint of the viewer.
+
+        Parameters
+        ----------
+        blueprint : dict of str to object
+            As `blueprint` returns it, for JSON.
+        """
 
     def set_time(self, nanoseconds: int, *, play: bool) -> None:
-        """Put its cursor on a time."""
+        """Put the cursor of the viewer on a time.
+
+        Parameters
+        ----------
+        nanoseconds : int
+            Of UTC.
+        play : bool
+            Whether the cursor runs from there on.
+        """
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons (key and text), where there is a page."""
+        """Offer buttons, where there is a page.
+
+        Parameters
+        ----------
+        keys : sequence of (str, str)
+            Of each button the key, and its text.
+        press : callable
+            Told the key of the button that is pressed.
+        """
 
     def say(self, text: str) -> None:
-        """Show a line, where there is a page."""
+        """Show a line, where there is a page.
+
+        Parameters
+        ----------
+        text : str
+        """
 
     def close(self) -> None:
-        """Stop it."""
+        """Stop the viewer."""
 
 
 class Viewer:
@@ -102,11 +129,17 @@ class Viewer:
         self._control.close()
 
     def is_open(self) -> bool:
-        """Tell whether it runs; its user may have closed it."""
+        """Tell whether the viewer runs; its user may have closed it."""
         return self._control.process.is_running()
 
     def check(self) -> None:
-        """Raise DataError if it failed."""
+        """Raise DataError if the viewer failed.
+
+        Raises
+        ------
+        DataError
+            If it ended with an error.
+        """
         self._control.process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
@@ -121,7 +154,8 @@ class Viewer:
         Raises
         ------
         DataError
-            If the viewer has ended.
+            If the viewer has ended, or does not take data within a minute, or there is no such time
+            zone as the timeline's.
         """
         process = self._control.process
         process.wait_until_it_listens()
@@ -134,7 +168,14 @@ class Viewer:
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
-        """Draw every frame of a span of the timeline."""
+        """Draw every frame of a span of the timeline.
+
+        Parameters
+        ----------
+        timeline : Timeline
+        start, end : int
+            In nanoseconds of UTC: frames that begin from `start` on, before `end`.
+        """
         draw_frames(timeline, self._canvas, start, end)
         self._flush()
 
@@ -144,7 +185,14 @@ class Viewer:
         self._flush()
 
     def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Draw the marks of a microphone again."""
+        """Draw the marks of a microphone again.
+
+        Parameters
+        ----------
+        microphone : str
+        marks : LabelledSpans
+            All that it has now; a mark that was drawn before and is not among them goes away.
+        """
         times, states = changes(marks)
         drawn = self._times.setdefault(microphone, set())
         drawn |= set(times.tolist())
@@ -158,12 +206,13 @@ class Viewer:
         self._flush()
 
     def wait_until_drawn(self) -> ViewerState:
-        """Wait until it shows what was sent to it; for a page, until somebody opens it.
+        """Wait until the viewer shows what was sent to it; for a page, until somebody opens it.
 
         Raises
         ------
         DataError
-            If it ends, takes too long, or is of another version than the package.
+            If the viewer ends, takes longer than a minute, or is of another version than the
+            package.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:
@@ -181,20 +230,56 @@ class Viewer:
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
 
     def state(self) -> ViewerState:
-        """Return its state; raises ConnectionError or TimeoutError, as all that follows."""
+        """Return the state of the viewer.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         return self._control.state()
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span that is selected on the time ruler, in nanoseconds of UTC."""
+        """Return the span that is selected on the time ruler.
+
+        Returns
+        -------
+        (int, int) or None
+            Start and end in nanoseconds of UTC; None if nothing is selected.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         panel = self._control.blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
         return _span(panel.get("time_selection"))
 
     def cursor(self) -> int | None:
-        """Return the time of the cursor, in nanoseconds of UTC."""
+        """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         return self.state().cursor
 
     def show(self, start: int, end: int, margin: int) -> None:
-        """Select a span, show it with a margin, and put the cursor on its start."""
+        """Select a span, show it with a margin, and put the cursor on its start.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC.
+        margin : int
+            On either side, in nanoseconds.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         blueprint = self._control.blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
         panel["time_selection"] = {"min": start, "max": end}
@@ -205,15 +290,39 @@ class Viewer:
         self._control.set_time(start, play=False)
 
     def play(self, start: int) -> None:
-        """Let the cursor run from a time on."""
+        """Let the cursor run from a time on.
+
+        Parameters
+        ----------
+        start : int
+            In nanoseconds of UTC.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         self._control.set_time(start, play=True)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Offer buttons (key and text) in its page, if it has one."""
+        """Offer buttons in the page of the viewer, if it has one.
+
+        Parameters
+        ----------
+        keys : sequence of (str, str)
+            Of each button the key, and its text.
+        press : callable
+            Told the key of the button that is pressed, from another thread.
+        """
         self._control.offer(keys, press)
 
     def say(self, text: str) -> None:
-        """Show a line in its page, if it has one."""
+        """Show a line in the page of the viewer, if it has one.
+
+        Parameters
+        ----------
+        text : str
+        """
         self._control.say(text)
 
     def _flush(self) -> None:
@@ -222,7 +331,18 @@ class Viewer:
 
 
 def check_version(version: str) -> None:
-    """Raise DataError if a viewer is of another version than the package."""
+    """Raise DataError if a viewer is of another version than the package.
+
+    Parameters
+    ----------
+    version : str
+        As the viewer reports it; empty if it does not.
+
+    Raises
+    ------
+    DataError
+        If it is not that of the installed `rerun` package.
+    """
     if version != rr.__version__:
         raise DataError(
             f"the viewer is of Rerun {version or 'an unknown version'}, and hearthlog works with "

@@ -33,7 +33,13 @@ class Relay:
     keys : list of (str, str)
         Buttons of the page: the key, and what it does.
     press : callable
-        Takes the key that was pressed in the page.
+        Told the key that was pressed in the page.
+    texts : queue.SimpleQueue of str
+        Lines that the page is to show.
+    requests : queue.SimpleQueue of (int, bytes)
+        Number and content of requests that the page has not fetched.
+    answers : dict of int to Future
+        By the number of the request, while somebody waits for the answer.
     """
 
     keys: Sequence[tuple[str, str]] = ()
@@ -46,10 +52,20 @@ class Relay:
     def ask(self, request: bytes) -> bytes:
         """Ask the page, and wait for its answer.
 
+        Parameters
+        ----------
+        request : bytes
+            A message of `messages`.
+
+        Returns
+        -------
+        bytes
+            For `read_state` or `read_blueprint`.
+
         Raises
         ------
         TimeoutError
-            If there is no answer.
+            If there is no answer within 15 seconds.
         ConnectionError
             If the viewer in the page refused.
         """
@@ -63,7 +79,14 @@ class Relay:
             del self.answers[number]
 
     def next(self) -> tuple[int, bytes]:
-        """Return number and content of the next request; 0 if there is none for a while."""
+        """Wait up to 20 seconds for the next request.
+
+        Returns
+        -------
+        number : int
+            Of the request; 0 if there is none.
+        content : bytes
+        """
         with suppress(queue.Empty):
             while True:
                 number, request = self.requests.get(timeout=_POLL_SECONDS)
@@ -72,7 +95,15 @@ class Relay:
         return 0, b""
 
     def answer(self, number: int, content: bytes | None) -> None:
-        """Take the answer to a request; None if the viewer refused."""
+        """Take the answer to a request.
+
+        Parameters
+        ----------
+        number : int
+            Of the request; one that nobody waits for any more is ignored.
+        content : bytes or None
+            None if the viewer refused.
+        """
         waiting = self.answers.get(number)
         if waiting is None or waiting.done():
             return
@@ -241,13 +272,14 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
     Parameters
     ----------
     port : int, optional
+        Of the page; by default any.
     data : str, optional
         URL of a server whose data it shows; by default it shows what is sent to it.
 
     Raises
     ------
     DataError
-        If the port is in use.
+        If the viewer is not installed, or the port is in use.
     """
     page, viewer_files = free_port(port), free_port()
     process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())

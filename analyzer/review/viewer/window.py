@@ -69,7 +69,13 @@ class WindowViewer(Viewer):
         super().__init__(self._window)
 
     def picture(self) -> bytes:
-        """Return a picture of it as PNG; raises ConnectionError or TimeoutError."""
+        """Return a picture of the window as PNG.
+
+        Raises
+        ------
+        ConnectionError, TimeoutError
+            If the viewer does not answer.
+        """
         return self._window.client.take_screenshot()
 
 
@@ -79,13 +85,14 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
     Parameters
     ----------
     port : int, optional
+        Where it takes data; by default any.
     data : str, optional
         URL of a server whose data it shows; by default it shows what is sent to it.
 
     Raises
     ------
     DataError
-        If there is no display, or the port is in use.
+        If there is no display, the viewer is not installed, or the port is in use.
     """
     check_display(
         "--save FILE.rrd to make a file that Rerun opens elsewhere"
@@ -98,7 +105,18 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
 
 
 def open_hidden(port: int | None = None) -> WindowViewer:
-    """Run the same viewer without a window, for pictures; raises DataError as `open_window`."""
+    """Run the viewer without a window, for pictures.
+
+    Parameters
+    ----------
+    port : int, optional
+        Where it takes data; by default any.
+
+    Raises
+    ------
+    DataError
+        If the viewer is not installed, or the port is in use.
+    """
     return _opened(port, "--expect-data-soon", "--headless")
 
 
