@@ -24,10 +24,19 @@ _HEADS = {"log_time": _MOMENT, "publish_time": _MOMENT, "sequence": pa.uint32()}
 
 
 def schema_of(topic: str, fields: Mapping[str, Field], selection: Selection) -> pa.Schema:
-    """Return the Arrow schema of a topic.
+    """Return the Arrow schema of a topic: log time, publish time, sequence, then its fields.
 
     Its metadata are those of the channel that are equal in all logs, and the `hearthlog` records of
     the logs as a JSON list.
+
+    Parameters
+    ----------
+    topic : str
+        One of the selection, such as `/mic/features`.
+    fields : mapping of str to Field
+        By path, in the order of the columns.
+    selection : Selection
+        Whose channels and `hearthlog` records give the metadata.
     """
     channels = [channel for channel, _ in selection.channels[topic]]
     agreed = set.intersection(*(set(channel.metadata.items()) for channel in channels))
@@ -37,12 +46,18 @@ def schema_of(topic: str, fields: Mapping[str, Field], selection: Selection) -> 
 
 
 def column_name(path: str) -> str:
-    """Name the column of a field; those of the message's own times come first."""
+    """Name the column of a field: by its path, after `message.` where a time has that name.
+
+    Parameters
+    ----------
+    path : str
+        Of the field, such as `header.stamp`.
+    """
     return f"message.{path}" if path in _HEADS else path
 
 
 def type_of(field: Field) -> pa.DataType:
-    """Return the Arrow type of a field."""
+    """Return the Arrow type of a field; stamps are timestamp[ns, UTC], durations duration[ns]."""
     if field.elements:
         element = pa.struct([(path, type_of(part)) for path, part in field.elements.items()])
     else:
@@ -53,12 +68,18 @@ def type_of(field: Field) -> pa.DataType:
 
 
 def batch_of(piece: TypedColumns, schema: pa.Schema) -> pa.RecordBatch:
-    """Turn messages into a record batch.
+    """Turn messages of one topic into a record batch.
+
+    Parameters
+    ----------
+    piece : TypedColumns
+    schema : pa.Schema
+        As `schema_of` returns it for the topic.
 
     Raises
     ------
     LogError
-        If their type is defined otherwise than the schema has it.
+        If the type of the messages is defined otherwise than the schema has it.
     """
     columns = piece.columns
     types = [type_of(piece.fields[path]) for path in columns.fields]
@@ -74,7 +95,21 @@ def batch_of(piece: TypedColumns, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def array_of(values: NDArray[Any], field: Field) -> pa.Array:
-    """Turn a column of messages into an Arrow array."""
+    """Turn a column of messages into an Arrow array.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, ...)]
+        As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
+        where their lengths differ.
+    field : Field
+        What the values are.
+
+    Returns
+    -------
+    pa.Array
+        Of length n and of the type that `type_of` returns.
+    """
     kind = type_of(field)
     if field.elements or (field.size is not None and field.type == "string"):
         return pa.array(values.tolist(), kind)

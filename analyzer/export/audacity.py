@@ -24,7 +24,18 @@ class LabelTrack:
         self._zero = _first_frame(topic, selection)
 
     def write(self, piece: TypedColumns) -> None:
-        """Append segments; raise LogError if the messages are none."""
+        """Append segments.
+
+        Parameters
+        ----------
+        piece : TypedColumns
+            Messages with the fields `header.stamp`, `duration` and `label`.
+
+        Raises
+        ------
+        LogError
+            If one of these fields is missing.
+        """
         columns = piece.columns
         starts = columns["header.stamp"]
         if self._zero is None:

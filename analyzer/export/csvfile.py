@@ -41,10 +41,15 @@ class CsvFile:
     def write(self, piece: TypedColumns) -> None:
         """Append messages.
 
+        Parameters
+        ----------
+        piece : TypedColumns
+            Messages of the topic. Those of the first call decide which columns there are.
+
         Raises
         ------
         LogError
-            If they have values for which there is no column.
+            If there is no column for a value, or not one name for each element of an array.
         """
         columns = self._columns(piece)
         if self._writer is None:

@@ -29,7 +29,18 @@ class OutputFiles:
         self._names: set[str] = set()
 
     def new(self, stem: str) -> Path:
-        """Name a new file of a folder, or the only file; raise LogError if that is taken."""
+        """Name a new file in the folder, or the only file.
+
+        Parameters
+        ----------
+        stem : str
+            Name without a suffix, for a file in a folder; a number is added if it is taken.
+
+        Raises
+        ------
+        LogError
+            If there is already the only file.
+        """
         if self.path.is_dir():
             return self.path / unused_name(f"{stem}.{self._suffix}", self._names)
         if self.path.exists():
@@ -62,7 +73,18 @@ class TopicWriter(Protocol):
     """A file of one topic being written."""
 
     def write(self, piece: TypedColumns) -> None:
-        """Append messages of the topic."""
+        """Append messages of the topic.
+
+        Parameters
+        ----------
+        piece : TypedColumns
+            Messages of one definition.
+
+        Raises
+        ------
+        LogError
+            If the format has no place for them.
+        """
 
     def finish(self) -> None:
         """Complete what was written."""
@@ -71,7 +93,23 @@ class TopicWriter(Protocol):
 def write_topics(
     selection: Selection, progress: Progress, opened: Callable[[str, ExitStack], TopicWriter]
 ) -> None:
-    """Write each topic with a writer of its own, which `opened` makes at the first message."""
+    """Write the messages of each topic with a writer of its own.
+
+    Parameters
+    ----------
+    selection : Selection
+        Its checksums are compared first.
+    progress : callable
+        Is told the share that is done, 0 to 1.
+    opened : callable
+        Is called with a topic, at its first message, and with an `ExitStack`, to which it may
+        add what is to be closed after `finish` of the writer that it returns.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if there is no message, or one that the format has no place for.
+    """
     selection.verify()
     writers: dict[str, TopicWriter] = {}
     with ExitStack() as stack:
@@ -91,7 +129,17 @@ def stream_exporter(
     type_: str = "",
     fields: Collection[str] = (),
 ) -> Exporter:
-    """Make the exporter of a format whose files are streams of one topic each."""
+    """Make the exporter of a format whose files are streams of one topic each.
+
+    Parameters
+    ----------
+    writer : callable
+        Is called with a stream, a topic and the selection, and returns the writer of the topic.
+    type_ : str
+        Name of the only message type that the format takes; empty for any.
+    fields : collection of str
+        Paths of the fields that messages must have.
+    """
 
     def save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
         def opened(topic: str, stack: ExitStack) -> TopicWriter:

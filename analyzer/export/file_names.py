@@ -6,12 +6,31 @@ _LENGTH = 100  # characters
 
 
 def file_stem(topic: str) -> str:
-    """Make a part of a file name of a topic: `mic_features` of `/mic/features`."""
+    """Make a part of a file name from a topic: `mic_features` from `/mic/features`.
+
+    Parameters
+    ----------
+    topic : str
+        Any text.
+
+    Returns
+    -------
+    str
+        At most 100 letters, digits and `_`; `topic` if nothing is left.
+    """
     return re.sub(r"[^A-Za-z0-9]+", "_", topic).strip("_")[:_LENGTH] or "topic"
 
 
 def unused_name(name: str, taken: set[str]) -> str:
-    """Return the name, or with `-2` and so on before its suffix if it is taken; it is taken now."""
+    """Return a name that is not taken, with a number before its suffix if need be.
+
+    Parameters
+    ----------
+    name : str
+        The name that is wanted; becomes `name-2.suffix` and so on.
+    taken : set of str
+        Names that are taken; the returned one is added.
+    """
     stem, dot, suffix = name.rpartition(".")
     before, behind = (stem, dot + suffix) if stem else (name, "")
     unused, number = name, 2

@@ -50,7 +50,7 @@ def merge_logs(
     output : Path
         Must not exist.
     progress : callable
-        Is called with the share that is done.
+        Is told the share that is done, 0 to 1.
     latched : bool
         Begin with what a late subscriber would still receive: the last message before the span
         of each channel that is transient local without end, with the log time of the first message
@@ -59,7 +59,8 @@ def merge_logs(
     Raises
     ------
     LogError
-        If a log is damaged, if there is no message, or if the output cannot be written.
+        If a log is damaged, if there is no message, if there are more channels than a log can
+        have, or if the output exists or cannot be written.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
         write_log(selection, stream, output.name, progress, latched=latched)
@@ -73,9 +74,31 @@ def write_log(
     *,
     latched: bool = False,
 ) -> Mapping[str, str] | None:
-    """Do what `splice` does, on a stream; return the `rosbag2` record.
+    """Write the messages of a selection to a stream, as `merge_logs` does to a file.
 
-    There is none if a topic has channels that rosbag2 cannot tell apart, or no ROS 2 messages.
+    Parameters
+    ----------
+    selection : Selection
+    stream : binary file
+        Is written to, from where it is.
+    name : str
+        Name of the file, for the `rosbag2` record.
+    progress : callable
+        Is told the share that is done, 0 to 1.
+    latched : bool
+        As of `merge_logs`.
+
+    Returns
+    -------
+    mapping of str to str, or None
+        The `rosbag2` record that was written; None, and no record, if a topic has channels that
+        rosbag2 cannot tell apart, or no ROS 2 messages.
+
+    Raises
+    ------
+    LogError
+        If a log is damaged, if there is no message, or if there are more channels than a log can
+        have.
     """
     selection.verify()  # the copies get checksums of their own
     batches = selection.messages(progress)
@@ -243,7 +266,13 @@ def _at(time: int, messages: RawMessages) -> RawMessages:
 
 
 def is_latched(channel: Channel) -> bool:
-    """Tell whether a late subscriber still receives the last message, however old it is."""
+    """Tell whether a late subscriber still receives the last message, however old it is.
+
+    Parameters
+    ----------
+    channel : Channel
+        Its metadata `offered_qos_profiles` decides; a channel with invalid ones is not latched.
+    """
     return any(
         profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER
         for profile in _profiles(channel)

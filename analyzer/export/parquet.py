@@ -28,7 +28,18 @@ class ParquetFile:
         self._size = 0
 
     def write(self, piece: TypedColumns) -> None:
-        """Append messages."""
+        """Append messages.
+
+        Parameters
+        ----------
+        piece : TypedColumns
+            Messages of the topic. The type of those of the first call decides the columns.
+
+        Raises
+        ------
+        LogError
+            If the messages are of a type that is defined otherwise.
+        """
         if self._writer is None:
             schema = schema_of(self._topic, piece.fields, self._selection)
             texts = [field.name for field in schema if field.type == pa.string()]

@@ -16,10 +16,20 @@ from hearthlog.schemas.storage.new_files import new_file, new_folder
 def exportable(selection: Selection, format_: ExportFormat) -> Selection:
     """Leave out the topics that a format is not for, as WAV is for clips of sound.
 
+    Parameters
+    ----------
+    selection : Selection
+    format_ : ExportFormat
+
+    Returns
+    -------
+    Selection
+        The same one if the format takes any topic.
+
     Raises
     ------
     LogError
-        If none is left.
+        If the selection has logs, and no topic is left.
     """
     exporter = _exporter(format_)
     if not exporter.type:
@@ -53,7 +63,7 @@ def export(
         Must not exist.
     format_ : ExportFormat
     progress : callable
-        Is called with the share that is done.
+        Is told the share that is done, 0 to 1.
     folder : bool
         Make a folder with one file for each topic (WAV: for each clip); otherwise one file, of one
         topic if the format is `by_topic`.

@@ -24,7 +24,15 @@ _MINUS_ZERO = re.compile(r"(?<![\w])-0(?![.\d])")  # many readers take it for an
 def in_order(
     pieces: Iterable[TypedColumns], lines: Callable[[TypedColumns], list[str]]
 ) -> list[str]:
-    """Make a line of every message, in the order of their log times."""
+    """Make a line of every message, in the order of their log times.
+
+    Parameters
+    ----------
+    pieces : iterable of TypedColumns
+        At least one.
+    lines : callable
+        Makes a line of every message of a piece, in their order: `json_lines` or `text_lines`.
+    """
     texts: list[str] = []
     times: list[Int64] = []
     for piece in pieces:
@@ -38,6 +46,15 @@ def json_lines(piece: TypedColumns) -> list[str]:
     """Make a JSON object of every message, in the form of `mcap cat --json`.
 
     Times are seconds with nine decimals, bytes are in base64, and what is not finite is null.
+
+    Parameters
+    ----------
+    piece : TypedColumns
+
+    Returns
+    -------
+    list of str
+        One line for each message, in their order.
     """
     columns = piece.columns
     texts = [
@@ -53,7 +70,18 @@ def json_lines(piece: TypedColumns) -> list[str]:
 
 
 def text_lines(piece: TypedColumns) -> list[str]:
-    """Make a short line of every message: time, topic, fields."""
+    """Make a short line of every message: time, topic, fields.
+
+    Parameters
+    ----------
+    piece : TypedColumns
+
+    Returns
+    -------
+    list of str
+        One line for each message, in their order. `header.stamp` is left out where all stamps are
+        log times; times are UTC to the millisecond, and durations seconds.
+    """
     columns = piece.columns
     fields = dict(columns.fields)
     stamp = fields.get("header.stamp")
@@ -68,14 +96,35 @@ def text_lines(piece: TypedColumns) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Return a text, in quotes if it has spaces or could steer a terminal."""
+    """Return a text for a terminal: in quotes if it is empty, has spaces or quotes, or could steer it.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+    """
     harmless = text.isprintable()
     plain = harmless and text and not set(text) & set(' "')
     return text if plain else json.dumps(text, ensure_ascii=not harmless)
 
 
 def json_texts(values: NDArray[Any], field: Field) -> list[str]:
-    """Make JSON of every value of a column."""
+    """Make JSON of every value of a column.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n, ...)]
+        As `Columns` has them: times as int64 nanoseconds; arrays as one row each, or as objects
+        where their lengths differ.
+    field : Field
+        What the values are.
+
+    Returns
+    -------
+    list of str
+        One text for each row. Times are seconds with nine decimals, bytes are in base64, and what
+        is not finite is null.
+    """
     if field.size is None and field.type in {TIME, DURATION}:
         return _seconds(values)
     if field.size is None and field.type == "string":

@@ -35,12 +35,17 @@ class WavFiles:
         self._size = 0
 
     def write(self, piece: TypedColumns) -> None:
-        """Append messages.
+        """Append the clips of messages; begin a new file after a hole, or where the format changes.
+
+        Parameters
+        ----------
+        piece : TypedColumns
+            Messages of type `RawAudio`.
 
         Raises
         ------
         LogError
-            If they are no sound that WAV can hold.
+            If the messages hold no sound that WAV can hold; the callable `name` may raise it too.
         """
         for clip in clips_of(piece.columns):
             if self._file is None or not self._follows(clip):
