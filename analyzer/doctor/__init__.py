@@ -16,15 +16,23 @@ __all__ = ["ExaminedFile", "Finding", "Findings", "examine", "examine_file"]
 def examine(path: Path, progress: Progress = ignore_progress) -> list[Findings]:
     """Check a log, or all logs of a folder and how they follow each other.
 
+    Parameters
+    ----------
+    path : Path
+        A log, or a folder of logs.
+    progress : callable, optional
+        Is told the share of the bytes that is done, 0 to 1.
+
     Returns
     -------
     list of Findings
-        One for each file; for those left behind by what was killed, too.
+        One for each log, in the order of their paths, sound ones too; then one for each file that
+        a killed recorder or command has left behind.
 
     Raises
     ------
     LogError
-        If there is no log.
+        If there is neither a log nor such a file.
     """
     left = list(check_leftovers(path)) if path.is_dir() else []
     try:

@@ -25,10 +25,21 @@ def check_stamps(
 
     Parameters
     ----------
+    findings : Findings
+        Is added to.
+    kind : str
+        Last part of the topic, such as `features`; `/rosout` and `/diagnostics` are kinds, too.
+    columns : Columns
+        Messages of this kind.
     microphone : str
-        Empty for a topic of none.
+        Its name; empty for a topic of no microphone.
     named : bool
         Whether the file bears the name of a recorder's log.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
     """
     times = columns.log_times
     stamps = columns["stamp" if kind == ROSOUT else STAMP]
@@ -58,7 +69,23 @@ def check_stamps(
 
 
 def check_values(findings: Findings, columns: Columns, field: str, width: int) -> None:
-    """Check that an array has so many values, and that they are finite."""
+    """Check that an array has as many values as names, and that they are finite.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+    field : str
+        Path of the array; the values of `std` must not be negative, either.
+    width : int
+        Number of names.
+
+    Raises
+    ------
+    LogError
+        If the messages have no such field.
+    """
     values, times = columns[field], columns.log_times
     report = findings.rows
     if values.ndim == 1:
@@ -81,7 +108,22 @@ def check_values(findings: Findings, columns: Columns, field: str, width: int) -
 
 
 def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> None:
-    """Check the labels of frames: their classes, probabilities and confidence."""
+    """Check the labels of frames: their classes, probabilities and confidence.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+        Messages of type `AudioLabel`.
+    classes : list of str
+        Of the model, in the order of the probabilities.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
+    """
     times, report = columns.log_times, findings.rows
     numbers = _check_names(findings, columns, classes)
     probabilities = columns["probabilities"]
@@ -123,7 +165,22 @@ def _check_names(findings: Findings, columns: Columns, classes: list[str]) -> In
 
 
 def check_segments(findings: Findings, columns: Columns, classes: list[str] | None) -> None:
-    """Check the durations, confidence and classes of segments; any class if these are None."""
+    """Check the durations, confidence and classes of segments.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+        Messages of type `AudioSegment`.
+    classes : list of str or None
+        Of the model; None allows any.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
+    """
     times, confidence = columns.log_times, columns["confidence"]
     no_duration = columns["duration"] <= 0
     findings.rows("duration", no_duration, times, lambda _: f"{columns.topic}: has no duration")
@@ -138,7 +195,20 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
 
 
 def check_gaps(findings: Findings, columns: Columns) -> None:
-    """Report every gap, and check that its lost frames last as long as it does."""
+    """Report every gap, and check that its lost frames last as long as it does.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    columns : Columns
+        Messages of type `AudioGap`.
+
+    Raises
+    ------
+    LogError
+        If a field of the type is missing.
+    """
     times, durations = columns.log_times, columns["duration"]
     lost, reasons = columns["frames_lost"], columns["reason"]
     findings.rows(

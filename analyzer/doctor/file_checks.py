@@ -46,7 +46,19 @@ class ExaminedFile:
 
 
 def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFile:
-    """Check one file against the specification of MCAP and, if it is ours, docs/log.md."""
+    """Check one file against the specification of MCAP and, if it is ours, docs/log.md.
+
+    Parameters
+    ----------
+    path : Path
+    progress : callable, optional
+        Is told the share of the bytes that is done, 0 to 1.
+
+    Returns
+    -------
+    ExaminedFile
+        If the file cannot be read, its findings say so.
+    """
     examined = ExaminedFile(Findings(path))
     try:
         with ByteSource(path) as source:
@@ -201,7 +213,13 @@ class ForeignMessages:
         self._findings = findings
 
     def add(self, batch: MessageBatch) -> None:
-        """Take the next messages of the file."""
+        """Decode the next messages of the file, and report what cannot be decoded.
+
+        Parameters
+        ----------
+        batch : MessageBatch
+            Messages behind those before them.
+        """
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):
             if raw.channel.message_encoding != "cdr":
@@ -215,4 +233,4 @@ class ForeignMessages:
                 self._findings.error("cdr", what, time=int(raw.log_times[0]))
 
     def interrupt(self) -> None:
-        """Take note that messages are missing here."""
+        """Note that messages are missing here, which makes no difference."""

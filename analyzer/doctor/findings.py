@@ -62,7 +62,21 @@ class Findings:
         offset: int | None = None,
         time: int | None = None,
     ) -> None:
-        """Note what violates the specification of MCAP, or the contract."""
+        """Add what violates the specification of MCAP or docs/log.md.
+
+        Parameters
+        ----------
+        rule : str
+            Name of the rule in docs/doctor.md.
+        what : str
+            What is wrong.
+        advice : str
+            What to do; empty where `what` says it all.
+        offset : int, optional
+            Byte of the file at which the record begins.
+        time : int, optional
+            Log time in nanoseconds of UTC.
+        """
         self._add(Finding(self.path, "error", rule, what, advice, offset, time))
 
     def warning(
@@ -74,7 +88,21 @@ class Findings:
         offset: int | None = None,
         time: int | None = None,
     ) -> None:
-        """Note what is incomplete, or was lost."""
+        """Add what is incomplete, or was lost.
+
+        Parameters
+        ----------
+        rule : str
+            Name of the rule in docs/doctor.md.
+        what : str
+            What is incomplete.
+        advice : str
+            What to do; empty where `what` says it all.
+        offset : int, optional
+            Byte of the file at which the record begins.
+        time : int, optional
+            Log time in nanoseconds of UTC.
+        """
         self._add(Finding(self.path, "warning", rule, what, advice, offset, time))
 
     def rows(
@@ -85,7 +113,22 @@ class Findings:
         what: Callable[[int], str],
         level: Level = "error",
     ) -> None:
-        """Note the rows of a column that break a rule; `what` describes one of them."""
+        """Add the rows of a column that break a rule.
+
+        Parameters
+        ----------
+        rule : str
+            Name of the rule in docs/doctor.md.
+        wrong : np.ndarray [shape=(n,)], bool
+            Which rows break it.
+        times : np.ndarray [shape=(n,)], int64
+            Log times in nanoseconds of UTC.
+        what : callable
+            Is told the number of a row, from 0, and says what is wrong with it; is called for the
+            first five of them.
+        level : str
+            `error` or `warning`.
+        """
         places = np.flatnonzero(wrong)
         advice = DISTRUST if level == "error" else ""
         for row in places[:_SHOWN].tolist():
@@ -96,7 +139,7 @@ class Findings:
             self.counts[level, rule] += len(places) - _SHOWN
 
     def more(self) -> dict[tuple[Level, str], int]:
-        """Count, by kind, the findings that are not shown."""
+        """Count the findings that are not shown, by level and rule."""
         shown = Counter((finding.level, finding.rule) for finding in self.shown)
         return {kind: n - shown[kind] for kind, n in self.counts.items() if n > shown[kind]}
 

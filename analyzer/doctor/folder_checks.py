@@ -20,7 +20,18 @@ _LEFT = {
 
 
 def check_leftovers(folder: Path) -> Iterator[Findings]:
-    """Find what was left behind by recorders and commands that were killed."""
+    """Find the files that killed recorders and commands have left behind.
+
+    Parameters
+    ----------
+    folder : Path
+        Is searched with all folders in it.
+
+    Yields
+    ------
+    Findings
+        One for each such file, in the order of their paths.
+    """
     for path in sorted(folder.rglob("*")):
         for suffix, what in _LEFT.items():
             if path.name.endswith(suffix) and SUFFIX in path.name:
@@ -30,7 +41,13 @@ def check_leftovers(folder: Path) -> Iterator[Findings]:
 
 
 def check_series(files: Sequence[ExaminedFile]) -> None:
-    """Compare the logs of each node with each other, and add to their findings."""
+    """Compare the logs of each node with each other, and add to their findings.
+
+    Parameters
+    ----------
+    files : sequence of ExaminedFile
+        In any order; those that are not ours, or have no messages, are passed over.
+    """
     nodes: dict[str, list[ExaminedFile]] = {}
     for file in files:
         if file.ours and file.span is not None:

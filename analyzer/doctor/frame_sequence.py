@@ -24,6 +24,10 @@ class FrameSequence:
 
     Parameters
     ----------
+    findings : Findings
+        Is added to.
+    microphone : str
+        Its name.
     statistics_every : int or None
         Frames from one statistics message to the next, if the file has that.
     window_frames : int
@@ -59,27 +63,48 @@ class FrameSequence:
         self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
 
     def add(self, kind: str, rows: Int64) -> None:
-        """Add messages of one kind [shape=(n, 3)], in the order of their log times."""
+        """Add messages of one kind.
+
+        Parameters
+        ----------
+        kind : str
+            `features`, `statistics`, `label`, `segment` or `gap`.
+        rows : np.ndarray [shape=(n, 3)], int64
+            As the class describes them (times in nanoseconds of UTC), in the order of their log
+            times, behind those of this kind that were added before.
+        """
         self._pending.setdefault(kind, []).append(rows)
 
     def interrupt(self) -> None:
-        """Take note that messages are missing here, because the file is damaged."""
+        """Note that messages are missing here, because the file is damaged."""
         self.finish()
         self._pending.clear()
         self._previous = self._run = self._segment_end = None
 
     def begin_anew(self, time: int) -> None:
-        """Take note that from a log time on this is another recording, or its next log."""
+        """Note that from a log time on this is another recording, or its next log.
+
+        Parameters
+        ----------
+        time : int
+            Nanoseconds of UTC.
+        """
         self.settle(time)
         self._previous = self._run = self._segment_end = None
 
     def finish(self) -> None:
-        """Check the last frame; what a killed recorder did not write of it is not missed."""
+        """Check the last frame; what a killed recorder did not write of it is not reported."""
         self._check_features(self._take(FEATURES, None), self._take(GAP, None))
         self._check_segments(self._take(SEGMENT, None))
 
     def settle(self, until: int | None) -> None:
-        """Check everything before some log time, of which nothing more will come."""
+        """Check everything before a log time, of which nothing more will come.
+
+        Parameters
+        ----------
+        until : int or None
+            Nanoseconds of UTC; None for everything that was added.
+        """
         features, statistics, labels, segments, gaps = (
             self._take(kind, until) for kind in (FEATURES, STATISTICS, LABEL, SEGMENT, GAP)
         )

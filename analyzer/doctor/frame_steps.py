@@ -41,7 +41,14 @@ class Steps(NamedTuple):
 
 
 def check_steps(report: Report, steps: Steps) -> None:
-    """Check that frame numbers and stamps go on, and that a gap explains every jump."""
+    """Check that frame numbers and stamps go on, and that a gap explains every jump.
+
+    Parameters
+    ----------
+    report : callable
+        Is told the rows that break a rule, as `Report` says.
+    steps : Steps
+    """
     rows, has_previous, numbers, elapsed, gaps, lost = steps
     times, frames, _ = rows.T
     report(
@@ -76,8 +83,11 @@ def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.
 
     Parameters
     ----------
+    report : callable
+        Is told the gaps that break a rule, as `Report` says.
+    steps : Steps
     gaps : np.ndarray [shape=(m, 3)], int64
-        End and start (ns), and frames that were lost.
+        End and start (nanoseconds of UTC), and the number of frames that were lost.
     following : np.ndarray [shape=(m,)], int
         Rows of the frames behind the gaps.
     """

@@ -50,7 +50,13 @@ class MessageChecks:
         self._named = LOG_NAME.fullmatch(findings.path.name) is not None
 
     def add(self, batch: MessageBatch) -> None:
-        """Take the next messages of the file."""
+        """Check the next messages of the file.
+
+        Parameters
+        ----------
+        batch : MessageBatch
+            Messages behind those before them.
+        """
         self._check_times(batch)
         definitions = self._data.definitions
         by_kind: dict[str, list[Columns]] = {}
@@ -72,12 +78,12 @@ class MessageChecks:
             frames.settle(self._last)
 
     def finish(self) -> None:
-        """Take note that this was all."""
+        """Check the last frames: no more messages will come."""
         for frames in self.frames.values():
             frames.finish()
 
     def interrupt(self) -> None:
-        """Take note that messages are missing here, because the file is damaged."""
+        """Note that messages are missing here, because the file is damaged."""
         self._last = None
         for frames in self.frames.values():
             frames.interrupt()
@@ -181,7 +187,18 @@ class MessageChecks:
 
 
 def statistics_every(data: DataSection) -> int | None:
-    """Read from the configuration in a file how often statistics are logged."""
+    """Read from the configuration in a file how often statistics are logged.
+
+    Parameters
+    ----------
+    data : DataSection
+        With the attachment `configuration.json`, if the file has it.
+
+    Returns
+    -------
+    int or None
+        Frames from one message of statistics to the next; None if the file does not say.
+    """
     try:
         configuration = json.loads(data.attachments["configuration.json"][0])
         every = configuration["statistics_every"]

@@ -38,8 +38,12 @@ class MetadataChecks:
 
     Parameters
     ----------
+    data : DataSection
+        The whole data section of the file.
     messages : MessageChecks
         The checks of its messages, which are over.
+    findings : Findings
+        Is added to.
     finished : bool
         Whether the file was completed.
     whole : bool
@@ -63,7 +67,7 @@ class MetadataChecks:
         self._channels = {c.topic: c for c in data.definitions.channels.values()}
 
     def check(self) -> None:
-        """Check all of it."""
+        """Check the metadata, the name, the info, the topics and the counts of the file."""
         if self._data.header is not None and self._data.header.profile != PROFILE:
             self._error("profile", f"the profile is {self._data.header.profile!r}, not {PROFILE}")
         self._check_metadata()

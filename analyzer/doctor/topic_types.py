@@ -20,7 +20,18 @@ SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 
 
 def split_topic(topic: str) -> tuple[str, str]:
-    """Split a topic into microphone and kind; one of no microphone into nothing and itself."""
+    """Split a topic of a recorder into microphone and kind.
+
+    Parameters
+    ----------
+    topic : str
+        Such as `/mic/features`.
+
+    Returns
+    -------
+    microphone, kind : str
+        Such as `mic` and `features`; nothing and the whole topic if it is none of a microphone.
+    """
     name = parse_topic(topic)
     if name is None or name.labelling != LIVE or name.kind not in TYPES:
         return "", topic
@@ -28,5 +39,16 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def topic_type(topic: str) -> str | None:
-    """Return the message type that docs/log.md gives to a topic; None if it has no such topic."""
+    """Return the message type that docs/log.md gives to a topic.
+
+    Parameters
+    ----------
+    topic : str
+        Such as `/mic/features`.
+
+    Returns
+    -------
+    str or None
+        None if docs/log.md has no such topic.
+    """
     return TYPES.get(split_topic(topic)[1], SHARED.get(topic))

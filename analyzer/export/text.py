@@ -96,7 +96,7 @@ def text_lines(piece: TypedColumns) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Return a text for a terminal: in quotes if it is empty, has spaces or quotes, or could steer it.
+    """Put a text in quotes if it is empty, has spaces or quotes, or could steer a terminal.
 
     Parameters
     ----------

@@ -27,7 +27,13 @@ class ByteSource:
         self._stream.close()
 
     def take(self, length: int) -> bytes:
-        """Read some bytes; fewer at the end."""
+        """Read the next bytes, and add them to the checksum.
+
+        Parameters
+        ----------
+        length : int
+            Bytes; fewer are returned at the end of the file.
+        """
         data = self._stream.read(min(length, self.size - self.offset))
         self.offset += len(data)
         if self.crc is not None:
@@ -35,7 +41,13 @@ class ByteSource:
         return data
 
     def skip(self, offset: int) -> None:
-        """Go on to a later byte."""
+        """Go on to a later byte; what is passed over is read for the checksum, up to 1 GiB.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file, from 0; an earlier one than the next changes nothing.
+        """
         if offset - self.offset > _READ_ANYWAY:
             self.crc = None
             self.offset = self._stream.seek(offset)
@@ -43,9 +55,23 @@ class ByteSource:
             pass
 
     def tail(self, length: int) -> bytes:
-        """Read the last bytes, and stay where we are."""
+        """Read the last bytes of the file, and leave `offset` as it is.
+
+        Parameters
+        ----------
+        length : int
+            Bytes; fewer are returned of a shorter file.
+        """
         return self.at(max(self.size - length, 0), length)
 
     def at(self, offset: int, length: int) -> bytes:
-        """Read some bytes anywhere, and stay where we are."""
+        """Read bytes anywhere in the file, and leave `offset` as it is.
+
+        Parameters
+        ----------
+        offset : int
+            Byte of the file, from 0.
+        length : int
+            Bytes; fewer are returned at the end of the file.
+        """
         return os.pread(self._stream.fileno(), length, offset)

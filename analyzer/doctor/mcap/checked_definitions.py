@@ -23,7 +23,26 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
 def parse_strictly(
     findings: Findings, opcode: int, offset: int, content: bytes
 ) -> McapRecord | None:
-    """Parse a record; say if it is too short, holds what is no text, or a key twice."""
+    """Parse a record, and report one that is damaged or too large.
+
+    Damaged are records that are too short, have a text that is not UTF-8, or a key of a map twice.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    opcode : int
+        Kind of the record.
+    offset : int
+        Byte of the file at which the record begins, or the chunk that it is in.
+    content : bytes
+        The record without opcode and length.
+
+    Returns
+    -------
+    McapRecord or None
+        None if it cannot be parsed, is larger than hearthlog reads, or is of an unknown kind.
+    """
     if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
         what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
         findings.error("too-large", what, RECOVER, offset=offset)
@@ -42,7 +61,13 @@ def parse_strictly(
 
 
 def name_of(opcode: int) -> str:
-    """Name a kind of record."""
+    """Name a kind of record, such as `Chunk index`.
+
+    Parameters
+    ----------
+    opcode : int
+        Any number; an unknown one is named as such.
+    """
     try:
         return Opcode(opcode).name.capitalize().replace("_", " ")
     except ValueError:
@@ -60,7 +85,22 @@ class CheckedDefinitions(Definitions):
         self._findings = findings
 
     def read(self, opcode: int, offset: int, content: bytes) -> int | None:
-        """Read and check a schema or a channel; return the number of a channel that is new."""
+        """Read and check a schema or a channel.
+
+        Parameters
+        ----------
+        opcode : int
+            Of a schema or a channel.
+        offset : int
+            Byte of the file at which the record begins, or the chunk that it is in.
+        content : bytes
+            The record without opcode and length.
+
+        Returns
+        -------
+        int or None
+            Number of the channel, if the record defines a new one.
+        """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
             self._add_schema(record, offset, len(content))

@@ -57,7 +57,13 @@ class Chunk:
         self.whole = True
 
     def add_index(self, record: Record) -> None:
-        """Take a message index that stands behind the chunk."""
+        """Add a message index that stands behind the chunk.
+
+        Parameters
+        ----------
+        record : Record
+            Of this kind.
+        """
         self._index_length += record.length
         try:
             channel, size = formats.MESSAGE_INDEX.unpack_from(record.content)
@@ -77,7 +83,13 @@ class Chunk:
                 self._index_offsets.append((channel, record.offset))
 
     def check(self, *, cut: bool) -> None:
-        """Check what is in it; `cut`: its message indexes may not all be there."""
+        """Check the records of the chunk, its times and its message indexes.
+
+        Parameters
+        ----------
+        cut : bool
+            Whether message indexes may be missing behind it: they are not compared then.
+        """
         if not self.whole:
             return
         counts = [len(e) // formats.INDEX_ENTRIES.itemsize for e in self._indexes.values()]
@@ -92,7 +104,13 @@ class Chunk:
             self._check_index(entries, channels)
 
     def index_content(self) -> bytes | None:
-        """Return what the chunk index should say of this chunk."""
+        """Return the chunk index that there should be, without opcode and length.
+
+        Returns
+        -------
+        bytes or None
+            None if the head of the chunk cannot be read.
+        """
         if self._head is None:
             return None
         head = self._head
@@ -228,7 +246,21 @@ def check_channels(
     new: dict[int, int],
     offset: int,
 ) -> None:
-    """Report messages before their channels, of which `new` are defined among them, and where."""
+    """Report messages whose channel is not defined, or only behind them.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    definitions : CheckedDefinitions
+        Of the file, up to the end of these records.
+    content : ChunkContent
+        The messages.
+    new : dict of int to int
+        By number of a channel that these records define: where in their bytes they do.
+    offset : int
+        Byte of the file at which the chunk, or the first of the messages, begins.
+    """
     numbers = content.heads["channel"]
     for channel in np.flatnonzero(np.bincount(numbers)).tolist():
         if channel not in definitions.channels:

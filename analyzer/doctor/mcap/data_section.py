@@ -43,6 +43,8 @@ class DataSection:
 
     Parameters
     ----------
+    findings : Findings
+        Is added to.
     names : collection of str
         Of metadata records and attachments, the first two of each are kept if they are not large.
     ours : bool
@@ -75,7 +77,12 @@ class DataSection:
         self._first = True
 
     def add(self, record: Record) -> Iterator[MessageBatch | None]:
-        """Take the next record.
+        """Check the next record.
+
+        Parameters
+        ----------
+        record : Record
+            Behind those before it.
 
         Yields
         ------
@@ -100,7 +107,18 @@ class DataSection:
             yield from self._batches()
 
     def finish(self, *, cut: bool) -> Iterator[MessageBatch | None]:
-        """Hand out the last messages; `cut`: something is missing behind them."""
+        """Check what is still open, and hand out the last messages.
+
+        Parameters
+        ----------
+        cut : bool
+            Whether something is missing behind the last record.
+
+        Yields
+        ------
+        MessageBatch or None
+            As of `add`.
+        """
         self._end_run()
         yield from self._end_chunk(cut=cut)
         yield from self._batches()

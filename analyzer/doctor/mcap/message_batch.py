@@ -24,7 +24,18 @@ class MessageBatch(NamedTuple):
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
     ) -> Iterator[RawMessages]:
-        """Group the messages by channel, without those of channels that are not defined."""
+        """Group the messages by channel, without those of channels that are not defined.
+
+        Parameters
+        ----------
+        channels, schemas : mapping of int to Channel, of int to Schema
+            By their numbers in the file.
+
+        Yields
+        ------
+        RawMessages
+            Those of one channel in the order of the file; channels by number.
+        """
         for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
             if identity in channels:
                 channel = channels[identity]
@@ -35,7 +46,14 @@ class MessageBatch(NamedTuple):
 
 
 def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[MessageBatch]:
-    """Yield the messages of some chunks, a few megabytes each time, however large a chunk is."""
+    """Yield the messages of some chunks, a few megabytes each time, however large a chunk is.
+
+    Parameters
+    ----------
+    parts : sequence of (bytes, np.ndarray, np.ndarray)
+        Records of each chunk; where in them its n messages begin, shape (n,), int64; the heads of
+        these messages, shape (n,), of dtype `MESSAGE_HEAD`.
+    """
     sizes = [len(content) for content, _, _ in parts]
     firsts = np.cumsum([0, *sizes[:-1]])
     buffer = np.frombuffer(b"".join(content for content, _, _ in parts), np.uint8)

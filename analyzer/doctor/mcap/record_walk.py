@@ -33,11 +33,13 @@ class RecordWalk:
     ----------
     source : ByteSource
         Behind the magic.
+    findings : Findings
+        Is added to.
     finished : bool
         Whether the file has an end.
     offsets : sequence of int
-        Of records, ascending, as the index of the file has them: here the walk goes on
-        when it has lost its way.
+        Bytes at which records begin, ascending, as the index of the file has them: here the walk
+        goes on when it has lost its way.
     """
 
     def __init__(

@@ -43,6 +43,8 @@ class SummarySection:
     ----------
     data : DataSection
         The whole data section before it.
+    findings : Findings
+        Is added to.
     whole : bool
         Whether all of that could be read: if not, what the index says is not compared with it.
     """
@@ -62,7 +64,13 @@ class SummarySection:
         self._crc = 0
 
     def add(self, record: Record) -> None:
-        """Take the next record behind the Data End."""
+        """Check the next record behind the Data End.
+
+        Parameters
+        ----------
+        record : Record
+            Any but the footer.
+        """
         opcode = record.opcode
         if opcode not in _ALLOWED:
             if opcode < _RESERVED:
@@ -78,7 +86,13 @@ class SummarySection:
         self._crc = zlib.crc32(record.content, self._crc)
 
     def finish(self, record: Record) -> None:
-        """Take the footer."""
+        """Check the footer, and whether the summary is complete.
+
+        Parameters
+        ----------
+        record : Record
+            The footer.
+        """
         footer = parse_strictly(self._findings, record.opcode, record.offset, record.content)
         if not isinstance(footer, Footer):
             return
