@@ -76,13 +76,18 @@ _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
 
 def find_class(label: str) -> SoundClass | None:
-    """Return the class that a label means; None for a class that is not in the table.
+    """Return the class that a label means.
 
     Parameters
     ----------
     label : str
         Name or alias of a class. Capitals, and spaces, commas and hyphens for `_`, make no
         difference: `Crying, sobbing` is `crying_sobbing`.
+
+    Returns
+    -------
+    SoundClass or None
+        None if the class is not in the table.
     """
     return _BY_NAME.get(_spelt(label))
 

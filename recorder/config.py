@@ -120,7 +120,9 @@ class Settings(BaseSettings):
 def load_settings(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> Settings:
-    """Combine the command line, the environment, the file and the defaults, in this order.
+    """Combine the command line, the environment, the file and the defaults.
+
+    The first of these that has a value gives it.
 
     Parameters
     ----------

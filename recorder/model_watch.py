@@ -63,7 +63,7 @@ class ModelWatch:
         self._thread.start()
 
     def refusals(self) -> Iterator[str]:
-        """Yield why models were refused since the last call, and set `ready`.
+        """Yield why models were refused since the last call, and update `ready`.
 
         Yields
         ------

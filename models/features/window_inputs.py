@@ -153,7 +153,18 @@ class StatisticsStream:
         self._recent = None
 
     def __call__(self, features: Float32) -> Float32:
-        """Compute the inputs at successive frames; see `InputStream`."""
+        """Compute the inputs at successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+
+        Returns
+        -------
+        np.ndarray [shape=(m, width)], float32
+            At the last m of these frames: those with a whole window since the start or the last
+            restart.
+        """
         length = self._inputs.window_frames
         if self._recent is not None:
             features = np.concatenate([self._recent, features])

@@ -62,7 +62,7 @@ def list_models(folder: Path) -> list[ModelEntry]:
 
 
 def target(folder: Path, alias: str) -> str | None:
-    """Return the name of the model that an alias points to; None if there is no such alias.
+    """Return the name of the model that an alias points to.
 
     Parameters
     ----------
@@ -70,6 +70,11 @@ def target(folder: Path, alias: str) -> str | None:
         Folder of model files.
     alias : str
         `champion` or `candidate`.
+
+    Returns
+    -------
+    str or None
+        None if there is no such alias. That there is such a model is not checked.
 
     Raises
     ------

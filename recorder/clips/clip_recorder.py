@@ -55,7 +55,13 @@ class ClipRecorder:
             raise ConfigurationError(self._refused)
 
     def before(self, event: Event) -> list[Notice]:
-        """Prepare for an event that is about to be logged: a gap ends the sound before it."""
+        """Prepare for an event that is about to be logged: a gap ends the sound before it.
+
+        Returns
+        -------
+        list of Notice
+            What people should know: sound that cannot be kept, or is kept again.
+        """
         if isinstance(event, Gap) and not self._refused:
             return self._writer.write(self._finder.close())
         return []
@@ -87,7 +93,13 @@ class ClipRecorder:
         return notices
 
     def finish(self) -> list[Notice]:
-        """Write the remaining sound, and complete the layer."""
+        """Write the remaining sound, and complete the layer.
+
+        Returns
+        -------
+        list of Notice
+            What people should know: sound that cannot be kept, or is kept again.
+        """
         notices = [] if self._refused else self._writer.write(self._finder.close())
         return [*notices, *self._writer.finish()]
 

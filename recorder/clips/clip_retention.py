@@ -35,7 +35,7 @@ class ClipRetention:
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
-        """Delete what is old, unless that was done less than an hour ago.
+        """Delete old clips, unless the last time was less than an hour ago.
 
         Parameters
         ----------

@@ -116,7 +116,7 @@ class Framer:
         self._wall_offset = wall_offset
 
     def step_clock(self, wall_offset: int, reason: str) -> None:
-        """Change the time of day; only the samples of the unfinished frame are lost.
+        """Follow a change of the time of day; only the samples of the unfinished frame are lost.
 
         Parameters
         ----------

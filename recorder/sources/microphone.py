@@ -31,6 +31,11 @@ class MicrophoneSource:
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
 
+    Attributes
+    ----------
+    device : str
+        Name of the microphone that was opened first.
+
     Raises
     ------
     SourceError

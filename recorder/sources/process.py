@@ -24,7 +24,7 @@ _INPUT_OVERFLOW = 2  # paInputOverflow
 
 
 def query_devices() -> list[Device]:
-    """List the microphones.
+    """List the microphones, as `list_devices` does, in a process of its own.
 
     Raises
     ------

@@ -55,7 +55,18 @@ class Columns:
         return len(self.log_times)
 
     def __getitem__(self, path: str) -> NDArray[Any]:
-        """Return the column of a field; raise LogError if the messages have no such field."""
+        """Return the column of a field.
+
+        Parameters
+        ----------
+        path : str
+            Path of the field, such as "header.stamp".
+
+        Raises
+        ------
+        LogError
+            If the messages have no such field, or it was not read.
+        """
         try:
             return self.fields[path]
         except KeyError:

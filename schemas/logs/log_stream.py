@@ -79,12 +79,12 @@ class LogStreamWriter:
             )
 
     def continue_on(self, stream: BinaryIO) -> None:
-        """Continue on another stream.
+        """Go on with another stream.
 
         Parameters
         ----------
         stream : BinaryIO
-            At its end, and it contains all that was flushed; stays open.
+            It contains all that was flushed, and is at its end; stays open.
         """
         self._writer.continue_on(stream)
 

@@ -28,6 +28,11 @@ def provenance(node: str, **more: str) -> dict[str, str]:
         Name of the node that the file is of.
     **more : str
         What this kind of file says besides.
+
+    Returns
+    -------
+    dict of str to str
+        `version` of hearthlog, `schema_version`, `node`, and `more`.
     """
     return {"version": __version__, _KEY: str(SCHEMA_VERSION), "node": node, **more}
 
@@ -35,8 +40,12 @@ def provenance(node: str, **more: str) -> dict[str, str]:
 def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
     """Read the records of a file, each different one once.
 
-    There is one, or those of all logs that were merged. A record of a newer version gives a
-    `HearthlogWarning`.
+    A record of a newer version gives a `HearthlogWarning`.
+
+    Returns
+    -------
+    list of mapping of str to str
+        One, or those of all logs that were merged; empty if the file is not of hearthlog.
 
     Raises
     ------
@@ -80,12 +89,17 @@ def version_text(record: Mapping[str, str]) -> str:
 
 
 def schema_version(record: Mapping[str, str]) -> int | None:
-    """Return the schema version of a record; None if this version of hearthlog does not know it.
+    """Return the schema version of a record.
 
     Parameters
     ----------
     record : mapping of str to str
         As `read_provenance` gives it.
+
+    Returns
+    -------
+    int or None
+        None if this version of hearthlog does not know it.
     """
     return _KNOWN.get(version_text(record))
 

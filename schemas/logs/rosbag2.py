@@ -22,13 +22,16 @@ class TopicCount:
 def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
     """Return the metadata that a ROS 2 channel must have.
 
-    Its quality of service is JSON, which is a part of YAML.
-
     Parameters
     ----------
     type_hash : str
         RIHS01 hash of the topic's type.
     quality : Quality
+
+    Returns
+    -------
+    dict of str to str
+        `offered_qos_profiles`, as JSON, which is a part of YAML, and `topic_type_hash`.
     """
     seconds = quality.lifespan_seconds
     profile = {
@@ -58,6 +61,11 @@ def file_metadata(
         By name of the topic.
     span : (int, int)
         First and last log time, in nanoseconds of UTC.
+
+    Returns
+    -------
+    dict of str to str
+        `serialized_metadata`, as JSON.
     """
     start, end = span
     times = {

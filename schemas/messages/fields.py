@@ -41,6 +41,11 @@ class Field(NamedTuple):
 def fields_of(kind: MessageType) -> dict[str, Field]:
     """List all fields of a message type by path, with the fields of the messages inside it.
 
+    Returns
+    -------
+    dict of str to Field
+        By path, such as "header.stamp", in the order of the definition.
+
     Raises
     ------
     LogError

@@ -120,12 +120,17 @@ def relabelling(model: str) -> str:
 
 
 def parse_topic(name: str) -> TopicName | None:
-    """Return the parts of the name of a topic; None if it is no topic of a microphone.
+    """Split the name of a topic into its parts.
 
     Parameters
     ----------
     name : str
         Such as "/mic/features" or "/mic/review/segment".
+
+    Returns
+    -------
+    TopicName or None
+        None if it is no topic of a microphone.
     """
     match = _TOPIC.fullmatch(name)
     return None if match is None else TopicName(match[1], match[2] or LIVE, match[3])

@@ -68,6 +68,11 @@ class MessageType:
         ----------
         size : int
             Bytes of a payload.
+
+        Returns
+        -------
+        list of Layout
+            Empty before `layout_of` has found one. The caller must not change it.
         """
         return self._layouts.get(size, [])
 
