@@ -206,7 +206,15 @@ def _report_unfinished(findings: Findings, *, active: bool) -> None:
 
 
 class ForeignMessages:
-    """Checks that the messages of a file that is not ours are of the types that it names."""
+    """Checks that the messages of a file that is not ours are of the types that it names.
+
+    Parameters
+    ----------
+    data : DataSection
+        Of the file; its definitions grow as it is read.
+    findings : Findings
+        Is added to.
+    """
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self._data = data

@@ -38,7 +38,15 @@ _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
 
 
 class MessageChecks:
-    """Follows the messages of one file."""
+    """Follows the messages of one file.
+
+    Parameters
+    ----------
+    data : DataSection
+        Of the file; its definitions grow as it is read.
+    findings : Findings
+        Is added to.
+    """
 
     def __init__(self, data: DataSection, findings: Findings) -> None:
         self.infos: dict[str, dict[str, Any]] = {}  # the `AudioStreamInfo` of each microphone

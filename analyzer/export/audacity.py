@@ -17,6 +17,15 @@ class LabelTrack:
 
     Times are seconds since the first frame of the microphone in the span or, without frames, since
     the first segment. A segment that began before is cut.
+
+    Parameters
+    ----------
+    stream : binary file
+        Is written to.
+    topic : str
+        Such as `/mic/segment`.
+    selection : Selection
+        Has the topic.
     """
 
     def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:

@@ -30,6 +30,15 @@ class CsvFile:
     Arrays are spread into columns, such as `mean.energy` where the channel has names for the
     elements, otherwise `values[0]`; arrays of messages are JSON, and bytes are in base64. Stamps
     are UTC, durations are in seconds. Control characters of texts become U+FFFD.
+
+    Parameters
+    ----------
+    stream : binary file
+        Is written to.
+    topic : str
+        Such as `/mic/segment`.
+    selection : Selection
+        Has the topic.
     """
 
     def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:

@@ -15,6 +15,15 @@ from hearthlog.schemas.progress import Progress
 class OutputFiles:
     """The files of an export, under temporary names until all are written.
 
+    Parameters
+    ----------
+    path : Path
+        The only file, which does not exist, or an empty folder.
+    output : Path
+        The name that it gets.
+    suffix : str
+        Of the files in a folder, without a dot.
+
     Attributes
     ----------
     path : Path

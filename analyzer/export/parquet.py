@@ -17,6 +17,15 @@ class ParquetFile:
     """A Parquet file being written, row group by row group.
 
     Stamps are of type timestamp[ns, UTC]; the metadata are those of `schema_of`.
+
+    Parameters
+    ----------
+    stream : binary file
+        Is written to.
+    topic : str
+        Such as `/mic/segment`.
+    selection : Selection
+        Has the topic.
     """
 
     def __init__(self, stream: BinaryIO, topic: str, selection: Selection) -> None:

@@ -35,7 +35,17 @@ _INFO = ("device", "feature_set", "model", "model_sha256")
 
 
 class Configuration(BaseModel):
-    """Of what the recorder was asked to do, that which shapes its log."""
+    """Settings of a recorder that shape its log.
+
+    Attributes
+    ----------
+    max_bag_duration : int
+        Seconds in a file; 1 to 86,400.
+    flush_seconds, sync_seconds : float
+        Seconds that a killed process, and a power cut, lose at most; 1 to 3600.
+    statistics_every : int
+        Frames from one message of statistics to the next; at least 1.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 

@@ -36,7 +36,7 @@ class Timed(Protocol):
 
 
 class Overlay(NamedTuple):
-    """Time in which nothing begins or ends."""
+    """Parts of the time, in nanoseconds of UTC, in which no span of any layer begins or ends."""
 
     starts: Int64  # shape (n,)
     ends: Int64

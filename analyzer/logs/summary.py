@@ -105,7 +105,7 @@ class Summary:
 
     @property
     def compression_ratio(self) -> float | None:
-        """Bytes before compression for each on disk; None without chunks."""
+        """Bytes before compression for each byte on disk; None without chunks."""
         return self.raw_bytes / self.chunk_bytes if self.chunk_bytes else None
 
     def add(self, other: "Summary") -> None:

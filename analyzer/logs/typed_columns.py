@@ -94,7 +94,7 @@ def decode_all(batch: Iterable[RawMessages]) -> list[TypedColumns]:
 def is_compatible(
     channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
 ) -> bool:
-    """Tell whether some fields can be read from the messages of a channel, if it is of a type.
+    """Tell whether a channel has messages of a type, from which some fields can be read.
 
     Any version of a type of ours can be read: fields that were appended later have defaults. If a
     definition is of no version of the type, a `HearthlogWarning` says so.

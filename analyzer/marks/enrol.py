@@ -79,7 +79,7 @@ def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None
         If the label cannot be the name of a class, if there is less than a second of sound, or if
         the sound is only silence and the label is not.
     SourceError
-        If the file is missing, or is no audio.
+        If the file is missing, is no audio, or is shorter than a frame.
     LogError
         If an enrolled log is damaged, or the new one cannot be written.
     """
@@ -124,7 +124,7 @@ def enrol_microphone(
         If the label cannot be the name of a class, if there is less than a second of sound, or if
         the sound is only silence and the label is not.
     SourceError
-        If the microphone cannot be opened, or gives no sound.
+        If the microphone cannot be found or opened.
     LogError
         If the log cannot be written.
     """

@@ -75,7 +75,15 @@ def name_of(opcode: int) -> str:
 
 
 class CheckedDefinitions(Definitions):
-    """The schemas and channels that were defined so far, each checked when it was added."""
+    """The schemas and channels that were defined so far, each checked when it was added.
+
+    Parameters
+    ----------
+    findings : Findings
+        Is added to.
+    ours : bool
+        Whether hearthlog made this file: then breaches of its profile are errors, not warnings.
+    """
 
     def __init__(self, findings: Findings, *, ours: bool) -> None:
         super().__init__()

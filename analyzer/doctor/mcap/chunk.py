@@ -23,7 +23,17 @@ from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress
 
 
 class ChunkContent(NamedTuple):
-    """The records of a chunk: their bytes, where messages begin in them, and the heads of these."""
+    """The records of a chunk.
+
+    Attributes
+    ----------
+    records : bytes
+        Decompressed.
+    starts : np.ndarray [shape=(n,)], int64
+        Bytes in `records` at which its messages begin, ascending.
+    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
+        The heads of these messages.
+    """
 
     records: bytes
     starts: Int64
@@ -31,7 +41,17 @@ class ChunkContent(NamedTuple):
 
 
 class Chunk:
-    """A chunk, checked when the message indexes behind it are known."""
+    """A chunk, checked when the message indexes behind it are known.
+
+    Parameters
+    ----------
+    record : Record
+        The chunk.
+    findings : Findings
+        Is added to.
+    definitions : CheckedDefinitions
+        Of the file so far; those in the chunk are added.
+    """
 
     def __init__(self, record: Record, findings: Findings, definitions: CheckedDefinitions) -> None:
         self.content: ChunkContent | None = None  # None if the chunk is too damaged to be read

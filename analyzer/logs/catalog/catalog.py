@@ -69,7 +69,7 @@ class CatalogRow:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """First and last log time; None if there are no messages."""
+        """First and last log time, in nanoseconds of UTC; None if there are no messages."""
         return None if self.start is None or self.end is None else (self.start, self.end)
 
 

@@ -36,6 +36,11 @@ class LabelCodec(Protocol):
         text : str
             All of it.
 
+        Yields
+        ------
+        FileLabel
+            In the order of the file.
+
         Raises
         ------
         DataError
