@@ -35,7 +35,7 @@ class AdaptationCurve(NamedTuple):
 
 
 def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> AdaptationCurve:
-    """Leave each collection out in turn and adapt to ever more of it.
+    """Leave each collection out in turn, and adapt the method to more and more of its segments.
 
     Parameters
     ----------

@@ -124,12 +124,13 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> Difference:
 
 
 def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
-    """Join successive pieces whose labels are the same; they may be a frame apart.
+    """Join successive pieces of two labellings while both labels stay the same.
 
     Parameters
     ----------
     pieces : Overlay
-        Of `a` and `b`, where both have a span; at least one piece.
+        Of `a` and `b`, where both have a span; at least one piece. Pieces of a run may be a frame
+        apart.
     a, b : Events
         The spans behind its rows, labels as indices of the same classes.
 

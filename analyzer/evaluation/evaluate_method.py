@@ -69,13 +69,13 @@ def evaluate_method(
 
 
 def divide(data: Dataset, kind: Kind) -> list[Fold]:
-    """Divide segments into folds, of which a `kind` is never on both sides.
+    """Divide segments into folds that learn from some and are tried on the others.
 
     Parameters
     ----------
     data : Dataset
     kind : str
-        `segment`, `source` or `collection`.
+        What is never on both sides of a fold: a `segment`, a `source` or a `collection`.
 
     Returns
     -------

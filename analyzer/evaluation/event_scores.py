@@ -181,7 +181,7 @@ def _seconds(events: Events) -> Spans:
 
 
 def event_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
-    """Score event by event, each matched with at most one.
+    """Score event by event; each event is matched with at most one.
 
     These are the event-based metrics of Mesaros et al. (2016). Two events match if their onsets are
     at most 0.2 s apart, and their offsets at most 0.2 s or half the length of the reference's,
@@ -226,7 +226,7 @@ def _matches(reference: Events, predicted: Events) -> int:
 def false_alarms_per_day(
     reference: Events, predicted: Events, classes: Sequence[str], duration: int
 ) -> dict[str, float]:
-    """Count events of a class that overlap none of that class in the reference.
+    """Count predicted events that overlap no event of their class in the reference.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ def make_job(
 
 
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
-    """Tell whether a layer is what would be made again, apart from its open segment at the start.
+    """Tell whether a layer need not be made again; its open segment at the start is not compared.
 
     Parameters
     ----------

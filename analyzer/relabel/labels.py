@@ -66,7 +66,7 @@ class UnfinishedLayer(NamedTuple):
     loss: str  # what could not be read of the log
 
     def with_start(self, open_at_start: Run | None) -> "UnfinishedLayer":
-        """Add the open segment with which the layer before ends, where it is lacking.
+        """Add the open segment with which the layer before ends, if it is still lacking.
 
         Parameters
         ----------

@@ -100,7 +100,7 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     Raises
     ------
     LogError
-        If it is damaged, or is not a layer of `relabel`.
+        If the layer is damaged, or `relabel` has not made it.
     """
     if not layer.exists():
         return None
@@ -119,7 +119,7 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Return a new path for an unfinished layer, of a name that no log has."""
+    """Return a new path for an unfinished layer, hidden beside the layer and different each time."""
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 

@@ -111,7 +111,7 @@ def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
 def warm_up(
     info: RecorderInfo, earlier: Sequence[Path], classifier: Classifier, *, states_only: bool
 ) -> StreamLabeller:
-    """Label as much before a log as its first labels depend on.
+    """Label as much of the sound before a log as its first labels depend on.
 
     Parameters
     ----------

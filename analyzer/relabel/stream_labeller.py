@@ -43,7 +43,7 @@ class StreamLabeller:
 
     @property
     def open_run(self) -> Run | None:
-        """The segment that has not ended."""
+        """The segment that has not ended; None if there is none."""
         return self._labeller.segmenter.open_run
 
     def discard_open(self) -> None:

@@ -43,7 +43,7 @@ class LogSet:
         self._infos: dict[Path, RecorderInfo | None] = {}
 
     def span(self, options: ReplayOptions) -> tuple[int, int]:
-        """Return the log times at which the replay starts and before which it ends.
+        """Return the span of time that is replayed.
 
         Parameters
         ----------
@@ -53,7 +53,8 @@ class LogSet:
         Returns
         -------
         start, end : int
-            In nanoseconds of UTC; without a duration the end is the largest number of 64 bits.
+            Log times in nanoseconds of UTC, from `start` on, before `end`; without a duration the
+            end is the largest number of 64 bits.
         """
         start = self.first + round(options.start_offset * NANOSECONDS)
         if options.duration is None:
@@ -90,12 +91,12 @@ class LogSet:
         return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
 
     def between(self, start: int, end: int) -> list[RecorderInfo]:
-        """Return the logs that have messages with start <= log time < end.
+        """Return the logs that have messages in a span of time.
 
         Parameters
         ----------
         start, end : int
-            Log times, in nanoseconds of UTC.
+            Log times, in nanoseconds of UTC: from `start` on, before `end`.
 
         Returns
         -------

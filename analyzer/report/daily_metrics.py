@@ -58,7 +58,10 @@ class CountedEvents(NamedTuple):
 
     @property
     def number(self) -> Count:
-        """How many there were."""
+        """How many events there were, by the chances that they happened.
+
+        The mean and the variance are those of a Poisson binomial distribution.
+        """
         p = self.chances
         variance = float((p * (1 - p)).sum())
         return Count(float(p.sum()), variance, int((p == 1).sum()), len(p))
@@ -96,7 +99,19 @@ class HomeMetrics:
 
 
 def whole_home(data: HomeData) -> HomeMetrics:
-    """Put together what the microphones heard."""
+    """Put together what the microphones of a home heard.
+
+    Parameters
+    ----------
+    data : HomeData
+        With the segments and classes of at least one microphone.
+
+    Returns
+    -------
+    HomeMetrics
+        A span is silent where no microphone heard anything else; segments of a class that are at
+        most ten seconds apart, of whichever microphones, are one event.
+    """
     parts = list(data.segments.values())
     starts, ends, labels, chances = (
         np.concatenate([getattr(part, name) for part in parts]) for name in Segments._fields
@@ -176,7 +191,7 @@ class Day:
         return common(self.home.listened.get(name, NONE), self.span).length / self.span.length
 
     def minutes(self, name: str) -> Minutes | None:
-        """Return for how long a class was heard; None if it could not be.
+        """Return how long a class was heard; None if it could not be.
 
         Parameters
         ----------
@@ -230,12 +245,12 @@ class Day:
 
     @property
     def sound(self) -> Minutes:
-        """For how long there was any sound."""
+        """How long there was any sound on this day."""
         return _minutes(common(self.home.sound, self.span))
 
     @property
     def night_sound(self) -> Minutes:
-        """For how long there was any sound in the night."""
+        """How long there was any sound in the night."""
         return _minutes(common(self.home.sound, self.night))
 
     @property
@@ -264,7 +279,7 @@ class Day:
 
     @property
     def longest_quiet(self) -> Spans:
-        """The longest span without sound in waking hours; none if nothing was heard then."""
+        """The longest heard span without sound from 07:00 to 22:00; empty if nothing was heard then."""
         waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
         quiet = without(common(self.home.coverage, waking), self.home.sound)
         if not len(quiet.starts):
@@ -279,18 +294,18 @@ class Day:
 
     @property
     def active(self) -> Int64:
-        """Starts of the ten minutes with a minute of sound, from four o'clock on, in ns of UTC."""
+        """Starts of the ten-minute blocks after 04:00 with a minute of sound or more, in ns of UTC."""
         edges = np.arange(at_hour(self.day, _RISING, self.zone), self.span.ends[0] + 1, _BIN)
         return edges[:-1][lengths(self.home.sound, edges) >= _BUSY]
 
     @property
     def first(self) -> Clock | None:
-        """Start of the first of the `active` ten minutes; None if there are none."""
+        """Start of the first of the `active` blocks; None if there are none."""
         return self._clock(self.active[:1])
 
     @property
     def last(self) -> Clock | None:
-        """Last minute of the last of the `active` ten minutes; None if there are none."""
+        """Last minute of the last of the `active` blocks; None if there are none."""
         return self._clock(self.active[-1:] + _BIN - _MINUTE)
 
     def _clock(self, times: Int64) -> Clock | None:

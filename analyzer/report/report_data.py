@@ -72,12 +72,34 @@ class Account:
         return None if baseline is None else (baseline, values[0])
 
     def usually(self, figure: Figure) -> str:
-        """Say what is usual: `4 (3 to 6)`; nothing if there are too few days."""
+        """Say what is usual: `4 (3 to 6)`.
+
+        Parameters
+        ----------
+        figure : Figure
+
+        Returns
+        -------
+        str
+            Empty if there are too few days.
+        """
         baseline = self.baseline(figure)
         return "" if baseline is None else baseline[1].spread(*baseline[0])
 
     def change(self, figure: Figure, day: Day) -> str:
-        """Say in a word or two what is not as on any earlier day; nothing if all is as usual."""
+        """Compare a figure of a day with all earlier days.
+
+        Parameters
+        ----------
+        figure : Figure
+        day : Day
+
+        Returns
+        -------
+        str
+            A word or two, as `more often` or `later`; empty if the figure is as usual, or cannot be
+            compared.
+        """
         value, baseline = figure.value(day), self.baseline(figure)
         if value is None or baseline is None or not day.comparable(figure.name):
             return ""

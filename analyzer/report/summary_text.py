@@ -33,6 +33,11 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
     account : Account
     day : Day
         One of its days.
+
+    Yields
+    ------
+    str
+        A paragraph of the page.
     """
     minutes = Minutes(day.coverage.length / _MINUTE).text
     yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}"
@@ -44,7 +49,18 @@ def gist_of_day(account: Account, day: Day) -> Iterator[str]:
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
-    """Sum up a week in a few sentences, and compare it with earlier days."""
+    """Sum up a week in a few sentences, and compare it with earlier days.
+
+    Parameters
+    ----------
+    account : Account
+        Of seven days.
+
+    Yields
+    ------
+    str
+        A paragraph of the page.
+    """
     days = [day for day in account.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
     yield f"Heard: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
@@ -62,7 +78,18 @@ def gist_of_week(account: Account) -> Iterator[str]:
 
 
 def not_heard(account: Account) -> Iterator[str]:
-    """Say how much was not heard, and why; the first line says how much in all."""
+    """Say how much was not heard, and why.
+
+    Parameters
+    ----------
+    account : Account
+
+    Yields
+    ------
+    str
+        A sentence or two; the first line says how much in all. Nothing where less than a minute is
+        missing, unless a log could not be read or there is a gap.
+    """
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
     if missing >= _MINUTE:
@@ -83,7 +110,18 @@ def not_heard(account: Account) -> Iterator[str]:
 
 
 def not_well(account: Account) -> Iterator[str]:
-    """Say which troubles the box reported, where gaps do not say it already."""
+    """Say which troubles the box reported, where gaps do not say it already.
+
+    Parameters
+    ----------
+    account : Account
+
+    Yields
+    ------
+    str
+        An introduction, then a line for each kind of trouble, the longest first; nothing without
+        troubles.
+    """
     told = {gap.text for gap in account.gaps}
     troubles = [trouble for trouble in account.troubles if trouble.text not in told]
     if troubles:
@@ -93,7 +131,17 @@ def not_well(account: Account) -> Iterator[str]:
 
 
 def longest_quiet(day: Day) -> str:
-    """Say when the longest quiet stretch of the day was; nothing if it was under a minute."""
+    """Say when the longest quiet stretch of the day was.
+
+    Parameters
+    ----------
+    day : Day
+
+    Returns
+    -------
+    str
+        Empty if it was under a minute.
+    """
     quiet = day.longest_quiet
     if day.quiet is None or day.quiet.minutes < 1:
         return ""

@@ -33,12 +33,18 @@ class Count:
 
     @property
     def low(self) -> float:
-        """Lower end of the interval that the number lies in nine times in ten."""
+        """Lower end of the interval that the number lies in nine times in ten.
+
+        It is 1.645 standard deviations below the mean, but at least the number of certain events.
+        """
         return max(self.certain, self.expected - _WIDTH * math.sqrt(self.variance))
 
     @property
     def high(self) -> float:
-        """Upper end of the interval that the number lies in nine times in ten."""
+        """Upper end of the interval that the number lies in nine times in ten.
+
+        It is 1.645 standard deviations above the mean, but at most the number of marked events.
+        """
         return min(self.marked, self.expected + _WIDTH * math.sqrt(self.variance))
 
     @property

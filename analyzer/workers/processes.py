@@ -67,7 +67,10 @@ class Processes:
         return self._threads.submit(self._run, function, args)
 
     def close(self) -> None:
-        """Give up the tasks that are not done, and end the processes."""
+        """Give up the tasks that are not done, and end the processes.
+
+        A task that has not begun is cancelled: its future raises CancelledError.
+        """
         with self._lock:
             self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)

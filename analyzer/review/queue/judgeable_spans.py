@@ -53,7 +53,7 @@ class JudgeableSpans:
 
 
 def judgeable_spans(segments: Events) -> JudgeableSpans:
-    """Join segments that flicker, and cut long ones.
+    """Make spans that a person can judge: join segments that flicker, and cut long ones.
 
     Successive segments of less than a second each are joined, with the label of the longest. What
     is longer than ten seconds is cut into equal spans; what is shorter than half a second is left

@@ -53,7 +53,7 @@ class ReviewSpan(NamedTuple):
     reason: str
 
     def as_text(self) -> dict[str, str | float | None]:
-        """Return the fields, the times as text."""
+        """Return the fields by name, with the times as texts."""
         return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
 
 
@@ -109,7 +109,7 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
 
 
 def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
-    """Write spans as CSV that `read_list` reads again, in the same order.
+    """Write spans as CSV, in their order, for `read_list`.
 
     Parameters
     ----------

@@ -124,7 +124,7 @@ class Session:
 
     @property
     def keys(self) -> list[tuple[str, str]]:
-        """The keys, and what each does."""
+        """Each key, and what it does."""
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]

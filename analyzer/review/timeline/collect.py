@@ -147,7 +147,13 @@ class Collector:
         self._microphone(microphone).clips.append(clip)
 
     def microphones(self) -> dict[str, MicrophoneTimeline]:
-        """Return the timelines of the microphones that have something to show, by name."""
+        """Return the timelines of the microphones that have something to show.
+
+        Returns
+        -------
+        dict of str to MicrophoneTimeline
+            By microphone, in the order of their names.
+        """
         return {
             name: self._timeline(name, rows)
             for name, rows in sorted(self._microphones.items())

@@ -95,7 +95,7 @@ class GridMeans:
 def time_shares(
     starts: Int64, ends: Int64, labels: NDArray[np.intp], width: int, grid: Grid
 ) -> Float64:
-    """Measure which part of each share of a grid each label covers.
+    """Measure how much of each share of a grid each label covers.
 
     Parameters
     ----------

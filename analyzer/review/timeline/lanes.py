@@ -122,6 +122,12 @@ def timeline_lanes(timeline: Timeline, *, detail: bool) -> Iterator[Lane]:
     detail : bool
         Whether they show every segment, where there are any, or an `overview`.
 
+    Yields
+    ------
+    Lane
+        The clock, then microphone by microphone: the labellings, the marks, the differences from
+        the first labelling, gaps and troubles.
+
     Raises
     ------
     DataError

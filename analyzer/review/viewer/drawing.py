@@ -41,7 +41,7 @@ def draw(timeline: Timeline, canvas: Canvas) -> None:
 
 
 def draw_close_up(timeline: Timeline, canvas: Canvas) -> None:
-    """Draw the plots of a short timeline beside those of the one that it is a part of.
+    """Draw the plots of a short timeline beside those of the longer timeline around it.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ _BACKTRACE = re.compile(r"\s*\d+: ")
 
 
 def program() -> Path:
-    """Return the path of the viewer that belongs to the installed `rerun` package.
+    """Return the path of the viewer's program, as the installed `rerun` package has it.
 
     Raises
     ------

@@ -180,7 +180,7 @@ class Viewer:
         self._flush()
 
     def draw_close_up(self, timeline: Timeline) -> None:
-        """Draw a short timeline beside the one that it is a part of."""
+        """Draw a short timeline beside the longer one that it is a part of."""
         draw_close_up(timeline, self._canvas)
         self._flush()
 
@@ -211,8 +211,8 @@ class Viewer:
         Raises
         ------
         DataError
-            If the viewer ends, takes longer than a minute, or is of another version than the
-            package.
+            If the viewer ends, if a window takes longer than a minute, or if the viewer is of
+            another version than the package.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:

@@ -62,7 +62,13 @@ class _WindowControl:
 
 
 class WindowViewer(Viewer):
-    """A viewer in a window of its own."""
+    """A viewer in a window of its own.
+
+    Parameters
+    ----------
+    process : ViewerProcess
+        The viewer, which is stopped at the end.
+    """
 
     def __init__(self, process: ViewerProcess) -> None:
         self._window = _WindowControl(process)
