@@ -119,7 +119,7 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Return a new path for an unfinished layer, hidden beside the layer and different each time."""
+    """Return a path for an unfinished layer: hidden beside the layer, and new each time."""
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 

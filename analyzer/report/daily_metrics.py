@@ -279,7 +279,7 @@ class Day:
 
     @property
     def longest_quiet(self) -> Spans:
-        """The longest heard span without sound from 07:00 to 22:00; empty if nothing was heard then."""
+        """The longest quiet span from 07:00 to 22:00; empty if nothing was heard then."""
         waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
         quiet = without(common(self.home.coverage, waking), self.home.sound)
         if not len(quiet.starts):
@@ -294,7 +294,10 @@ class Day:
 
     @property
     def active(self) -> Int64:
-        """Starts of the ten-minute blocks after 04:00 with a minute of sound or more, in ns of UTC."""
+        """Starts of the ten-minute blocks with a minute of sound or more, in ns of UTC.
+
+        The first block of a day begins at 04:00.
+        """
         edges = np.arange(at_hour(self.day, _RISING, self.zone), self.span.ends[0] + 1, _BIN)
         return edges[:-1][lengths(self.home.sound, edges) >= _BUSY]
 

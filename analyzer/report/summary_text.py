@@ -87,8 +87,7 @@ def not_heard(account: Account) -> Iterator[str]:
     Yields
     ------
     str
-        A sentence or two; the first line says how much in all. Nothing where less than a minute is
-        missing, unless a log could not be read or there is a gap.
+        A sentence or two, how much in all first; none where everything was heard.
     """
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
