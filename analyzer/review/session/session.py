@@ -172,7 +172,8 @@ class Session:
         Parameters
         ----------
         key : str
-            One of `keys`; for another one the keys are shown, for white space nothing.
+            One of `keys`; where there are items, a space skips one, too. For any other key the keys
+            are shown, unless it is white space.
         """
         try:
             self._press(key)
