@@ -99,9 +99,8 @@ def read_home(
     DataError
         If there is no such labelling, or no label at all in these days.
     LogError
-        If segments overlap, begin before 1970, are of different types, or
-        have labels that are too many
-        or cannot be names of classes.
+        If segments overlap, begin before 1970, are of different types, or have labels that are
+        too many or cannot be names of classes.
     """
     layer = _layer(logs, labelling)
     home = HomeData(losses=list(logs.losses))
