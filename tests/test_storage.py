@@ -231,7 +231,7 @@ def test_a_path_of_a_store_goes_to_other_processes(bucket, logs):
 
 
 def test_reading_and_recording_logs_of_this_machine_needs_no_store():
-    modules = ("schemas.logs.columns", "schemas.logs.files", "recorder.service")
+    modules = ("schemas.logs.columns", "schemas.logs.files", "recorder.recording")
     imports = "import " + ", ".join(
         f"hearthlog.{module}" for module in (*modules, "tools.cli.main")
     )
