@@ -299,6 +299,16 @@ def test_a_message_that_claims_to_be_longer_than_a_number_can_say(log, victim, l
     assert not victim.read(joined(records), log.name)
 
 
+def test_a_group_of_the_summary_that_holds_other_records_with_bad_texts(log, victim):
+    records = split(log.read_bytes())
+    offsets = {raw.content[0]: raw for raw in records if raw.opcode == Opcode.SUMMARY_OFFSET}
+    channels, statistics = offsets[Opcode.CHANNEL], offsets[Opcode.STATISTICS]
+    statistics.content = statistics.content[:1] + channels.content[1:]
+    last = [raw for raw in records if raw.opcode == Opcode.CHANNEL][-1]
+    last.content = last.content[:8] + b"\xff" + last.content[9:]
+    assert not victim.read(_written(records), log.name)
+
+
 def _written(records):
     """Put records together; the footer keeps its checksum only where it can be made anew."""
     try:

@@ -289,6 +289,17 @@ def test_messages_without_an_index_behind_their_chunk_are_lost_in_unknown_number
     )
 
 
+@pytest.mark.parametrize("left", range(1, 10))
+def test_a_damaged_chunk_of_a_file_cut_in_the_head_of_the_next_record(log, recover, left):
+    data, records = log
+    chunk, behind = [record for record in records if record.opcode == CHUNK][1:3]
+    damaged = bytearray(data[: behind.start + left])
+    damaged[chunk.end - 100] ^= 1
+    result = recover(bytes(damaged))
+    assert result.messages == messages_of(records[: records.index(chunk)])
+    assert result.some_lost
+
+
 def test_messages_whose_channel_nothing_defines_are_counted(log, recover):
     data, records = log
     chunks = [r for r in records if r.opcode == CHUNK]

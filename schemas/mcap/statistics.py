@@ -40,7 +40,7 @@ def time_span(path: Path) -> tuple[int, int] | None:
     try:
         with closing(open_file(path)) as file:
             statistics = _statistics(file)
-    except (McapError, struct.error):
+    except (McapError, UnicodeDecodeError, struct.error):
         statistics = None
     if statistics is not None:
         times = statistics.message_start_time, statistics.message_end_time

@@ -288,7 +288,7 @@ def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
         head = reader.read(start + HEAD.size, CHUNK.size).ljust(CHUNK.size, b"\0")
         times = CHUNK.unpack(head)[:2]
         exact = bool(messages) and end in ends and behind < reader.end and reader.plausible(behind)
-        exact = exact and reader.head(behind)[0] != Opcode.MESSAGE_INDEX
+        exact = exact and reader.read(behind, 1)[0] != Opcode.MESSAGE_INDEX
         is_sound = 0 < times[0] <= times[1] < 1 << 63
         return Loss(messages, exact, span or (times if is_sound else None))
     if opcode in _NAME_AFTER and is_record:
