@@ -219,7 +219,8 @@ def test_a_damaged_log_is_left_out_of_the_segments_with_a_warning(day, model_fil
     make_logs(tmp_path / "logs", model_file, [day], max_bag_duration=60)
     (first, *_) = find_logs(tmp_path / "logs")
     data = bytearray(first.read_bytes())
-    data[len(data) // 3] ^= 0xFF
+    half = len(data) // 2
+    data[half // 2 : half] = bytes(half - half // 2)  # several chunks
     first.write_bytes(data)
     logs = hearthlog.open_logs(tmp_path / "logs")
     with pytest.warns(HearthlogWarning, match="damaged"):
