@@ -340,6 +340,34 @@ def test_only_the_chunks_that_are_needed_are_read(log, tmp_path):
         read_columns([path], ["/mic/features"])
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_damaged_chunk_spoils_only_what_it_alone_defines(number, tmp_path):
+    path = tmp_path / "cut.mcap"
+    with path.open("xb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE, chunk_size=1)
+        writer.start("ros2")
+        schema = writer.register_schema("x/msg/Text", "ros2msg", b"string text")
+        for topic, times in (("/a", (0, 1)), ("/b", (2, 3))):  # a chunk for each message
+            channel = writer.register_channel(topic, "cdr", schema)
+            for time in times:
+                writer.add_message(channel, time, b"\0\1\0\0" + b"\3\0\0\0hi\0", time)
+        writer.finish()
+    with LogFile(path) as file:
+        offsets, lengths = (file.chunks[name].tolist() for name in ("offset", "length"))
+    data = bytearray(path.read_bytes()[: offsets[-1] + lengths[-1]])
+    first_length = offsets[number] + 9 + 40 + 1
+    data[first_length : first_length + 8] = b"\xff" * 8
+    path.write_bytes(data)
+    damage = f"damaged at byte {offsets[number]} "
+    if number == 1:  # chunk 2 defines /b
+        assert read_columns([path], start=3)["/b"]["text"].tolist() == ["hi"]
+    else:
+        with pytest.raises(LogError, match=damage):
+            read_columns([path], start=3)
+    with pytest.raises(LogError, match=damage):
+        read_columns([path])
+
+
 def test_an_index_that_does_not_belong_to_its_chunk_is_damage(log, tmp_path):
     for field, step in (("offset", 8), ("offset", 1 << 40), ("time", 1)):
         data = bytearray(log.read_bytes())

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -57,14 +56,14 @@ def read_chunks(
     ------
     LogError
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
-        is of a channel that is not defined; or if another chunk is damaged in which such a channel
-        was looked for.
+        is of a channel that no sound chunk defines.
     """
     if not len(chunks):
         return []
     batch = _read(file, chunks, check=check)
     indices = batch.indices(_other_channels(file, topics))
-    _define(file, indices.keys())
+    if not indices.keys() <= file.channels.keys():
+        _define(file, indices.keys())
     for identity in _other_channels(file, topics):
         indices.pop(identity, None)
     read = [batch.messages(identity, parts) for identity, parts in indices.items()]
@@ -100,8 +99,7 @@ def read_in_batches(
     ------
     LogError
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
-        is of a channel that is not defined; or if another chunk is damaged in which such a channel
-        was looked for.
+        is of a channel that no sound chunk defines.
     """
     batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
@@ -225,13 +223,16 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, bytes]:
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
     """Look for channels that nothing read so far defines, from the first chunk on."""
-    if identities <= file.channels.keys():
-        return
+    damage = None
     for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
-        with suppress(McapError, UnicodeDecodeError):  # it is not this one that was asked for
+        try:
             _read(file, np.array([chunk]), check=False).index_records()
+        except LogError as error:  # another chunk may define them
+            damage = damage or error
         if identities <= file.channels.keys():
             return
+    if damage is not None:
+        raise damage
 
 
 class _Batch(NamedTuple):
