@@ -189,10 +189,9 @@ def _microphones(file: LogFile, kind: str) -> set[str]:
 def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict[str, Any]:
     """Return the fields of the first message of a topic; nothing if it has none."""
     ids = {i for i, channel in file.channels.items() if channel.topic == name}
-    for i, number in enumerate(file.chunks["channels"].tolist()):
-        if file.channel_sets[number] and not file.channel_sets[number] & ids:
-            continue
-        messages = read_chunks(file, file.chunks[i : i + 1], [name])
+    chunks = file.with_channels(file.chunks, ids)
+    for i in range(len(chunks)):
+        messages = read_chunks(file, chunks[i : i + 1], [name])
         for columns in decode_types(file.path, messages, {kind: fields}):
             return {field: values[0] for field, values in columns.fields.items()}
     return {}

@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
@@ -133,8 +132,7 @@ def _count_by_index(file: LogFile, summary: Summary) -> None:
     counts = file.statistics.channel_message_counts
     for identity, channel in file.channels.items():
         topic = _topic(summary, channel, file.schemas.get(channel.schema_id))
-        holds = [not ids or identity in ids for ids in file.channel_sets]
-        chunks = file.chunks[np.array(holds, bool)[file.chunks["channels"]]]
+        chunks = file.with_channels(file.chunks, {identity})
         count = counts.get(identity, 0)
         if count and len(chunks):
             topic.add(count, None, (int(chunks["start"].min()), int(chunks["end"].max())))

@@ -114,8 +114,7 @@ class _Query(NamedTuple):
         if self.topics is None:
             return chunks
         others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}
-        may_hold = [not ids or not ids <= others for ids in file.channel_sets]
-        return chunks[np.array(may_hold, bool)[chunks["channels"]]]
+        return file.with_channels(chunks, frozenset().union(*file.channel_sets) - others)
 
     def read(self, batch: "_Batch") -> list[RawMessages]:
         """Read the messages of a batch that the query asks for."""

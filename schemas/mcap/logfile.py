@@ -5,6 +5,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterator
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Self
 
@@ -170,6 +171,26 @@ class LogFile:
             return parse(location.opcode, content)
         except (McapError, UnicodeDecodeError) as error:
             raise self.damaged(location.offset, error) from error
+
+    def with_channels(
+        self, chunks: NDArray[np.void], channels: AbstractSet[int]
+    ) -> NDArray[np.void]:
+        """Select the chunks that may have messages of some channels.
+
+        Parameters
+        ----------
+        chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+            Rows of `chunks`.
+        channels : set of int
+            Numbers of channels.
+
+        Returns
+        -------
+        np.ndarray [shape=(m,)], of dtype `CHUNKS`
+            Chunks of which the file does not tell the channels are among them.
+        """
+        may_have = [not ids or not ids.isdisjoint(channels) for ids in self.channel_sets]
+        return chunks[np.array(may_have, bool)[chunks["channels"]]]
 
     def damaged(self, offset: int, what: object) -> LogError:
         """Make the error that says where this file is damaged.

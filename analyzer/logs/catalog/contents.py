@@ -119,9 +119,7 @@ class _Reading:
 
     def chunks_with(self, kinds: Mapping[str, Collection[str]]) -> NDArray[np.void]:
         """Return the chunks that hold messages of some types."""
-        channels = self.channels_of(kinds)
-        holds = [not ids or not ids.isdisjoint(channels) for ids in self._file.channel_sets]
-        return self._file.chunks[np.array(holds, bool)[self._file.chunks["channels"]]]
+        return self._file.with_channels(self._file.chunks, self.channels_of(kinds))
 
     def read(self, chunks: NDArray[np.void], types: Mapping[str, Collection[str]]) -> None:
         """Read some chunks, a few at a time, and note their messages of some types."""
