@@ -173,7 +173,7 @@ def test_sound_shorter_than_a_window_has_no_label(model_file):
 
 def test_arrays_tables_and_frames_hold_the_same(folder):
     logs = hearthlog.open_logs(folder / "logs")
-    for topic in set(logs.topics) - {"/mic/gap"}:
+    for topic in logs.topics:  # of which /mic/gap has no message
         columns, table = logs.columns(topic), logs.arrow(topic)
         assert table["log_time"].to_numpy().astype("i8").tolist() == columns.log_times.tolist()
         frame = logs.pandas(topic)
@@ -193,6 +193,32 @@ def test_a_span_of_time_is_what_is_read(folder):
     assert (spans.starts[0], spans.ends[-1]) == (logs.start, logs.end)
     with pytest.raises(HearthlogError, match="no topic /mic/other; there are /diagnostics, "):
         logs.columns("/mic/other")
+
+
+@pytest.mark.parametrize(
+    ("span", "topic"),
+    [((None, None), "/mic/gap"), ((0, START), "/mic/features"), ((0, START), "/mic/gap")],
+    ids=["no message at all", "no log of the span", "neither"],
+)
+def test_a_topic_without_messages_is_a_table_without_rows(span, topic, folder):
+    logs, whole = hearthlog.open_logs(folder / "logs", *span), hearthlog.open_logs(folder / "logs")
+    columns = logs.columns(topic)
+    assert (len(columns), columns.type) == (0, whole.topics[topic])
+    assert columns["header.stamp"].dtype == np.int64
+    assert logs.columns(topic, ["header.frame_id"]).fields.keys() == {"header.frame_id"}
+    assert logs.arrow(topic).num_rows == 0
+    assert logs.arrow(topic).schema.types == whole.arrow(topic).schema.types
+    assert len(logs.pandas(topic)) == 0
+    assert logs.pandas(topic).dtypes.equals(whole.pandas(topic).dtypes)
+    assert logs.pandas(topic).index.dtype == whole.pandas(topic).index.dtype
+    with pytest.raises(HearthlogError, match="no topic /mic/other; there are /diagnostics, "):
+        logs.columns("/mic/other")
+
+
+def test_marks_are_those_of_the_span_of_time(folder):
+    first = hearthlog.open_logs(folder / "logs", end=START + 2 * SECOND)
+    rest = hearthlog.open_logs(folder / "logs", START + 2 * SECOND)
+    assert ([mark.label for mark in first.marks()], rest.marks()) == (["coughing"], [])
 
 
 def test_what_a_reviewer_says_is_a_labelling(folder):

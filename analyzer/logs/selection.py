@@ -3,9 +3,11 @@
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.logs.typed_columns import is_compatible
@@ -14,6 +16,7 @@ from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
+from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
@@ -112,6 +115,12 @@ class Selection:
         """
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
+
+    def no_messages(self) -> list[RawMessages]:
+        """Return zero messages of each channel, of which a decoder makes columns without rows."""
+        buffer, offsets, heads = np.empty(0, np.uint8), np.empty(0, int), np.empty(0, MESSAGE_HEAD)
+        channels = chain.from_iterable(self.channels.values())
+        return [RawMessages(*channel, buffer, offsets, heads) for channel in channels]
 
     def nothing(self) -> LogError:
         """Make the error that says that the selection has no message."""

@@ -1,5 +1,6 @@
 """Many messages of one type at once: from arrays to payloads, and back."""
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -204,7 +205,7 @@ def decode_rows(
     Returns
     -------
     dict of str to np.ndarray [shape=(n, ...)]
-        By field path, as `Columns` has them.
+        By field path, as `Columns` has them; arrays of any length have no elements if n is 0.
 
     Raises
     ------
@@ -217,6 +218,9 @@ def decode_rows(
         for layout, same in _by_layout(kind, payloads):
             block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
             parts.append((rows[same], _decode(layout.leaves, block, fields)))
+    if not parts:
+        layout = kind.layout_for(defaultdict(int))
+        return _decode(layout.leaves, np.empty(0, layout.dtype), fields)
     return _scattered(parts, len(sizes))
 
 
@@ -312,7 +316,7 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
     if len(parts) == 1:
         return parts[0][1]
     columns_by_path: Fields = {}
-    for path in parts[0][1] if parts else ():
+    for path in parts[0][1]:
         columns = [(rows, fields[path]) for rows, fields in parts]
         like = columns[0][1]
         if all(c.dtype == like.dtype and c.shape[1:] == like.shape[1:] for _, c in columns):

@@ -1,12 +1,16 @@
-"""The public way to read logs; it says what `hearthlog.analyzer.logs` does in fewer words."""
+"""Read logs as arrays, tables, segments and marks: `open_logs` and `follow`."""
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -15,10 +19,9 @@ from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.typed_columns import TypedColumns, decode_all
 from hearthlog.analyzer.marks.marks import Mark, read_marks
-from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs import follow as growing
-from hearthlog.schemas.logs.columns import Columns, join, read_columns
+from hearthlog.schemas.logs.columns import Columns, decode, join, read_columns
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.messages.fields import DURATION, TIME
 from hearthlog.schemas.messages.message_types import PACKAGE
@@ -28,17 +31,21 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_TIMES: Mapping[str, Callable[[Any, Int64], Any]] = {
-    TIME: lambda pandas, times: pandas.to_datetime(times, unit="ns", utc=True),
-    DURATION: lambda pandas, times: pandas.to_timedelta(times, unit="ns"),
-}
 __all__ = ["Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
 
 
 class Logs:
     """A log or the logs of a folder, with the layers beside them; `open_logs` makes it.
 
-    All times are integers: nanoseconds of UTC since 1970.
+    All times are integers: nanoseconds of UTC since 1970. A topic without a message in the span of
+    time is read as a table without rows.
+
+    Attributes
+    ----------
+    path : Path
+        Of the log or the folder.
+    start, end : int or None
+        Log times: what is read is from `start` on, before `end`; None for no limit.
     """
 
     def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
@@ -100,11 +107,9 @@ class Logs:
         >>> features["values"].shape, features["values"].dtype
         ((3600, 21), dtype('float32'))
         """
-        selection = self._only(topic)
+        selection = self._select(topic)
         columns = read_columns(selection.logs, [topic], self.start, self.end, fields)
-        if topic not in columns:
-            raise selection.nothing()
-        return columns[topic]
+        return columns[topic] if columns else join(decode(selection.no_messages(), fields))
 
     def arrow(self, topic: str) -> "pa.Table":
         """Read a topic as an Arrow table, with the types of a Parquet file of `hearthlog export`.
@@ -135,8 +140,9 @@ class Logs:
         table = _optional("pyarrow").Table
         from hearthlog.analyzer.export.arrow import batch_of, schema_of  # noqa: PLC0415  an extra
 
-        parts = self._parts(topic)
-        schema = schema_of(topic, parts[0].fields, self._only(topic))
+        selection = self._select(topic)
+        parts = _typed_columns(selection)
+        schema = schema_of(topic, parts[0].fields, selection)
         return table.from_batches([batch_of(part, schema) for part in parts])
 
     def pandas(self, topic: str) -> "pd.DataFrame":
@@ -167,18 +173,19 @@ class Logs:
         (dtype('float32'), 50)
         """
         pandas = _optional("pandas")
-        parts = self._parts(topic)
+        parts = _typed_columns(self._select(topic))
         columns, fields = join([part.columns for part in parts]), parts[0].fields
         series: dict[str, Any] = {}
         for path, values in columns.fields.items():
             if values.ndim == 2:
-                names = _element_names(columns, path)
-                series |= {f"{path}.{name}": row for name, row in zip(names, values.T, strict=True)}
-            elif fields[path].size is None and fields[path].type in _TIMES:
-                series[path] = _TIMES[fields[path].type](pandas, values)
+                series |= _elements(columns, path)
+            elif fields[path].size is None and fields[path].type == TIME:
+                series[path] = pandas.to_datetime(values, unit="ns", utc=True)
+            elif fields[path].size is None and fields[path].type == DURATION:
+                series[path] = pandas.to_timedelta(values, unit="ns")
             else:
                 series[path] = values
-        index = pandas.Index(_TIMES[TIME](pandas, columns.log_times), name="log_time")
+        index = pandas.to_datetime(columns.log_times, unit="ns", utc=True).rename("log_time")
         return pandas.DataFrame(series, index, copy=False)
 
     def segments(self, labelling: str = "live", microphone: str | None = None) -> Labelling:
@@ -216,10 +223,10 @@ class Logs:
         """
         microphone = self._labellings.microphone(microphone)
         name = self._labellings.find(microphone, labelling)
-        side = self._labellings.read(microphone, name, self.start, self.end)
+        segments = self._labellings.read(microphone, name, self.start, self.end).labelling
         for loss in self._labellings.losses:
             warnings.warn(HearthlogWarning(loss, self.path), stacklevel=2)
-        return side.labelling
+        return segments
 
     def marks(self) -> list[Mark]:
         """Read what reviewers have corrected.
@@ -227,7 +234,7 @@ class Logs:
         Returns
         -------
         list of Mark
-            In the order of time.
+            Those with any part in the span of time, whole, in the order of time.
 
         Raises
         ------
@@ -239,24 +246,24 @@ class Logs:
         >>> [(mark.label, mark.reviewer) for mark in hearthlog.open_logs("logs").marks()]
         [('coughing', 'ada')]
         """
-        logs = [path for path in self.paths if not is_layer(path)]
-        return sorted((mark for log in logs for mark in read_marks(log)), key=lambda m: m.start)
+        marks = [mark for path in self.paths if not is_layer(path) for mark in read_marks(path)]
+        marks = [mark for mark in marks if self.start is None or mark.end > self.start]
+        marks = [mark for mark in marks if self.end is None or mark.start < self.end]
+        return sorted(marks, key=attrgetter("start"))
 
     @cached_property
     def _labellings(self) -> Labellings:
         return find_labellings(self.path)
 
-    def _only(self, topic: str) -> Selection:
-        if topic not in self._selection.channels:
-            raise LogError(f"{self.path}: no topic {topic}; there are {', '.join(self.topics)}")
-        return self._selection.only([topic])
-
-    def _parts(self, topic: str) -> list[TypedColumns]:
-        selection = self._only(topic)
-        parts = [part for batch in selection.messages() for part in decode_all(batch)]
-        if not parts:
-            raise selection.nothing()
-        return parts
+    def _select(self, topic: str) -> Selection:
+        """Select one topic; if no log of the span of time has it, its type is that of others."""
+        selection = self._selection
+        if topic not in selection.channels:
+            selection = replace(selection, channels=select(with_layers(self.path)).channels)
+        if topic not in selection.channels:
+            there = ", ".join(sorted(selection.channels)) or "none"
+            raise LogError(f"{self.path}: no topic {topic}; there are {there}")
+        return selection.only([topic])
 
 
 def open_logs(path: Path | str, start: int | None = None, end: int | None = None) -> Logs:
@@ -328,10 +335,19 @@ def follow(
     return growing.follow(Path(path), topics, start, stop=stop)
 
 
-def _element_names(columns: Columns, path: str) -> list[str]:
-    """Name the elements of an array as the log does, else by their place."""
-    names, count = array_names(columns.metadata, path), columns[path].shape[1]
-    return names if len(names) == count else [f"{i}" for i in range(count)]
+def _typed_columns(selection: Selection) -> list[TypedColumns]:
+    parts = [part for batch in selection.messages() for part in decode_all(batch)]
+    return parts or decode_all(selection.no_messages())
+
+
+def _elements(columns: Columns, path: str) -> dict[str, NDArray[Any]]:
+    """Make a column of each element of an array, called as the log does, else by its place."""
+    names, values = array_names(columns.metadata, path), columns[path]
+    if values.shape == (0, 0):  # without messages nothing else tells how many there are
+        values = values.reshape(0, len(names))
+    if len(names) != values.shape[1]:
+        names = [f"{i}" for i in range(values.shape[1])]
+    return {f"{path}.{name}": element for name, element in zip(names, values.T, strict=True)}
 
 
 def _optional(module: str) -> Any:
