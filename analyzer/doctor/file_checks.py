@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Footer
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.mcap.byte_source import ByteSource
+from hearthlog.analyzer.doctor.mcap.checked_definitions import ROS_ENCODINGS
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
 from hearthlog.analyzer.doctor.mcap.message_batch import MessageBatch
 from hearthlog.analyzer.doctor.mcap.record_walk import RecordWalk
@@ -21,16 +21,16 @@ from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataCheck
 from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
-from hearthlog.schemas.mcap.records import parse
+from hearthlog.schemas.mcap.records import read_footer
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
-_ENCODINGS = ("ros2msg", "ros2idl")
 _KEPT = {METADATA, ROSBAG2, *ATTACHMENTS}
 
 
@@ -83,7 +83,7 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
     if magic != MAGIC and not (active and MAGIC.startswith(magic)):
         findings.error("magic", "is no MCAP file: it does not begin as one")
         return
-    finished = source.size > len(MAGIC) and source.at(source.size - len(MAGIC), 8) == MAGIC
+    finished = source.size > len(MAGIC) and source.tail(len(MAGIC)) == MAGIC
     outline = _outline(findings.path, source)
     data = DataSection(findings, _KEPT, ours=outline.ours)
     checks = MessageChecks(data, findings) if outline.ours else ForeignMessages(data, findings)
@@ -108,12 +108,8 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
 
 def _outline(path: Path, source: ByteSource) -> _Outline:
     """Read the index of a file, as far as it has one."""
-    start = 0
-    tail = source.at(max(source.size - FOOTER_SIZE, 0), FOOTER_SIZE)
-    if tail[:1] == bytes([Opcode.FOOTER]) and tail.endswith(MAGIC):
-        footer = parse(Opcode.FOOTER, tail[HEAD.size :])
-        assert isinstance(footer, Footer)
-        start = footer.summary_start
+    footer = read_footer(source.tail(FOOTER_SIZE))
+    start = 0 if footer is None else footer.summary_start
     try:
         with LogFile(path) as file:
             ours = _is_ours(file)
@@ -230,9 +226,9 @@ class ForeignMessages:
         """
         definitions = self._data.definitions
         for raw in batch.by_channel(definitions.channels, definitions.schemas):
-            if raw.channel.message_encoding != "cdr":
+            if raw.channel.message_encoding != ENCODING:
                 continue
-            if raw.schema is None or raw.schema.encoding not in _ENCODINGS:
+            if raw.schema is None or raw.schema.encoding not in ROS_ENCODINGS:
                 continue
             try:
                 decode([raw])

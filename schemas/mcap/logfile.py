@@ -26,7 +26,7 @@ from hearthlog.schemas.mcap.chunk_table import (
     read_chunk_row,
 )
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
-from hearthlog.schemas.mcap.records import LIMIT, parse
+from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import Section, open_file
 
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
@@ -219,14 +219,10 @@ class LogFile:
 
     def _find_chunks(self) -> None:
         size = self.size
-        tail = self.read(max(size - FOOTER_SIZE, 0), FOOTER_SIZE)
-        self.complete = tail.endswith(MAGIC) and tail[:1] == bytes([Opcode.FOOTER])
-        if self.complete:
-            footer = parse(Opcode.FOOTER, tail[HEAD.size :])
-            assert isinstance(footer, records.Footer)
-            if self._read_summary(footer, size - FOOTER_SIZE):
-                return
-        self.scan_new()
+        footer = read_footer(self.read(max(size - FOOTER_SIZE, 0), FOOTER_SIZE))
+        self.complete = footer is not None
+        if footer is None or not self._read_summary(footer, size - FOOTER_SIZE):
+            self.scan_new()
 
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
         """Read the summary, and return whether it has an index and is sound."""

@@ -18,7 +18,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
-from hearthlog.schemas.mcap.formats import CHUNK, UINT64
+from hearthlog.schemas.mcap.formats import CHUNK, FOOTER_SIZE, HEAD, MAGIC, UINT64
 
 LIMIT = 100 << 20  # bytes; ours are below 2 MiB
 _CLASSES: dict[int, Any] = {
@@ -70,6 +70,26 @@ def parse(opcode: int, content: bytes) -> McapRecord | None:
     """
     kind = _CLASSES.get(opcode)
     return None if kind is None else kind.read(_Content(BytesIO(content)))
+
+
+def read_footer(tail: bytes) -> records.Footer | None:
+    """Read the footer of a finished file.
+
+    Parameters
+    ----------
+    tail : bytes
+        The last `FOOTER_SIZE` bytes of the file, or all of a shorter one.
+
+    Returns
+    -------
+    mcap.records.Footer or None
+        None if the file does not end with a footer and the magic.
+    """
+    if len(tail) < FOOTER_SIZE or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
+        return None
+    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
+    assert isinstance(footer, records.Footer)
+    return footer
 
 
 def encode(record: McapRecord) -> bytes:

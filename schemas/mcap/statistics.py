@@ -11,9 +11,9 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC, SUMMARY_OFFSET
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, SUMMARY_OFFSET
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import parse
+from hearthlog.schemas.mcap.records import parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
 
 _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
@@ -90,11 +90,9 @@ def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
 def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord | None]:
     """Read the records of one kind in the summary of a finished log."""
     end = max(file.size - FOOTER_SIZE, 0)
-    tail = file.read(end, FOOTER_SIZE)
-    if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
+    footer = read_footer(file.read(end, FOOTER_SIZE))
+    if footer is None:
         return []
-    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
-    assert isinstance(footer, records.Footer)
     size = end - footer.summary_offset_start
     if not footer.summary_offset_start or not 0 <= size <= _SIZE_LIMIT:
         return []

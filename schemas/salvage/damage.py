@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
-from hearthlog.schemas.mcap.records import LIMIT, parse
+from hearthlog.schemas.mcap.records import LIMIT, read_footer
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import WholeRecord
@@ -195,10 +195,9 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     """
     end = reader.end - FOOTER_SIZE
     tail = reader.read(max(end, 0), FOOTER_SIZE)
-    if tail[:1] != bytes([Opcode.FOOTER]) or not tail.endswith(MAGIC):
+    footer = read_footer(tail)
+    if footer is None:
         return None
-    footer = parse(Opcode.FOOTER, tail[HEAD.size :])
-    assert isinstance(footer, records.Footer)
     start = footer.summary_start
     if not len(MAGIC) <= start < end or end - start > limit:
         return None

@@ -8,13 +8,13 @@ from mcap.records import Channel, McapRecord, Schema
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE, SCHEMA_ENCODING
 from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.records import encode, parse
 from hearthlog.schemas.messages.type_definitions import message_type
 
-PROFILE = "ros2"
-_ENCODINGS = ("ros2msg", "ros2idl")
+ROS_ENCODINGS = (SCHEMA_ENCODING, "ros2idl")
 _SIZE_LIMIT = 16 << 20  # bytes of a record that is neither chunk nor attachment
 _TOTAL_LIMIT = 64 << 20  # bytes of all schemas and channels of a file
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
@@ -141,7 +141,7 @@ class CheckedDefinitions(Definitions):
         if not schema.encoding and schema.data:
             what = f"schema {schema.name} has data, but no encoding"
             error("schema-encoding", what, RECOVER, offset=offset)
-        if schema.encoding in _ENCODINGS:
+        if schema.encoding in ROS_ENCODINGS:
             self._check_definition(schema, offset)
         elif self.profile == PROFILE:
             what = f"schema {schema.name} is {schema.encoding!r}, neither ros2msg nor ros2idl"
@@ -165,8 +165,8 @@ class CheckedDefinitions(Definitions):
         if not channel.message_encoding:
             error("channel-encoding", f"{topic} has no message encoding", RECOVER, offset=offset)
         elif self.profile == PROFILE:
-            if channel.message_encoding != "cdr":
-                what = f"{topic} is encoded as {channel.message_encoding!r}, not as cdr"
+            if channel.message_encoding != ENCODING:
+                what = f"{topic} is encoded as {channel.message_encoding!r}, not as {ENCODING}"
                 self._profile("profile-channel", what, offset)
             elif not channel.schema_id:
                 self._profile("profile-channel", f"{topic} has no schema", offset)
