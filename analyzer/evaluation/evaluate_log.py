@@ -15,16 +15,22 @@ from hearthlog.analyzer.evaluation.event_scores import (
     events_of,
     laid_out,
 )
+from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.coverage import find_coverage
-from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labelling import FIELDS, Labelling, all_classes, labelling_of
+from hearthlog.analyzer.logs.layers import with_layers
+from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import common, joined
 from hearthlog.analyzer.marks.formats.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import REVIEW, microphone_of
 from hearthlog.schemas.times import NANOSECONDS
 
 _BLOCK = 300 * NANOSECONDS
@@ -158,6 +164,70 @@ def _between(labelling: Labelling) -> str:
         for t in (labelling.starts.min(), labelling.ends.max())
     )
     return f"{first}Z to {last}Z"
+
+
+@dataclass(frozen=True)
+class TopicLabelling:
+    """The labelling that some logs have on a topic of segments."""
+
+    topic: str
+    classes: tuple[str, ...]  # the labels there may be
+    labelling: Labelling
+    unfinished: tuple[Path, ...]  # logs that were not completed
+
+    @property
+    def microphone(self) -> str:
+        """Name of the microphone."""
+        return microphone_of(self.topic)
+
+
+def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
+    """Read the segments of a log, or of a folder of logs, and of their layers.
+
+    `Labellings.read` leaves out a damaged log; here it is an error, for scores do not show it.
+
+    Parameters
+    ----------
+    path : Path
+        The log, or folder of logs.
+    topic : str, optional
+        The topic of the segments, such as `/mic/segment`; by default that of the only microphone.
+
+    Returns
+    -------
+    TopicLabelling
+        Its segments are in the order of time.
+
+    Raises
+    ------
+    LogError
+        If there is no log, if one is damaged, if there are no such segments, if they overlap, or
+        if `topic` is None and there are several microphones.
+    """
+    selection = select(with_layers(path))
+    topic = _segment_topic(selection, topic)
+    columns = read_columns(selection.logs, {topic}, fields=FIELDS).get(topic)
+    if columns is None or not (columns["duration"] > 0).any():
+        raise LogError(f"{path}: there is no segment on {topic}")
+    labelling = labelling_of(columns)
+    channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
+    named = [array_names(channel.metadata, "probabilities") for channel, _ in channels]
+    classes = all_classes(topic, named, labelling.labels)
+    return TopicLabelling(topic, classes, labelling, tuple(selection.unfinished))
+
+
+def _segment_topic(selection: Selection, asked: str | None) -> str:
+    """Find the topic of a recorder's segments."""
+    topics = sorted(selection.topics_of(message_types.SEGMENT, FIELDS))
+    recorded = [topic for topic in topics if topic.count("/") == 2]
+    if not topics:
+        raise LogError("no segments; if the log was recorded without a model, relabel it with one")
+    if asked is None and len(recorded) != 1:
+        raise LogError(f"choose one with --topic: {', '.join(topics)}")
+    topic = recorded[0] if asked is None else asked
+    if topic not in topics:
+        raise LogError(f"{topic}: no such segments; there are {', '.join(topics)}")
+    return topic
 
 
 def read_reference(source: str, path: Path, microphone: str) -> Labelling:

@@ -2,21 +2,15 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.layers import with_layers
-from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import microphone_of
+from hearthlog.schemas.logs.columns import Columns
 
 FIELDS = {"header.stamp", "duration", "label"}
 MOST_CLASSES = 100
@@ -50,53 +44,6 @@ class Labelling:
         """
         names = translation(set(self.labels), classes)
         return replace(self, labels=np.array([names[label] for label in self.labels], object))
-
-
-@dataclass(frozen=True)
-class TopicLabelling:
-    """The labelling that some logs have on a topic of segments."""
-
-    topic: str
-    classes: tuple[str, ...]  # the labels there may be
-    labelling: Labelling
-    unfinished: tuple[Path, ...]  # logs that were not completed
-
-    @property
-    def microphone(self) -> str:
-        """Name of the microphone."""
-        return microphone_of(self.topic)
-
-
-def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
-    """Read the segments of a log, or of a folder of logs, and of their layers.
-
-    Parameters
-    ----------
-    path : Path
-    topic : str, optional
-        The topic of the segments, such as `/mic/segment`; by default that of the only microphone.
-
-    Returns
-    -------
-    TopicLabelling
-        Its segments are in the order of time.
-
-    Raises
-    ------
-    LogError
-        If there is no log, if one is damaged, if there are no such segments, if they overlap, or
-        if `topic` is None and there are several microphones.
-    """
-    selection = select(with_layers(path))
-    topic = _segment_topic(selection, topic)
-    columns = read_columns(selection.logs, {topic}, fields=FIELDS).get(topic)
-    if columns is None or not (columns["duration"] > 0).any():
-        raise LogError(f"{path}: there is no segment on {topic}")
-    labelling = labelling_of(columns)
-    channels = selection.channels.get(f"{topic.removesuffix('/segment')}/label", ())
-    named = [array_names(channel.metadata, "probabilities") for channel, _ in channels]
-    classes = all_classes(topic, named, labelling.labels)
-    return TopicLabelling(topic, classes, labelling, tuple(selection.unfinished))
 
 
 def labelling_of(segments: Columns) -> Labelling:
@@ -192,17 +139,3 @@ def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
             raise LogError(f"{topic}: {label[:64]!r} cannot be the name of a class")
     if len(starts) and starts[0] < 0:
         raise LogError(f"{topic}: has a segment before 1970")
-
-
-def _segment_topic(selection: Selection, asked: str | None) -> str:
-    """Find the topic of a recorder's segments."""
-    topics = sorted(selection.topics_of(message_types.SEGMENT, FIELDS))
-    recorded = [topic for topic in topics if topic.count("/") == 2]
-    if not topics:
-        raise LogError("no segments; if the log was recorded without a model, relabel it with one")
-    if asked is None and len(recorded) != 1:
-        raise LogError(f"choose one with --topic: {', '.join(topics)}")
-    topic = recorded[0] if asked is None else asked
-    if topic not in topics:
-        raise LogError(f"{topic}: no such segments; there are {', '.join(topics)}")
-    return topic

@@ -87,8 +87,11 @@ def evaluate_log(
 
     Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
     """
-    from hearthlog.analyzer.evaluation.evaluate_log import evaluate_labelling, read_reference
-    from hearthlog.analyzer.logs.labelling import read_labelling
+    from hearthlog.analyzer.evaluation.evaluate_log import (
+        evaluate_labelling,
+        read_labelling,
+        read_reference,
+    )
 
     check_output("--plot", plot, ".png", "a picture")
     labelled = read_labelling(log, topic)
