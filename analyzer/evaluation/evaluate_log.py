@@ -17,7 +17,7 @@ from hearthlog.analyzer.evaluation.event_scores import (
 )
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.coverage import find_coverage
-from hearthlog.analyzer.logs.labelling import FIELDS, Labelling, all_classes, labelling_of
+from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_classes, labelling_of
 from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import common, joined
@@ -206,7 +206,7 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     """
     selection = select(with_layers(path))
     topic = _segment_topic(selection, topic)
-    columns = read_columns(selection.logs, {topic}, fields=FIELDS).get(topic)
+    columns = read_columns(selection.logs, {topic}, fields=SEGMENT_FIELDS).get(topic)
     if columns is None or not (columns["duration"] > 0).any():
         raise LogError(f"{path}: there is no segment on {topic}")
     labelling = labelling_of(columns)
@@ -218,7 +218,7 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
 
 def _segment_topic(selection: Selection, asked: str | None) -> str:
     """Find the topic of a recorder's segments."""
-    topics = sorted(selection.topics_of(message_types.SEGMENT, FIELDS))
+    topics = sorted(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
     recorded = [topic for topic in topics if topic.count("/") == 2]
     if not topics:
         raise LogError("no segments; if the log was recorded without a model, relabel it with one")

@@ -12,7 +12,7 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns
 
-FIELDS = {"header.stamp", "duration", "label"}
+SEGMENT_FIELDS = {"header.stamp", "duration", "label"}
 MOST_CLASSES = 100
 
 
@@ -52,7 +52,7 @@ def labelling_of(segments: Columns) -> Labelling:
     Parameters
     ----------
     segments : Columns
-        Messages of type `AudioSegment`, with the fields `FIELDS`.
+        Messages of type `AudioSegment`, with the fields `SEGMENT_FIELDS`.
 
     Raises
     ------

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import (
-    FIELDS,
+    SEGMENT_FIELDS,
     Labelling,
     all_classes,
     check_labelling,
@@ -283,7 +283,7 @@ class Labellings:
         for i, log in enumerate(logs):
             progress(i / len(logs))
             try:
-                columns = read_columns([log.path], {topic}, start, fields=FIELDS).get(topic)
+                columns = read_columns([log.path], {topic}, start, fields=SEGMENT_FIELDS).get(topic)
             except LogError as error:
                 self.lose(error)
                 continue
@@ -346,5 +346,5 @@ def _log(path: Path, selection: Selection) -> LogContents:
         ]
         for topic in selection.topics_of(message_types.LABEL, LABEL_FIELDS)
     }
-    segments = frozenset(selection.topics_of(message_types.SEGMENT, FIELDS))
+    segments = frozenset(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
     return LogContents(path, *selection.span, not selection.unfinished, segments, classes)

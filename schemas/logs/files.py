@@ -12,11 +12,8 @@ from hearthlog.schemas.storage.regular_file import may_be_regular
 from hearthlog.schemas.times import NANOSECONDS
 
 SUFFIX = ".mcap"
-AUDIO_LAYER, REVIEW_LAYER, RELABEL_LAYER = (
-    "audio",
-    "review",
-    "relabel-",
-)  # layers; the last with a model behind it
+AUDIO_LAYER, REVIEW_LAYER = "audio", "review"
+RELABEL_LAYER = "relabel-"  # and the name of a model
 AUDIO_SUFFIX = f".{AUDIO_LAYER}{SUFFIX}"
 _NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER}))?", re.DOTALL)
 _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)

@@ -10,7 +10,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64
-from hearthlog.schemas.mcap.formats import INDEX_ENTRY
+from hearthlog.schemas.mcap.formats import INDEX_ENTRIES, INDEX_ENTRY
 
 LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
 
@@ -25,6 +25,10 @@ class StoredChunk(NamedTuple):
     start: int  # log time of the first message, in nanoseconds
     end: int  # and of the last
     entries: Mapping[int, bytes | bytearray]  # the message index, `INDEX_ENTRIES` by channel
+
+    def times(self, channel: int) -> Int64:
+        """Return the log times of a channel's messages, as the message index has them."""
+        return np.frombuffer(self.entries[channel], INDEX_ENTRIES)["time"]
 
 
 class _Local(threading.local):

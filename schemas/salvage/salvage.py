@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 from mcap import records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -286,9 +285,9 @@ class Salvage:
             if defined:
                 yield chunk
             return
-        for number, entries in chunk.stored.entries.items():
+        for number in chunk.stored.entries:
             if not defined[number]:
-                times = np.frombuffer(entries, np.int64)[::2]
+                times = chunk.stored.times(number)
                 span = int(times.min()), int(times.max())
                 self._damages.add_unnamed(number, len(times), span, whole)
         if any(defined.values()):

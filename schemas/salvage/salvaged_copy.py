@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
-import numpy as np
 from mcap.records import Channel, Header, Message
 
 from hearthlog.schemas.logs import rosbag2
@@ -139,8 +138,8 @@ class SalvagedCopy:
             chunk = piece.stored
             self._define(chunk.entries, piece.definitions)
             self._writer.copy_chunk(chunk)
-            for number, entries in chunk.entries.items():
-                times = np.frombuffer(entries, np.int64)[::2]
+            for number in chunk.entries:
+                times = chunk.times(number)
                 self._count(number, len(times), int(times.min()), int(times.max()))
         elif isinstance(piece, Message):
             self._define([piece.channel_id])
