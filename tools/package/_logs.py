@@ -35,17 +35,17 @@ __all__ = ["Columns", "Labelling", "Logs", "Mark", "follow", "open_logs"]
 
 
 class Logs:
-    """A log or the logs of a folder, with the layers beside them; `open_logs` makes it.
+    """A log, or the logs of a folder, and the layers beside them, as `open_logs` returns them.
 
-    All times are integers: nanoseconds of UTC since 1970. A topic without a message in the span of
-    time is read as a table without rows.
+    All times are integers: nanoseconds of UTC since 1970. A topic that has no message in the span
+    of time is read as a table without rows.
 
     Attributes
     ----------
     path : Path
         Of the log or the folder.
     start, end : int or None
-        Log times: what is read is from `start` on, before `end`; None for no limit.
+        Span of time to read, as log times: from `start` on, before `end`; None for no limit.
     """
 
     def __init__(self, path: Path, start: int | None = None, end: int | None = None) -> None:
@@ -56,12 +56,12 @@ class Logs:
 
     @property
     def paths(self) -> list[Path]:
-        """Files with messages in the span of time, layers among them, in the order of time."""
+        """Logs and layers that have messages in the span of time, in the order of time."""
         return list(self._selection.logs)
 
     @property
     def topics(self) -> dict[str, str]:
-        """Message type of each topic."""
+        """Topics of these logs and layers, each with its message type."""
         channels = self._selection.channels
         named = {topic: schema for topic, same in channels.items() for _, schema in same}
         return {topic: schema.name if schema else "" for topic, schema in sorted(named.items())}
@@ -79,7 +79,7 @@ class Logs:
 
     @property
     def labellings(self) -> dict[str, list[str]]:
-        """Names of the labellings of each microphone that has some, for `segments`."""
+        """Names of the labellings of each microphone, as `segments` takes them."""
         named = {name: self._labellings.names(name) for name in self.microphones}
         return {name: names for name, names in named.items() if names}
 
@@ -89,6 +89,7 @@ class Logs:
         Parameters
         ----------
         topic : str
+            One of `topics`, or of another span of time.
         fields : collection of str, optional
             Paths of the fields to read, such as `header.stamp`; all by default.
 
@@ -112,13 +113,12 @@ class Logs:
         return columns[topic] if columns else join(decode(selection.no_messages(), fields))
 
     def arrow(self, topic: str) -> "pa.Table":
-        """Read a topic as an Arrow table, with the types of a Parquet file of `hearthlog export`.
-
-        Numbers are not copied once they are decoded.
+        """Read a topic as an Arrow table, with the columns that `hearthlog export` gives Parquet.
 
         Parameters
         ----------
         topic : str
+            As of `columns`.
 
         Returns
         -------
@@ -146,18 +146,19 @@ class Logs:
         return table.from_batches([batch_of(part, schema) for part in parts])
 
     def pandas(self, topic: str) -> "pd.DataFrame":
-        """Read a topic as a DataFrame; arrays become a column for each of their elements.
+        """Read a topic as a DataFrame, with a column for each element of an array.
 
         Parameters
         ----------
         topic : str
+            As of `columns`.
 
         Returns
         -------
         pandas.DataFrame
-            One row a message, by log time, which is of type `datetime64[ns, UTC]`. The columns
-            of arrays are called as the log names their elements (`values.energy`,
-            `probabilities.speech`), else `values.0`.
+            One row a message; the index is the log time, of type `datetime64[ns, UTC]`. Elements of
+            arrays are called as the log names them (`values.energy`, `probabilities.speech`), else
+            by number (`values.0`).
 
         Raises
         ------
@@ -229,12 +230,13 @@ class Logs:
         return segments
 
     def marks(self) -> list[Mark]:
-        """Read what reviewers have corrected.
+        """Read the marks of reviewers, which correct labels.
 
         Returns
         -------
         list of Mark
-            Those with any part in the span of time, whole, in the order of time.
+            Those that begin or end in the span of time, or last all through it; in the order of
+            their starts.
 
         Raises
         ------
@@ -256,7 +258,7 @@ class Logs:
         return find_labellings(self.path)
 
     def _select(self, topic: str) -> Selection:
-        """Select one topic; if no log of the span of time has it, its type is that of others."""
+        """Select one topic, which may be only in logs outside of the span of time."""
         selection = self._selection
         if topic not in selection.channels:
             selection = replace(selection, channels=select(with_layers(self.path)).channels)
@@ -308,17 +310,17 @@ def follow(
     ----------
     path : Path or str
     topics : collection of str, optional
-        All by default.
+        Names of the topics; all by default.
     start : int, optional
         Log time in nanoseconds of UTC from which on messages are read; by default those that are
         written from now on.
     stop : threading.Event, optional
-        Ends it.
+        Ends the reading when it is set; by default it never ends.
 
     Yields
     ------
     list of Columns
-        What was written since the last time, of one log, in the order of time.
+        What was written to one log since the last time, in the order of time.
 
     Raises
     ------
