@@ -262,17 +262,29 @@ def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlo
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "words"),
     [
-        ("record", "--realtime"),
-        ("record", "x.wav", "--start", "yesterday"),
-        ("record", "--what"),
-        ("replay",),
-        ("listen",),
+        (("record", "--realtime"), "--start and --realtime go with files"),
+        (("record", "x.wav", "--start", "yesterday"), "--start yesterday: not a time such as "),
+        (("record", "--what"), "no such option: --what; see `hearthlog record --help`"),
+        (("replay",), "missing argument 'log'; see `hearthlog replay --help`"),
+        (("models", "promote", "--to", "x"), "invalid value for '--to': "),
+        (("demo", "--minutes", "0"), "invalid value for '--minutes': "),
+        (("listen",), "no such command 'listen'; see `hearthlog --help`"),
     ],
 )
-def test_wrong_use_has_exit_status_2(hearthlog, arguments):
-    assert hearthlog(*arguments).returncode == 2
+def test_wrong_use_is_one_line_and_exit_status_2(hearthlog, arguments, words):
+    result = hearthlog(*arguments)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"hearthlog: {words}")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("verb", [(), ("models",)])
+def test_a_command_without_words_shows_its_help(hearthlog, verb):
+    result = hearthlog(*verb)
+    assert (result.returncode, result.stderr) == (2, "")
+    assert "Usage: hearthlog" in result.stdout
 
 
 @pytest.mark.parametrize("content", [b"", b"RIFF", b"x" * 999])

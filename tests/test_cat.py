@@ -349,9 +349,10 @@ def test_times(text, nanoseconds):
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-13-01", "1772348400", "07:00"])
-def test_what_is_no_time(text):
-    with pytest.raises(typer.BadParameter, match="--end"):
+def test_what_is_no_time(capsys, text):
+    with pytest.raises(typer.Exit):
         parse_time(text, "--end")
+    assert capsys.readouterr().err.startswith(f"hearthlog: --end {text}: not a time")
 
 
 def test_wrong_use(recorded, hearthlog):

@@ -82,17 +82,21 @@ _debug = {"on": False}
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
     with checked_output(), _warnings_shown() as warned:
-        status = _status_of(app)
+        status = _status_of(lambda: app(standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
 
 
-def _status_of(step: Callable[[], object]) -> str | int | None:
-    """Return the exit status of a step; an error is one line, and exit status 1."""
+def _status_of(step: Callable[[], Any]) -> str | int | None:
+    """Return the exit status of a step; an error is one line, and exit status 1 or 2."""
     try:
-        step()
+        return step()
     except SystemExit as end:
         return end.code
+    except typer.TyperException as error:
+        if error.format_message():  # else it has shown the help
+            tell(_usage_text(error))
+        return error.exit_code
     except OutputClosedError:
         return 0  # `| head` has seen enough
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
@@ -100,7 +104,13 @@ def _status_of(step: Callable[[], object]) -> str | int | None:
             raise
         tell(_message(error))
         return 1
-    return 0
+
+
+def _usage_text(error: typer.TyperException) -> str:
+    context = getattr(error, "ctx", None)
+    verb = "hearthlog" if context is None else context.command_path
+    text = error.format_message().rstrip(".").replace(": Value error,", ":")
+    return f"{text[0].lower()}{text[1:]}; see `{verb} --help`"
 
 
 def _message(error: Exception) -> str:

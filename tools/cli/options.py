@@ -91,33 +91,21 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
 
 def parse_time(text: str, option: str) -> int:
-    """Read a time, in nanoseconds of UTC.
-
-    Raises
-    ------
-    typer.BadParameter
-        If the text is not a time.
-    """
+    """Read a time, in nanoseconds of UTC; it is wrong use if the text is not a time."""
     from hearthlog.schemas.times import read_time
 
     try:
         return read_time(text)
-    except ValueError as error:
-        raise typer.BadParameter(f"{option} {text}: not a time such as 2026-03-01T07:00") from error
+    except ValueError:
+        wrong_use(f"{option} {text}: not a time such as 2026-03-01T07:00")
 
 
 def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | None]:
-    """Read the options --start and --end, in nanoseconds of UTC.
-
-    Raises
-    ------
-    typer.BadParameter
-        If one of them is not a time, or the end is not after the start.
-    """
+    """Read the options --start and --end, in nanoseconds of UTC."""
     first = None if start is None else min(max(parse_time(start, "--start"), 0), _LAST)
     last = None if end is None else min(max(parse_time(end, "--end"), 0), _LAST)
     if first is not None and last is not None and first >= last:
-        raise typer.BadParameter(f"--end {end} is not after --start {start}")
+        wrong_use(f"--end {end} is not after --start {start}")
     return first, last
 
 

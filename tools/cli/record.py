@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.tools.cli.options import parse_time
-from hearthlog.tools.cli.text import number, tell
+from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.recorder.recording import RecordingSummary
@@ -94,7 +94,7 @@ def record(
             source = FileSource(files, begin, realtime=realtime, progress=progress)
             recording = record_files(settings, microphone, source, stop, reload_requests)
     elif start is not None or realtime:
-        raise typer.BadParameter("--start and --realtime go with files")
+        wrong_use("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")

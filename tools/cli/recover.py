@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.tools.cli.options import Json
-from hearthlog.tools.cli.text import tell
+from hearthlog.tools.cli.text import tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.schemas.salvage.salvaged_copy import Recovery
@@ -37,7 +37,7 @@ def recover(
     from hearthlog.schemas.errors import LogError
 
     if output is not None and (len(logs) > 1 or in_place):
-        raise typer.BadParameter("--output goes with one log, and not with --in-place")
+        wrong_use("--output goes with one log, and not with --in-place")
     report = []
     failed = lost = False
     for log in logs:
