@@ -25,26 +25,12 @@ _NEVER = (1 << 63) - 1
 
 @dataclass(frozen=True)
 class LogDescription:
-    """What every file of a recording says of itself.
-
-    Attributes
-    ----------
-    root : Path
-        Folder of the logs.
-    node : str
-        Name of the node.
-    topics : sequence of Topic
-    infos : sequence of message
-        `AudioStreamInfo` of each microphone; each file sets their stamps.
-    metadata : mapping of str to str
-        The `hearthlog` record.
-    attachments : sequence of Attachment
-    """
+    """What every file of a recording says of itself."""
 
     root: Path  # folder of the logs
-    node: str
+    node: str  # name of the recorder
     topics: Sequence[Topic]
-    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone, without stamps
+    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
     metadata: Mapping[str, str]  # the `hearthlog` record
     attachments: Sequence[Attachment]
 

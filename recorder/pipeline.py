@@ -127,7 +127,7 @@ class Pipeline:
         self._labeller = None if classifier is None else Labeller(classifier)
         self._statistics_every = statistics_every
         self._features = features.extractor()
-        self._statistics = RollingStatistics(features.window_frames)
+        self._statistics = RollingStatistics(features.window_frames, features.width)
         self._end = 0
         self._level = OK
 

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from hearthlog.models.features.window_inputs import mean_and_std, successive
+from hearthlog.models.features.window_inputs import WindowStatistics, mean_and_std
 from hearthlog.schemas.arrays import Float32
-
-_FRAMES_AT_ONCE = 256
 
 
 class RollingStatistics:
@@ -17,20 +15,22 @@ class RollingStatistics:
     ----------
     window_frames : int
         Frames of the window.
+    width : int
+        Number of features of a frame.
     """
 
-    def __init__(self, window_frames: int) -> None:
-        self._window = window_frames
-        self._recent: Float32 | None = None
+    def __init__(self, window_frames: int, width: int) -> None:
+        self._width = width
+        self._windows = WindowStatistics(window_frames, np.asarray, width).stream()
 
     @property
     def recent(self) -> Float32 | None:
         """The features of the last frames, one less than a window; None after a gap."""
-        return self._recent
+        return self._windows.recent
 
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""
-        self._recent = None
+        self._windows.restart()
 
     def __call__(self, features: Float32) -> tuple[Float32, Float32]:
         """Compute the statistics at each of successive frames.
@@ -45,20 +45,12 @@ class RollingStatistics:
             Over the last window, or over all frames since the start or the last restart where
             these are fewer; the standard deviation divides by their number.
         """
-        mean = np.empty_like(features)
-        std = np.empty_like(features)
-        for start in range(0, len(features), _FRAMES_AT_ONCE):
-            block = slice(start, start + _FRAMES_AT_ONCE)
-            self._compute(features[block], mean[block], std[block])
-        return mean, std
-
-    def _compute(self, features: Float32, mean: Float32, std: Float32) -> None:
-        recent = features[:0] if self._recent is None else self._recent
-        values = np.concatenate([recent, features])
-        filling = min(max(self._window - 1 - len(recent), 0), len(features))
-        for i in range(filling):
-            frames = [*values[: len(recent) + i + 1, np.newaxis]]
-            mean[i : i + 1], std[i : i + 1] = mean_and_std(frames)
-        if filling < len(features):
-            mean[filling:], std[filling:] = mean_and_std(successive(values, self._window))
-        self._recent = values[max(len(values) - self._window + 1, 0) :].copy()
+        before = features[:0] if self.recent is None else self.recent
+        statistics = np.empty((len(features), 2 * self._width), np.float32)
+        whole = self._windows(features)
+        filling = len(features) - len(whole)
+        statistics[filling:] = whole
+        frames = np.concatenate([before, features[:filling]])[:, np.newaxis]
+        for row, end in enumerate(range(len(before) + 1, len(frames) + 1)):
+            statistics[row] = np.concatenate(mean_and_std([*frames[:end]]), axis=None)
+        return statistics[:, : self._width], statistics[:, self._width :]

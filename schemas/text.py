@@ -31,12 +31,14 @@ def shortened(text: str, length: int) -> str:
     return printable(text if len(text) <= length else text[: length - 1] + "…")
 
 
-def listed(names: Sequence[str]) -> str:
-    """List alternatives: `a, b or c`.
+def listed(names: Sequence[str], last: str = "or") -> str:
+    """List names in a sentence: `a, b or c`.
 
     Parameters
     ----------
     names : sequence of str
-        Alternatives in the order of the list; without any the list is an empty text.
+        Names in the order of the list; without any the list is an empty text.
+    last : str, optional
+        Word before the last name.
     """
-    return " or ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+    return f" {last} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))

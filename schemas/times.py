@@ -36,7 +36,7 @@ def read_time(text: str) -> int:
 
 
 def millisecond_text(nanoseconds: int) -> str:
-    """Write a time in UTC, to the millisecond.
+    """Write a time in UTC, down to the millisecond.
 
     Parameters
     ----------
@@ -48,11 +48,12 @@ def millisecond_text(nanoseconds: int) -> str:
     str
         Such as `2026-03-01T07:00:00.123Z`, or `<nanoseconds> ns` if no calendar has the time.
     """
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
     try:
-        moment = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
+        moment = datetime.fromtimestamp(seconds, UTC)
     except (OverflowError, ValueError, OSError):
         return f"{nanoseconds} ns"
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03}Z"
 
 
 def time_text(nanoseconds: int) -> str:

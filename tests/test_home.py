@@ -38,7 +38,7 @@ def decibels(samples, block=FRAME_SAMPLES):
 
 def one_second_statistics(samples):
     frames = samples[: len(samples) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
-    mean, std = RollingStatistics(20)(FeatureExtractor()(frames))
+    mean, std = RollingStatistics(20, 21)(FeatureExtractor()(frames))
     return np.concatenate([mean, std], axis=1)[WINDOW_FRAMES - 1 :: WINDOW_FRAMES]
 
 

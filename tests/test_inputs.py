@@ -43,7 +43,7 @@ def test_windows_on_their_own_give_what_the_stream_gives(kind):
 
 def test_statistics_are_those_of_the_log():
     values = features(300)
-    logged = np.concatenate(RollingStatistics(20)(values), axis=1)
+    logged = np.concatenate(RollingStatistics(20, 21)(values), axis=1)
     np.testing.assert_array_equal(DEFAULT.inputs["statistics"].stream()(values), logged[19:])
 
 

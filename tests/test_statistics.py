@@ -19,7 +19,7 @@ def directly(features):
 
 
 def in_blocks(features, sizes):
-    statistics = RollingStatistics(20)
+    statistics = RollingStatistics(20, 21)
     ends = np.minimum(np.cumsum(sizes), len(features))
     blocks = [statistics(block) for block in np.split(features, ends)]
     return np.concatenate([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks])
@@ -27,7 +27,7 @@ def in_blocks(features, sizes):
 
 def test_they_equal_the_direct_computation_on_real_features(real_frames):
     features = FeatureExtractor()(real_frames)
-    for ours, direct in zip(RollingStatistics(20)(features), directly(features), strict=True):
+    for ours, direct in zip(RollingStatistics(20, 21)(features), directly(features), strict=True):
         np.testing.assert_allclose(ours, direct, rtol=1e-6, atol=1e-6)
 
 
@@ -35,7 +35,7 @@ def test_they_do_not_drift_over_a_million_frames_of_extreme_values():
     features = np.random.default_rng(1).standard_normal((1_000_000, 3)).astype(np.float32)
     features *= np.float32([1e-6, 1.0, 1e6])
     features[500_000:, :] = 0.25
-    mean, std = RollingStatistics(20)(features)
+    mean, std = RollingStatistics(20, 3)(features)
     np.testing.assert_array_equal(mean[500_019:], 0.25)
     np.testing.assert_array_equal(std[500_019:], 0.0)
 
@@ -45,16 +45,16 @@ def test_they_do_not_drift_over_a_million_frames_of_extreme_values():
 def test_blocks_of_any_size_agree_bit_for_bit(sizes, count, seed):
     features = np.random.default_rng(seed).standard_normal((count, 21)).astype(np.float32)
     for block, whole in zip(
-        in_blocks(features, sizes), RollingStatistics(20)(features), strict=True
+        in_blocks(features, sizes), RollingStatistics(20, 21)(features), strict=True
     ):
         np.testing.assert_array_equal(block, whole)
 
 
 def test_after_a_restart_the_window_fills_again():
     features = np.random.default_rng(2).standard_normal((50, 21)).astype(np.float32)
-    statistics = RollingStatistics(20)
+    statistics = RollingStatistics(20, 21)
     statistics(features[:30])
     statistics.restart()
     mean, std = statistics(features[30:])
-    np.testing.assert_array_equal(mean, RollingStatistics(20)(features[30:])[0])
+    np.testing.assert_array_equal(mean, RollingStatistics(20, 21)(features[30:])[0])
     np.testing.assert_array_equal(std[0], 0.0)

@@ -82,14 +82,3 @@ def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
     shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
     more = len(starts) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
-
-
-def listed(items: list[str]) -> str:
-    """Put items in a sentence: `a, b and c`.
-
-    Parameters
-    ----------
-    items : list of str
-        Of none the sentence is empty.
-    """
-    return " and ".join([*([", ".join(items[:-1])] if items[:-1] else []), *items[-1:]])

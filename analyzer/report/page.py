@@ -10,7 +10,6 @@ from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.class_words import (
     clock_text,
     in_words,
-    listed,
     several_in_words,
     times_in_words,
 )
@@ -35,6 +34,7 @@ from hearthlog.analyzer.report.summary_text import (
 )
 from hearthlog.analyzer.report.values import Count, Minutes, Value
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
+from hearthlog.schemas.text import listed
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
@@ -116,9 +116,9 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         picture,
         account=account,
         week=len(account.days) > 1,
-        microphones=listed([plain(name) for name in account.microphones]),
+        microphones=listed([plain(name) for name in account.microphones], "and"),
         alerts=[*not_heard(account), *not_well(account)],
-        absent=listed([in_words(name).lower() for name in absent]),
+        absent=listed([in_words(name).lower() for name in absent], "and"),
         days_before=DAYS,
         interrai=_interrai(account, days),
         interrai_days=interrai.DAYS,

@@ -214,7 +214,7 @@ def _marks(home: HomeData, layers: Iterable[HomeLog]) -> dict[Source, list[Mark]
 
 
 def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
-    """Raise DataError unless something was home in the days that are reported."""
+    """Raise DataError unless something was labelled in the days that are reported."""
     if any(common(segments.spans, one(*close)).length for segments in home.segments.values()):
         return
     if labelling != LIVE:

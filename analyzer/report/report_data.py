@@ -6,10 +6,10 @@ from datetime import tzinfo
 
 from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
-from hearthlog.analyzer.report.class_words import listed
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.sections import Figure
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, Value
+from hearthlog.schemas.text import listed
 
 _CHANGES = {
     (Clock, 1): "later",
@@ -41,7 +41,7 @@ class Account:
     @property
     def home(self) -> str:
         """Name of the home."""
-        return listed(list(self.nodes)) or "Home"
+        return listed(list(self.nodes), "and") or "Home"
 
     @property
     def classes(self) -> list[str]:

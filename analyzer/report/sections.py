@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from hearthlog.analyzer.report.class_words import in_words, listed, several_in_words
+from hearthlog.analyzer.report.class_words import in_words, several_in_words
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.values import Value
 from hearthlog.models.classes import COUGHING, CRYING, FLUSHING_WATER, SHOWER, TAP_WATER
+from hearthlog.schemas.text import listed
 
 BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 
@@ -123,5 +124,5 @@ _ACTIVITY_NOTE = (
 def _missing(classes: Sequence[str], needed: Sequence[str]) -> str:
     if any(name in classes for name in needed):
         return ""
-    names = listed([in_words(name).lower() for name in needed])
+    names = listed([in_words(name).lower() for name in needed], "and")
     return f"Cannot be told: the model of this home does not know these sounds ({names})."

@@ -10,7 +10,6 @@ from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.report.class_words import (
     clock_text,
     in_words,
-    listed,
     several_in_words,
     short_day,
 )
@@ -19,6 +18,7 @@ from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.sections import Figure, events_of, sections
 from hearthlog.analyzer.report.values import Minutes
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER
+from hearthlog.schemas.text import listed
 
 _SHOWN = 4  # changes in one sentence
 _MOST = 6  # kinds of gaps, or of trouble
@@ -178,7 +178,8 @@ def _loudest(day: Day) -> str:
     most = [
         in_words(name).lower() for minutes, name in sorted(lasting, reverse=True) if minutes >= 1
     ]
-    return f"Most of the sound: {listed(most[:3])}." if most else "It was quiet."
+    sounds = listed(most[:3], "and")
+    return f"Most of the sound: {sounds}." if most else "It was quiet."
 
 
 def _changes(account: Account, day: Day) -> str:

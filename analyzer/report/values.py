@@ -9,8 +9,53 @@ _MIN = " min"
 _WIDTH = 1.645  # standard deviations: nine times in ten the number is within
 
 
+class _Quantity(ABC):
+    """What is counted: a number, with an interval where it is not certain."""
+
+    @property
+    @abstractmethod
+    def middle(self) -> float:
+        """The number, or what is expected of it."""
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.middle
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.middle
+
+    @property
+    def text(self) -> str:
+        """In words: `about 5 (4 to 6)`; the number alone if that is all of the interval."""
+        low, middle, high = (self.show(x) for x in (self.low, self.middle, self.high))
+        return middle if low == high else f"about {middle} ({low} to {high})"
+
+    @staticmethod
+    @abstractmethod
+    def show(number: float) -> str:
+        """Write a number."""
+
+    def spread(self, median: float, lowest: float, highest: float) -> str:
+        """Write what is usual: `4 (3 to 6)`; where both ends are minutes alone, `min` comes once.
+
+        Parameters
+        ----------
+        median, lowest, highest : float
+            Numbers, as `show` takes them.
+        """
+        low, high = self.show(lowest), self.show(highest)
+        if low == high:
+            return self.show(median)
+        if high.endswith(_MIN) and low.endswith(_MIN) and " h " not in low + high:
+            low = low.removesuffix(_MIN)
+        return f"{self.show(median)} ({low} to {high})"
+
+
 @dataclass(frozen=True)
-class Count:
+class Count(_Quantity):
     """A number of events, each of which may have been none."""
 
     expected: float = 0.0  # sum of p: mean of a Poisson binomial distribution
@@ -47,12 +92,6 @@ class Count:
         """
         return min(self.marked, self.expected + _WIDTH * math.sqrt(self.variance))
 
-    @property
-    def text(self) -> str:
-        """In words: `about 5 (4 to 6)`."""
-        low, middle, high = (self.show(x) for x in (self.low, self.middle, self.high))
-        return middle if low == high else f"about {middle} ({low} to {high})"
-
     @staticmethod
     def show(number: float) -> str:
         """Write a number of events, rounded.
@@ -63,16 +102,6 @@ class Count:
             Of events.
         """
         return f"{whole(number)}"
-
-    def spread(self, median: float, lowest: float, highest: float) -> str:
-        """Write what is usual: `4 (3 to 6)`.
-
-        Parameters
-        ----------
-        median, lowest, highest : float
-            Numbers of events.
-        """
-        return _spread(self.show(median), self.show(lowest), self.show(highest))
 
 
 def exactly(number: int) -> Count:
@@ -86,38 +115,8 @@ def exactly(number: int) -> Count:
     return Count(number, 0.0, number, number)
 
 
-class _Plain(ABC):
-    """What has no interval."""
-
-    @property
-    def low(self) -> float:
-        """The same."""
-        return self.middle
-
-    high = low
-
-    @property
-    @abstractmethod
-    def middle(self) -> float:
-        """The number."""
-
-    @property
-    def text(self) -> str:
-        """In words."""
-        return self.show(self.middle)
-
-    @staticmethod
-    @abstractmethod
-    def show(number: float) -> str:
-        """Write a number."""
-
-    def spread(self, median: float, lowest: float, highest: float) -> str:
-        """Write what is usual."""
-        return _spread(self.show(median), self.show(lowest), self.show(highest))
-
-
 @dataclass(frozen=True)
-class Minutes(_Plain):
+class Minutes(_Quantity):
     """A length of time."""
 
     minutes: float = 0.0
@@ -146,7 +145,7 @@ class Minutes(_Plain):
 
 
 @dataclass(frozen=True)
-class Clock(_Plain):
+class Clock(_Quantity):
     """A time of day, in minutes from midnight on."""
 
     minutes: float
@@ -170,15 +169,6 @@ class Clock(_Plain):
 
 
 Value = Count | Minutes | Clock
-
-
-def _spread(middle: str, low: str, high: str) -> str:
-    """Put median and range together; where both are minutes alone, that is said once."""
-    if low == high:
-        return middle
-    if high.endswith(_MIN) and low.endswith(_MIN) and " h " not in low + high:
-        low = low.removesuffix(_MIN)
-    return f"{middle} ({low} to {high})"
 
 
 def whole(number: float) -> int:

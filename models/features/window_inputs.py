@@ -111,7 +111,7 @@ class WindowStatistics:
             part = windows[start : start + _FRAMES_AT_ONCE]
             values = self.values(part.reshape(-1, part.shape[-1]))
             frames = values.reshape(len(part), self.window_frames, -1).swapaxes(0, 1)
-            changes = np.abs(np.diff(frames, axis=0))
+            changes = np.abs(np.diff(frames, axis=0)) if self.changes else ()
             self.reduce([*frames], [*changes], inputs[start : start + _FRAMES_AT_ONCE])
         return inputs
 
@@ -126,7 +126,7 @@ class WindowStatistics:
             Values of the first frames of all windows, of their second frames and so on, as of
             `successive`.
         changes : sequence of np.ndarray [shape=(n, d')]
-            The same of the absolute differences from frame to frame.
+            The same of the absolute differences from frame to frame; not used without `changes`.
         out : np.ndarray [shape=(n, width)], float32
             Overwritten: means, standard deviations and, with `changes`, mean absolute differences.
         """
@@ -142,15 +142,21 @@ class StatisticsStream:
     Parameters
     ----------
     inputs : WindowStatistics
+
+    Attributes
+    ----------
+    recent : np.ndarray [shape=(n, d)], float32, or None
+        Features of the last frames, at most one less than a window; None at the start and after a
+        restart.
     """
 
     def __init__(self, inputs: WindowStatistics) -> None:
+        self.recent: Float32 | None = None
         self._inputs = inputs
-        self._recent: Float32 | None = None
 
     def restart(self) -> None:
         """Forget the past: the next frame does not follow the last one."""
-        self._recent = None
+        self.recent = None
 
     def __call__(self, features: Float32) -> Float32:
         """Compute the inputs at successive frames.
@@ -166,16 +172,20 @@ class StatisticsStream:
             restart.
         """
         length = self._inputs.window_frames
-        if self._recent is not None:
-            features = np.concatenate([self._recent, features])
-        self._recent = features[max(len(features) - length + 1, 0) :].copy()
+        if self.recent is not None:
+            features = np.concatenate([self.recent, features])
+        self.recent = features[max(len(features) - length + 1, 0) :].copy()
         values = self._inputs.values(features)
         count = max(len(features) - length + 1, 0)
         inputs = np.empty((count, self._inputs.width), np.float32)
         for start in range(0, count, _FRAMES_AT_ONCE):
             end = min(start + _FRAMES_AT_ONCE, count)
             part = values[start : end + length - 1]
-            changes = successive(np.abs(np.diff(part, axis=0)), length - 1)
+            changes = (
+                successive(np.abs(np.diff(part, axis=0)), length - 1)
+                if self._inputs.changes
+                else ()
+            )
             self._inputs.reduce(successive(part, length), changes, inputs[start:end])
         return inputs
 

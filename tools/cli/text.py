@@ -8,6 +8,7 @@ from typing import NoReturn
 import typer
 
 from hearthlog.schemas.text import printable
+from hearthlog.schemas.times import millisecond_text
 
 _SHOWN = 10  # of a list
 
@@ -49,10 +50,8 @@ def number(count: int, what: str) -> str:
 
 
 def moment(stamp: int | None) -> str | None:
-    """Write a time (ns of UTC) down to the millisecond."""
-    import numpy as np
-
-    return None if stamp is None else f"{np.datetime64(stamp, 'ns').astype('datetime64[ms]')}Z"
+    """Write a time (ns of UTC) down to the millisecond; None stays None."""
+    return None if stamp is None else millisecond_text(stamp)
 
 
 def first_of(what: str, lines: Sequence[str]) -> Iterator[str]:

@@ -55,15 +55,15 @@ class LiveServer:
     memory : str, optional
         How much is kept for viewers that come later, as `200MB`; then the oldest is dropped.
 
-    Raises
-    ------
-    DataError
-        If it cannot listen there.
-
     Attributes
     ----------
     url : str
         Where viewers connect to.
+
+    Raises
+    ------
+    DataError
+        If it cannot listen there.
     """
 
     def __init__(self, port: int, bind: str, minutes: float, memory: str = _MEMORY) -> None:
