@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.selection import Selection
 from hearthlog.analyzer.logs.typed_columns import TypedColumns
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.fields import DURATION, TIME, Field
 
 _MOMENT = pa.timestamp("ns", "UTC")
@@ -85,13 +86,17 @@ def batch_of(piece: TypedColumns, schema: pa.Schema) -> pa.RecordBatch:
     types = [type_of(piece.fields[path]) for path in columns.fields]
     if types != schema.types[len(_HEADS) :]:
         raise LogError(f"{columns.topic}: {columns.type} is defined in two ways; choose one log")
-    arrays = [
-        pa.array(columns.log_times).cast(_MOMENT),
-        pa.array(columns.publish_times).cast(_MOMENT),
-        pa.array(columns.sequences),
-        *(array_of(columns[path], piece.fields[path]) for path in columns.fields),
-    ]
-    return pa.RecordBatch.from_arrays(arrays, schema=schema)
+    arrays = [array_of(columns[path], piece.fields[path]) for path in columns.fields]
+    return pa.RecordBatch.from_arrays([*head_arrays(columns).values(), *arrays], schema=schema)
+
+
+def head_arrays(columns: Columns) -> dict[str, pa.Array]:
+    """Return log times, publish times and sequence numbers, by the names of their columns."""
+    return {
+        "log_time": pa.array(columns.log_times).cast(_MOMENT),
+        "publish_time": pa.array(columns.publish_times).cast(_MOMENT),
+        "sequence": pa.array(columns.sequences),
+    }
 
 
 def array_of(values: NDArray[Any], field: Field) -> pa.Array:

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from hearthlog.analyzer.export.arrow import array_of, column_name, type_of
+from hearthlog.analyzer.export.arrow import array_of, column_name, head_arrays, type_of
 from hearthlog.analyzer.export.exporter import stream_exporter
 from hearthlog.analyzer.export.text import json_texts
 from hearthlog.analyzer.logs.channel_names import array_names
@@ -85,12 +85,7 @@ class CsvFile:
 
     def _columns(self, piece: TypedColumns) -> dict[str, pa.Array]:
         columns = piece.columns
-        moment = pa.timestamp("ns", "UTC")
-        arrays = {
-            "log_time": pa.array(columns.log_times).cast(moment),
-            "publish_time": pa.array(columns.publish_times).cast(moment),
-            "sequence": pa.array(columns.sequences),
-        }
+        arrays = head_arrays(columns)
         for path, values in columns.fields.items():
             field = piece.fields[path]
             name = column_name(path)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import number, tell, wrong_use
@@ -103,7 +104,7 @@ def _print_amounts(marks: "Sequence[Mark]") -> None:
         counts[mark.label] += 1
         lengths[mark.label] += mark.end - mark.start
     rows = [
-        (label, f"{number(count, 'mark')}, {lengths[label] / 1e9:.2f} s")
+        (label, f"{number(count, 'mark')}, {lengths[label] / NANOSECONDS:.2f} s")
         for label, count in sorted(counts.items())
     ]
     print_table((), rows, words=2)

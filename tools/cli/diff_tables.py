@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from hearthlog.schemas.text import shortened
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.table import NAME_WIDTH, print_confusion, print_table
 from hearthlog.tools.cli.text import moment
 
@@ -90,4 +91,4 @@ def print_queue(queue: "ReviewQueue") -> None:
 
 def _span(start: int, end: int) -> tuple[str, str]:
     """Write when a span starts, and how many seconds it lasts."""
-    return str(moment(start)), f"{(end - start) / 1e9:7.2f}"
+    return str(moment(start)), f"{(end - start) / NANOSECONDS:7.2f}"

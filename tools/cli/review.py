@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from hearthlog.schemas.text import printable
+from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.options import End, Microphone, Start, Timezone, parse_span, reviewer_name
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.timeline.model import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
-_ALL_FRAMES = 3 * 3600 * 10**9  # ns: of more, the viewer would take a gigabyte
+_ALL_FRAMES = 3 * 3600 * NANOSECONDS  # of more, the viewer would take a gigabyte
 
 
 def review(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.review.timeline.grid import Grid
 from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.times import NANOSECONDS
 
 
 class LabelledSpans(NamedTuple):
@@ -99,7 +100,7 @@ class SoundClip(NamedTuple):
     @property
     def end(self) -> int:
         """End of the clip, in nanoseconds of UTC."""
-        return self.start + len(self.samples) * 1_000_000_000 // self.rate
+        return self.start + len(self.samples) * NANOSECONDS // self.rate
 
 
 @dataclass
