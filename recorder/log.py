@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hearthlog.recorder.pipeline import EncodedMessage, opening_messages
+from hearthlog.recorder.stream_messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import active_path, log_path
 from hearthlog.schemas.logs.log_stream import Attachment

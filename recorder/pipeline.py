@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,79 +13,13 @@ from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
-from hearthlog.schemas.messages.message_types import (
-    duration_message,
-    encode,
-    header,
-    message,
-    nanoseconds,
-)
+from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
-
-
-class EncodedMessage(NamedTuple):
-    """One message on its way into the log."""
-
-    log_time: int  # in nanoseconds of UTC
-    topic: str
-    data: bytes  # CDR
-
-
-def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
-    """Make the `AudioStreamInfo` of a microphone, with a stamp of zero.
-
-    Parameters
-    ----------
-    microphone : str
-        Its name.
-    device : str
-        Name of the source.
-    features : FeatureSet
-    model : Model or None
-        The model that labels the sound; None for no labels.
-
-    Returns
-    -------
-    message
-        A `hearthlog_msgs/msg/AudioStreamInfo`.
-    """
-    return message(
-        message_types.STREAM_INFO,
-        header=header(0, microphone),
-        device=device,
-        sample_rate=SAMPLE_RATE,
-        frame_seconds=FRAME_SECONDS,
-        window_seconds=features.window_seconds,
-        feature_set=features.name,
-        feature_names=list(features.feature_names),
-        model="" if model is None else model.name,
-        model_sha256="" if model is None else model.sha256,
-        labels=[] if model is None else list(model.classes),
-    )
-
-
-def opening_messages(info: Any) -> list[EncodedMessage]:
-    """Return the first messages of every file: its `AudioStreamInfo`, and the same in words.
-
-    Parameters
-    ----------
-    info : message
-        `AudioStreamInfo`, with the start of the file as its stamp.
-
-    Returns
-    -------
-    list of EncodedMessage
-        Both at that time.
-    """
-    stamp = nanoseconds(info.header.stamp)
-    return [
-        EncodedMessage(stamp, topic(info.header.frame_id, "info"), encode(info)),
-        EncodedMessage(stamp, ROSOUT, rosout.info_line(info)),
-    ]
 
 
 class Pipeline:

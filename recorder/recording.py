@@ -20,10 +20,11 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.model_watch import ModelWatch
-from hearthlog.recorder.pipeline import EncodedMessage, Pipeline, stream_info
+from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.recorder.stream_messages import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import provenance

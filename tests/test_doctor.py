@@ -42,10 +42,11 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
 from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.pipeline import Pipeline, stream_info
+from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import describe_log, record
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.formats import MAGIC

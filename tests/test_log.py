@@ -7,8 +7,9 @@ from logs import features
 
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.pipeline import Pipeline, stream_info
+from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import Settings, describe_log
+from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

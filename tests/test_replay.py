@@ -255,7 +255,7 @@ def test_a_log_from_the_middle_of_a_recording_starts_without_labels_and_says_so(
     result = hearthlog("replay", middle, "--model", model_file, "-o", tmp_path / "again")
     assert result.returncode == 3
     assert result.stderr.splitlines()[-1].startswith(
-        "hearthlog: sound before 2026-03-01T07:31:00+00:00 is not in these logs"
+        "hearthlog: sound before 2026-03-01T07:31:00.000Z is not in these logs"
     )
     replayed, recorded = read(tmp_path / "again", "label"), read(middle, "label")
     assert len(recorded) - len(replayed) == 19

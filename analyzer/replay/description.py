@@ -9,7 +9,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.log import LogDescription
-from hearthlog.recorder.pipeline import stream_info
+from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.messages.topics import topics_of
 

@@ -16,7 +16,8 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.pipeline import EncodedMessage, Pipeline
+from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import topic

@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event as Flag
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,7 +15,7 @@ import typer
 
 from hearthlog.tools.cli.browser import print_recording
 from hearthlog.tools.cli.options import Json
-from hearthlog.tools.cli.text import tell, wrong_use
+from hearthlog.tools.cli.text import moment, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
@@ -246,11 +245,11 @@ def _warnings(result: "Replay") -> list[str]:
     ]
     if result.missing:
         count = len(result.missing)
-        where = datetime.fromtimestamp(result.missing[0] / 1e9, UTC).isoformat(timespec="seconds")
         more = f" (and {count - 1} more times)" if count > 1 else ""
         lines.append(
-            f"sound before {where}{more} is not in these logs: the first second there has no "
-            "labels, and the segment that was open begins too late; add the logs before"
+            f"sound before {moment(result.missing[0])}{more} is not in these logs: the first "
+            "second there has no labels, and the segment that was open begins too late; add the "
+            "logs before"
         )
     if result.interrupted:
         lines.append(f"interrupted after {result.seconds:.1f} s of sound")
