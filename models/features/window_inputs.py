@@ -171,22 +171,18 @@ class StatisticsStream:
             At the last m of these frames: those with a whole window since the start or the last
             restart.
         """
-        length = self._inputs.window_frames
+        kind, length = self._inputs, self._inputs.window_frames
         if self.recent is not None:
             features = np.concatenate([self.recent, features])
         self.recent = features[max(len(features) - length + 1, 0) :].copy()
-        values = self._inputs.values(features)
+        values = kind.values(features)
         count = max(len(features) - length + 1, 0)
-        inputs = np.empty((count, self._inputs.width), np.float32)
+        inputs = np.empty((count, kind.width), np.float32)
         for start in range(0, count, _FRAMES_AT_ONCE):
             end = min(start + _FRAMES_AT_ONCE, count)
             part = values[start : end + length - 1]
-            changes = (
-                successive(np.abs(np.diff(part, axis=0)), length - 1)
-                if self._inputs.changes
-                else ()
-            )
-            self._inputs.reduce(successive(part, length), changes, inputs[start:end])
+            steps = successive(np.abs(np.diff(part, axis=0)), length - 1) if kind.changes else ()
+            kind.reduce(successive(part, length), steps, inputs[start:end])
         return inputs
 
 

@@ -1,7 +1,7 @@
 """Microphones by names that survive a reboot."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -76,9 +76,7 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
     for device in devices:
         count = seen[device.name] = seen.get(device.name, 0) + 1
         name = device.name if count == 1 else f"{device.name} #{count}"
-        numbered.append(
-            Device(device.index, name, device.channels, device.default_rate, device.is_default)
-        )
+        numbered.append(replace(device, name=name))
     return numbered
 
 

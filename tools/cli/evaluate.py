@@ -120,8 +120,8 @@ def evaluate_log(
         )
         print_scores(result.scores, result.detections)
         if result.ambiguous_seconds:
-            print(f"\n{result.ambiguous_seconds:.1f} s have two labels in the reference", end="")
-            print(": left out of the scores of frames")
+            amount = f"{result.ambiguous_seconds:.1f} s have two labels in the reference"
+            print(f"\n{amount}: left out of the scores of frames")
     warnings = unfinished_lines(labelled.unfinished)
     if result.unknown_labels:
         warnings.append(_unknown_text(result.unknown_labels))

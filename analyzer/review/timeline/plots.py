@@ -80,10 +80,8 @@ def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
     times = timeline.grid.middles
     for microphone in timeline.microphones.values():
         for kind, labelling, names, values in _values(microphone):
-            if kind is FEATURES:
-                yield Plot(kind, microphone.name, labelling, names, *_shades(times, values))
-            else:
-                yield Plot(kind, microphone.name, labelling, names, times, values)
+            rows = _shades(times, values) if kind is FEATURES else (times, values)
+            yield Plot(kind, microphone.name, labelling, names, *rows)
 
 
 def _values(
