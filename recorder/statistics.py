@@ -46,11 +46,10 @@ class RollingStatistics:
             these are fewer; the standard deviation divides by their number.
         """
         before = features[:0] if self.recent is None else self.recent
-        statistics = np.empty((len(features), 2 * self._width), np.float32)
-        whole = self._windows(features)
-        filling = len(features) - len(whole)
-        statistics[filling:] = whole
-        frames = np.concatenate([before, features[:filling]])[:, np.newaxis]
-        for row, end in enumerate(range(len(before) + 1, len(frames) + 1)):
-            statistics[row] = np.concatenate(mean_and_std([*frames[:end]]), axis=None)
-        return statistics[:, : self._width], statistics[:, self._width :]
+        rows = self._windows(features)
+        if filling := len(features) - len(rows):
+            frames = np.concatenate([before, features[:filling]])[:, np.newaxis]
+            ends = range(len(before) + 1, len(frames) + 1)
+            first = [np.concatenate(mean_and_std([*frames[:end]]), axis=1) for end in ends]
+            rows = np.concatenate([*first, rows], dtype=np.float32, casting="same_kind")
+        return rows[:, : self._width], rows[:, self._width :]

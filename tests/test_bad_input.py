@@ -267,7 +267,7 @@ def test_variables_of_other_programs_and_of_the_configuration_are_taken(hearthlo
         (("record", "--realtime"), "--start and --realtime go with files"),
         (("record", "x.wav", "--start", "yesterday"), "--start yesterday: not a time such as "),
         (("record", "--what"), "no such option: --what; see `hearthlog record --help`"),
-        (("replay",), "missing argument 'log'; see `hearthlog replay --help`"),
+        (("replay",), "missing argument 'path'; see `hearthlog replay --help`"),
         (("models", "promote", "--to", "x"), "invalid value for '--to': "),
         (("demo", "--minutes", "0"), "invalid value for '--minutes': "),
         (("listen",), "no such command 'listen'; see `hearthlog --help`"),

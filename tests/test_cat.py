@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from logreader import LogReader
 from spliced import run, write_log
 
-from hearthlog.analyzer.export.text import in_order, json_lines, quoted, text_lines
+from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.typed_columns import decode_all
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
@@ -35,7 +35,7 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
 )
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 from hearthlog.tools.cli.options import parse_time
 
 
@@ -346,6 +346,11 @@ def test_a_span_begins_with_its_start_and_ends_before_its_end(recorded, hearthlo
 )
 def test_times(text, nanoseconds):
     assert parse_time(text, "--start") == nanoseconds
+
+
+@pytest.mark.parametrize("time", [0, -1, 1_772_348_400_123_999_999, -(1 << 62), (1 << 63) - 1])
+def test_a_time_is_written_in_a_column_as_it_is_alone(time):
+    assert _moments(np.array([time])) == [millisecond_text(time)]
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-13-01", "1772348400", "07:00"])

@@ -199,6 +199,7 @@ def _seconds(values: Int64) -> list[str]:
 
 
 def _moments(values: Int64) -> list[str]:
+    """Write times as `millisecond_text` does, many at once."""
     texts: list[str] = np.datetime_as_string(values.astype("M8[ns]"), unit="ms").tolist()
     return [f"{text}Z" for text in texts]
 

@@ -82,7 +82,7 @@ _debug = {"on": False}
 def main() -> None:
     """Run the command line; with a warning of ours, what is done is done with exit status 3."""
     with checked_output(), _warnings_shown() as warned:
-        status = _status_of(lambda: app(standalone_mode=False))
+        status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
 
