@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from mcap.exceptions import McapError
 
-from hearthlog.schemas.arrays import Int64, gather
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap.formats import CHUNK, HEAD, INDEX_ENTRIES
+from hearthlog.schemas.mcap.raw_messages import gather_heads
 
 _COMPRESSED = re.compile(  # from the length of the compression's name on, with the data's magic
     rb"\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd|\x03\0\0\0lz4.{8}\x04\x22\x4d\x18", re.DOTALL
@@ -73,11 +74,10 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
     """
     if not len(starts):
         return {}
-    buffer = np.frombuffer(content, np.uint8)
-    channels = gather(buffer, starts + 9, 2).view("<u2")
+    heads = gather_heads(content, starts)
+    channels = heads["channel"]
     entries = np.empty(len(starts), INDEX_ENTRIES)
-    entries["time"] = gather(buffer, starts + 15, 8).view("<i8")
-    entries["offset"] = starts
+    entries["time"], entries["offset"] = heads["log_time"], starts
     order = np.argsort(channels, kind="stable")
     numbers, firsts, counts = np.unique(channels, return_index=True, return_counts=True)
     ends = np.cumsum(counts)

@@ -354,15 +354,10 @@ class LogFile:
             self.channels.setdefault(record.id, record)
         elif isinstance(record, records.Statistics):
             self.statistics = record
-        elif isinstance(record, records.AttachmentIndex):
-            self._add_location(Opcode.ATTACHMENT, record)
-        elif isinstance(record, records.MetadataIndex):
-            self._add_location(Opcode.METADATA, record)
-
-    def _add_location(
-        self, opcode: int, index: records.AttachmentIndex | records.MetadataIndex
-    ) -> None:
-        self.record_locations.append(RecordLocation(opcode, index.offset, index.length))
+        elif isinstance(record, records.AttachmentIndex | records.MetadataIndex):
+            is_metadata = isinstance(record, records.MetadataIndex)
+            opcode = Opcode.METADATA if is_metadata else Opcode.ATTACHMENT
+            self.record_locations.append(RecordLocation(opcode, record.offset, record.length))
 
     def _forget(self) -> None:
         self.schemas.clear()

@@ -76,12 +76,12 @@ def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
     return first, max(first, last)
 
 
-def gather_heads(buffer: Bytes | bytes, starts: Int64) -> NDArray[np.void]:
+def gather_heads(buffer: Bytes | bytes | memoryview, starts: Int64) -> NDArray[np.void]:
     """Copy the heads of messages out of a buffer.
 
     Parameters
     ----------
-    buffer : bytes or np.ndarray [shape=(b,)], uint8
+    buffer : bytes-like or np.ndarray [shape=(b,)], uint8
     starts : np.ndarray [shape=(n,)], int64
         Bytes of the buffer at which the message records begin, with their opcodes.
 

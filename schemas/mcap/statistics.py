@@ -11,6 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, SUMMARY_OFFSET
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.records import parse, read_footer
@@ -99,15 +100,6 @@ def _summary_group(file: LocalFile | StoredFile, opcode: int) -> list[McapRecord
     offsets = file.read(footer.summary_offset_start, size)
     for group, start, length in SUMMARY_OFFSET.iter_unpack(offsets):
         if group == opcode and length <= _SIZE_LIMIT and start < end:
-            return _split(file.read(start, length))
+            raw = file.read(start, length)
+            return [parse(kind, raw[a + HEAD.size : b]) for kind, a, b in iterate_records(raw)]
     return []
-
-
-def _split(raw: bytes) -> list[McapRecord | None]:
-    group = []
-    start = 0
-    while start < len(raw):
-        opcode, length = HEAD.unpack_from(raw, start)
-        start += HEAD.size + length
-        group.append(parse(opcode, raw[start - length : start]))
-    return group

@@ -4,7 +4,6 @@ import struct
 import zlib
 from array import array
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.mcap.checked_definitions import CheckedDefinitions, name_of
+from hearthlog.analyzer.doctor.mcap.message_batch import ChunkContent
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap import formats
@@ -20,24 +20,6 @@ from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import ChunkHead, chunk_head, decompress
-
-
-class ChunkContent(NamedTuple):
-    """The records of a chunk.
-
-    Attributes
-    ----------
-    records : bytes
-        Decompressed.
-    starts : np.ndarray [shape=(n,)], int64
-        Bytes in `records` at which its messages begin, ascending.
-    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-        The heads of these messages.
-    """
-
-    records: bytes
-    starts: Int64
-    heads: NDArray[np.void]
 
 
 class Chunk:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, DataEnd, Header, Metadata, MetadataIndex
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.analyzer.doctor.mcap.checked_definitions import (
@@ -16,10 +15,14 @@ from hearthlog.analyzer.doctor.mcap.checked_definitions import (
     name_of,
     parse_strictly,
 )
-from hearthlog.analyzer.doctor.mcap.chunk import Chunk, ChunkContent, check_channels
-from hearthlog.analyzer.doctor.mcap.message_batch import BATCH_SIZE, MessageBatch, batches
+from hearthlog.analyzer.doctor.mcap.chunk import Chunk, check_channels
+from hearthlog.analyzer.doctor.mcap.message_batch import (
+    BATCH_SIZE,
+    ChunkContent,
+    MessageBatch,
+    batches,
+)
 from hearthlog.analyzer.doctor.mcap.record_walk import Record
-from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, MESSAGE_HEAD, UINT32, UINT64
 from hearthlog.schemas.mcap.raw_messages import gather_heads
@@ -72,7 +75,7 @@ class DataSection:
         self._chunk: Chunk | None = None
         self._run = bytearray()  # of messages outside of chunks
         self._run_offset = 0
-        self._parts: list[tuple[bytes, Int64, NDArray[np.void]]] = []
+        self._parts: list[ChunkContent] = []
         self._size = 0
         self._first = True
 
@@ -241,7 +244,7 @@ class DataSection:
         if self.span is not None:
             first, last = min(first, self.span[0]), max(last, self.span[1])
         self.span = first, last
-        self._parts.append((content.records, content.starts, heads))
+        self._parts.append(content)
         self._size += len(content.records)
 
     def _batches(self) -> Iterator[MessageBatch]:

@@ -14,6 +14,24 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages
 BATCH_SIZE = 4 << 20  # bytes
 
 
+class ChunkContent(NamedTuple):
+    """The records of a chunk.
+
+    Attributes
+    ----------
+    records : bytes
+        Decompressed.
+    starts : np.ndarray [shape=(n,)], int64
+        Bytes in `records` at which its messages begin, ascending.
+    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
+        The heads of these messages.
+    """
+
+    records: bytes
+    starts: Int64
+    heads: NDArray[np.void]
+
+
 class MessageBatch(NamedTuple):
     """Some messages, still encoded."""
 
@@ -45,20 +63,18 @@ class MessageBatch(NamedTuple):
                 yield RawMessages(channel, schema, self.buffer, offsets, self.heads[rows])
 
 
-def batches(parts: Sequence[tuple[bytes, Int64, NDArray[np.void]]]) -> Iterator[MessageBatch]:
+def batches(chunks: Sequence[ChunkContent]) -> Iterator[MessageBatch]:
     """Yield the messages of some chunks, a few megabytes each time, however large a chunk is.
 
     Parameters
     ----------
-    parts : sequence of (bytes, np.ndarray, np.ndarray)
-        Records of each chunk; where in them its n messages begin, shape (n,), int64; the heads of
-        these messages, shape (n,), of dtype `MESSAGE_HEAD`.
+    chunks : sequence of ChunkContent
+        At least one.
     """
-    sizes = [len(content) for content, _, _ in parts]
-    firsts = np.cumsum([0, *sizes[:-1]])
-    buffer = np.frombuffer(b"".join(content for content, _, _ in parts), np.uint8)
-    starts = np.concatenate([s + first for (_, s, _), first in zip(parts, firsts, strict=True)])
-    heads = np.concatenate([heads for _, _, heads in parts])
+    firsts = np.cumsum([0, *(len(chunk.records) for chunk in chunks[:-1])]).tolist()
+    buffer = np.frombuffer(b"".join(chunk.records for chunk in chunks), np.uint8)
+    starts = np.concatenate([c.starts + first for c, first in zip(chunks, firsts, strict=True)])
+    heads = np.concatenate([chunk.heads for chunk in chunks])
     number = np.cumsum(heads["length"]) // BATCH_SIZE
     for rows in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(number)) + 1):
         if len(rows):
