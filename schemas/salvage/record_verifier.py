@@ -4,7 +4,6 @@ What has a checksum is compared with it. What has none is believed if the length
 add up to the length before it.
 """
 
-import os
 import struct
 import zlib
 
@@ -20,6 +19,7 @@ from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
+from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 
 class RecordVerifier:
@@ -27,8 +27,8 @@ class RecordVerifier:
 
     Parameters
     ----------
-    descriptor : int
-        Of the file, open for reading; the caller closes it.
+    file : LocalFile
+        Stays open.
     end : int
         Byte of the file before which reading ends.
 
@@ -40,11 +40,11 @@ class RecordVerifier:
         Records inside of chunks that were gone through so far.
     """
 
-    def __init__(self, descriptor: int, end: int) -> None:
+    def __init__(self, file: LocalFile, end: int) -> None:
         self.end = end
         self.work = 0  # bytes that were read and decompressed
         self.inner = 0  # records inside of chunks that were gone through
-        self._descriptor = descriptor
+        self._file = file
 
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes from an offset on.
@@ -60,8 +60,13 @@ class RecordVerifier:
         -------
         bytes
             Fewer than `length` at the end of what is read of the file.
+
+        Raises
+        ------
+        LogError
+            If the file cannot be read.
         """
-        data = os.pread(self._descriptor, max(min(length, self.end - offset), 0), offset)
+        data = self._file.read(offset, max(min(length, self.end - offset), 0))
         self.work += len(data)
         return data
 

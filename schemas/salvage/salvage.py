@@ -8,7 +8,6 @@ is read once, and what is read in vain, because it only looks like a record, may
 the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, and reported.
 """
 
-import os
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,6 @@ from mcap import records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import MAGIC
@@ -32,7 +30,7 @@ from hearthlog.schemas.salvage.whole_records import (
     WholeRecord,
     chunk_messages,
 )
-from hearthlog.schemas.storage.regular_file import open_regular
+from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 _VAIN = 8
 _KEPT_LIMIT = 128 << 20  # bytes of definitions, names and indexes that a file may make us keep
@@ -84,13 +82,10 @@ class Salvage:
         self.definitions = Definitions()
         self._damages = DamageList()
         self.unnamed = self._damages.unnamed
-        try:
-            self._descriptor = open_regular(path)
-        except OSError as error:
-            raise LogError(f"{path}: cannot be read ({error.strerror})") from error
-        self.size = os.fstat(self._descriptor).st_size
+        self._file = LocalFile(path)
+        self.size = self._file.size
         self.offset = 0  # bytes that have been passed
-        self._reader = RecordVerifier(self._descriptor, self.size)
+        self._reader = RecordVerifier(self._file, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
         self._index = read_index(self._reader, _KEPT_LIMIT)
@@ -112,7 +107,7 @@ class Salvage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        os.close(self._descriptor)
+        self._file.close()
 
     def damages(self) -> list[Damage]:
         """List the damages met so far by offset, then the messages of undefined channels."""
@@ -237,7 +232,7 @@ class Salvage:
         end = self._reader.end
         while start < end:
             size = min(_WINDOW + CHUNK_HEAD_LIMIT, end - start)
-            window = os.pread(self._descriptor, size, start)
+            window = self._file.read(start, size)
             chunks = {place for place in find_chunk_heads(window) if place < _WINDOW}
             for place in sorted(chunks.union(find_record_heads(window[: _WINDOW + 8]))):
                 try:
