@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -48,10 +48,8 @@ class Findings:
     """The findings of one file: of every rule the first few, and the number of all."""
 
     path: Path
-
-    def __post_init__(self) -> None:
-        self.shown: list[Finding] = []
-        self.counts: Counter[tuple[Level, str]] = Counter()
+    shown: list[Finding] = field(default_factory=list)
+    counts: Counter[tuple[Level, str]] = field(default_factory=Counter)  # by level and rule
 
     def error(
         self,
