@@ -102,6 +102,7 @@ class Salvage:
         self._has_chunks = False
         self._ended = False  # the data: the index follows
         self._astray = False  # perhaps inside a damaged chunk
+        self._last_index: int | None = None  # start of the last record, if it is a message index
 
     def __enter__(self) -> Self:
         return self
@@ -136,6 +137,7 @@ class Salvage:
             if whole.corrected:
                 self._damages.add(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
             self.offset = whole.end
+            self._last_index = offset if whole.record is None else None
             yield from self._take(whole)
             del whole  # before the next is read, which may be as large
 
@@ -195,6 +197,8 @@ class Salvage:
     def _pass(self, offset: int, why: str) -> int:
         """Note that no whole record begins here; return where the next one does."""
         reader, cost = self._reader, self._cost
+        if (chunk := self._chunk_in_last_index(offset)) is not None:
+            return chunk
         opcode = reader.read(offset, 1)[0]
         ends: tuple[int, ...] = ()
         with suppress(McapError):
@@ -227,14 +231,33 @@ class Salvage:
             self._damages.add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
         return end
 
-    def _search(self, start: int) -> int:
-        """Return where the next whole record begins, or where the data end."""
-        end = self._reader.end
+    def _chunk_in_last_index(self, offset: int) -> int | None:
+        """Return where a whole chunk begins in what passed for a message index before a byte.
+
+        An index has no checksum: with bytes missing, it may end inside a later chunk.
+        """
+        index, self._last_index = self._last_index, None
+        if index is None:
+            return None
+        place = self._search(index + 1, before=offset)
+        if place == offset:
+            return None
+        self._damages.add(Damage(index, place, "a message index is damaged"))
+        return place
+
+    def _search(self, start: int, *, before: int | None = None) -> int:
+        """Return where the next whole record begins, or where the data end.
+
+        `before` a byte only chunks are searched for; it is returned if there is none.
+        """
+        end = self._reader.end if before is None else before
         while start < end:
-            size = min(_WINDOW + CHUNK_HEAD_LIMIT, end - start)
+            size = min(_WINDOW + CHUNK_HEAD_LIMIT, self._reader.end - start)
             window = self._file.read(start, size)
-            chunks = {place for place in find_chunk_heads(window) if place < _WINDOW}
-            for place in sorted(chunks.union(find_record_heads(window[: _WINDOW + 8]))):
+            places = min(_WINDOW, end - start)
+            chunks = {place for place in find_chunk_heads(window) if place < places}
+            heads = find_record_heads(window[: _WINDOW + 8]) if before is None else ()
+            for place in sorted(chunks.union(heads)):
                 try:
                     self._next = self._at(start + place, searching=True, chunk=place in chunks)
                 except McapError:
