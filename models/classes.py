@@ -21,7 +21,7 @@ class SoundClass(NamedTuple):
     colour : (int, int, int)
         Red, green and blue, 0 to 255.
     seconds : float
-        Expected duration of such a sound.
+        Expected duration of such a sound without a pause.
     words : str
         What people call the sound.
     several : str
@@ -46,29 +46,29 @@ class SoundClass(NamedTuple):
 # print.
 # fmt: off
 CLASSES = (
-    SoundClass(SILENCE,          (112, 120, 130),  60.0, "Quiet"),
-    SoundClass(SPEECH,           (103, 166, 255),   5.0, "Talking"),
-    SoundClass(MUSIC,            (200, 129, 194),  60.0, "Music"),
-    SoundClass(PHONE_RING,       (246, 241,  66),   5.0, "Telephone ringing",
+    SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
+    SoundClass(SPEECH,           (103, 166, 255),  10.0, "Talking"),
+    SoundClass(MUSIC,            (200, 129, 194),  20.0, "Music"),
+    SoundClass(PHONE_RING,       (246, 241,  66),  10.0, "Telephone ringing",
                "Times the telephone rang", ("telephone_bell_ringing", "ringtone")),
-    SoundClass(COUGHING,         (210,  94,   1),   0.5, "Coughing",
+    SoundClass(COUGHING,         (210,  94,   1),   1.0, "Coughing",
                "Bouts of coughing", ("cough",)),
-    SoundClass(CRYING,           ( 11, 112, 196),   5.0, "Crying",
+    SoundClass(CRYING,           ( 11, 112, 196),  10.0, "Crying",
                "Times of crying", ("crying_sobbing", "crying_and_sobbing")),
-    SoundClass(YELLING,          (232, 160,   0),   2.0, "Shouting",
+    SoundClass(YELLING,          (232, 160,   0),  10.0, "Shouting",
                "Times of shouting", ("shout", "yell")),
-    SoundClass(LAUGHING,         (  0, 158,  82),   2.0, "Laughing",
+    SoundClass(LAUGHING,         (  0, 158,  82),  10.0, "Laughing",
                "", ("laughter",)),
-    SoundClass(OBJECTS_ACTIVITY, (141,  76,  28),   2.0, "Household sounds"),
-    SoundClass(FLUSHING_WATER,   (107,  72, 224),  15.0, "Toilet flush",
+    SoundClass(OBJECTS_ACTIVITY, (141,  76,  28),  10.0, "Household sounds"),
+    SoundClass(FLUSHING_WATER,   (107,  72, 224),  10.0, "Toilet flush",
                "Toilet flushes", ("toilet_flush",)),
-    SoundClass(SHOWER,           ( 69, 215, 144), 300.0, "Shower", "Showers"),
+    SoundClass(SHOWER,           ( 69, 215, 144),  60.0, "Shower", "Showers"),
     SoundClass(TAP_WATER,        (169, 222, 251),  10.0, "Water tap",
                "Water taps", ("water_tap", "water_tap_faucet", "water_tap_and_faucet")),
-    SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),   5.0, "Bathroom other"),
-    SoundClass(OTHER_NEGATIVE,   (195, 202, 199),   5.0, "Other negative"),
+    SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),  10.0, "Bathroom other"),
+    SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
     SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
-    SoundClass(UNKNOWN,          (255, 255, 255),   5.0, "Not sure"),
+    SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not sure"),
 )
 # fmt: on
 

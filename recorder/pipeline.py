@@ -8,13 +8,14 @@ import numpy as np
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.statistics import RollingStatistics
 from hearthlog.recorder.stream_messages import EncodedMessage
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
@@ -61,6 +62,9 @@ class Pipeline:
         self._statistics_every = statistics_every
         self._features = features.extractor()
         self._statistics = RollingStatistics(features.window_frames, features.width)
+        self._floor = None if features.band_powers is None else FloorTracker()
+        self._recent_floors: Float64 | None = None  # of the last window
+        self._recent_stamps = np.empty(0, np.int64)  # of the last window
         self._end = 0
         self._level = OK
 
@@ -110,9 +114,11 @@ class Pipeline:
         messages = [
             *self._feature_messages("features", frames, stamps, {"values": features}),
             *self._feature_messages("statistics", frames[logged], stamps[logged], statistics),
-            *self._label(features, first, stamps),
+            *self._label(features, self._track_floor(features, first), first, stamps),
         ]
         messages.sort(key=attrgetter("log_time"))
+        recent = np.concatenate([self._recent_stamps, stamps])
+        self._recent_stamps = recent[-self.feature_set.window_frames :]
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
         return messages
 
@@ -147,10 +153,15 @@ class Pipeline:
         opening : list of EncodedMessage
             First messages of the log of this model.
         """
-        closing = self._close(stamp)
+        closing, earlier = self._close(stamp), self._labeller
         self._labeller = None if classifier is None else Labeller(classifier)
-        if self._labeller is not None and self._statistics.recent is not None:
-            self._labeller.fill_window(self._statistics.recent)
+        recent, floors = self._statistics.recent, self._recent_floors
+        if self._labeller is not None and recent is not None:
+            stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
+            if floors is not None:
+                floors = floors[max(len(floors) - len(recent), 0) :]
+            unlabelled = 0 if earlier is None else frame - earlier.timing.delay
+            self._labeller.follow(recent, floors, stamps, frame, unlabelled)
         who = "no model" if model is None else f"model {model.name} ({model.sha256[:12]})"
         notice = Notice(OK, f"{who} from frame {frame} on")
         return closing, self.report("model", stamp, notice)
@@ -180,6 +191,9 @@ class Pipeline:
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         self._features.restart()
         self._statistics.restart()
+        self._recent_floors = None
+        if self._floor is not None:
+            self._floor.restart()
         data = encode(
             message(
                 message_types.GAP,
@@ -195,19 +209,32 @@ class Pipeline:
             EncodedMessage(gap.end, ROSOUT, rosout.gap_line(self.microphone, gap)),
         ]
 
-    def _label(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
+    def _track_floor(self, features: Float32, first: int) -> Floors | None:
+        """Return the floor of the room at the last of these frames, those that have one."""
+        if self._floor is None or self.feature_set.band_powers is None:
+            return None
+        floors = self._floor(self.feature_set.band_powers(features), first)
+        recent = [floors.powers]
+        if self._recent_floors is not None:
+            recent.insert(0, self._recent_floors)
+        self._recent_floors = np.concatenate(recent)[-self.feature_set.window_frames :]
+        return floors
+
+    def _label(
+        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
+    ) -> list[EncodedMessage]:
         self.last_labels = None
         if self._labeller is None:
             return []
-        labels, segments = self._labeller.push(features, first, stamps)
+        labels, segments = self._labeller.push(features, floors, first, stamps)
         if not len(labels.frames):
             return []
         self.last_labels = labels
-        self.segments_converged |= self._labeller.segmenter.segments_converged
+        self.segments_converged |= self._labeller.segments_converged
         columns = labels.columns(self.microphone)
         return [
             *self._segment_messages(segments),
-            *self._messages("label", message_types.LABEL, labels.stamps, columns),
+            *self._messages("label", message_types.LABEL, labels.known_at, columns),
         ]
 
     def _close(self, end: int) -> list[EncodedMessage]:
@@ -256,14 +283,18 @@ class Pipeline:
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         name = f"hearthlog: {self.microphone}"
-        messages = [
-            self._diagnostics(health.stamp, health.level, name, health.summary, health.values)
-        ]
+        values = {**health.values, **self._floor_value()}
+        messages = [self._diagnostics(health.stamp, health.level, name, health.summary, values)]
         if health.level != self._level:
             self._level = health.level
             line = rosout.health_line(self.microphone, health)
             messages.append(EncodedMessage(health.stamp, ROSOUT, line))
         return messages
+
+    def _floor_value(self) -> dict[str, str]:
+        if self._recent_floors is None or not len(self._recent_floors):
+            return {}
+        return {"floor_dbfs": f"{decibels(self._recent_floors[-1, -1]):.1f}"}
 
     def _diagnostics(
         self, stamp: int, level: int, name: str, text: str, values: Mapping[str, str]

@@ -23,9 +23,10 @@ def until(true):
 
 @contextmanager
 def running(command, paths=(), stderr=subprocess.DEVNULL, **options):
+    paths = [*paths, str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([*paths, str(Path(__file__).parent)]),
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
         "TERM": "xterm",
         "COLUMNS": "100",

@@ -17,8 +17,14 @@ from stores import bucket, in_memory, s3_account
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario
+from hearthlog.analyzer.training.svm_method import BANDS
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import LAG_SECONDS, default_transitions
+from hearthlog.analyzer.training.transitions import (
+    LAG_SECONDS,
+    REACH_SECONDS,
+    SHORTEST_SECONDS,
+    default_transitions,
+)
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio
@@ -116,10 +122,26 @@ def model_file(tmp_path_factory, training_set) -> Path:
 
 
 @pytest.fixture(scope="session")
+def bands_file(tmp_path_factory, training_set) -> Path:
+    """A model that takes a whole second and no floor, and labels the middle of it."""
+    scenario = load_scenario("general")
+    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, lambda *_: None)
+    path = tmp_path_factory.mktemp("bands") / "bands.safetensors"
+    save_model(train_model(data, scenario, lambda *_: None, BANDS, "merge"), path)
+    return path
+
+
+@pytest.fixture(scope="session")
 def hmm_file(tmp_path_factory, model_file) -> Path:
     """The same model, with smoothing."""
     model = load_model(model_file)
-    smoothing = Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
+    smoothing = Smoothing(
+        method="hmm",
+        lag_seconds=LAG_SECONDS,
+        weight=0.4,
+        reach_seconds=REACH_SECONDS,
+        shortest_seconds=SHORTEST_SECONDS,
+    )
     about = model.description.model_copy(update={"smoothing": smoothing})
     path = tmp_path_factory.mktemp("hmm") / "smoothed.safetensors"
     transitions = default_transitions(model.classes)

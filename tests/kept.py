@@ -46,6 +46,9 @@ def _of_bands(model: Model) -> Model:
     description = model.description.model_copy(
         update={
             "inputs": "bands",
+            "window_seconds": 1.0,
+            "label_frame": 10,
+            "gate": 0.0,
             "parameters": model.description.parameters | {"gamma": 0.5 / width},
             "smoothing": Smoothing(method="hmm", lag_seconds=0.7),
         }

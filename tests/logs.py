@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from logreader import LogReader
 
+from hearthlog.models.classifiers.timing import LabelTiming
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -28,3 +29,10 @@ def features(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         np.array([nanoseconds(m.header.stamp) for m in found], np.int64),
         np.array([m.values for m in found], np.float32).reshape(-1, len(FEATURE_NAMES)),
     )
+
+
+def labelled_frames(heard: np.ndarray, timing: LabelTiming) -> np.ndarray:
+    """Numbers of the frames that get a label where these frames were heard."""
+    runs = np.split(heard, np.flatnonzero(np.diff(heard) != 1) + 1)
+    ends = [np.arange(timing.first_window_end(int(run[0])), int(run[-1]) + 1) for run in runs]
+    return np.concatenate(ends) - timing.delay

@@ -2,6 +2,7 @@
 
 import multiprocessing
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from threading import Event as Flag
 
@@ -14,6 +15,7 @@ from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
@@ -89,7 +91,7 @@ def write_real_day(household: Path, folder: Path) -> Path:
     learnt = [clip for name in CLASSES for clip in _spread(clips[name], _CLIPS)]
     data = build_dataset(learnt, scenario, lambda *_: None)
     model = folder / "home.safetensors"
-    save_model(train_model(data, scenario, lambda *_: None, PAPER), model)
+    save_model(_surer(train_model(data, scenario, lambda *_: None, PAPER)), model)
     pieces = {name: _write_piece(folder / f"{name}.wav", clips[name]) for name in CLASSES}
     halves = [
         (folder, model, [pieces[name] for name in names], half)
@@ -98,6 +100,17 @@ def write_real_day(household: Path, folder: Path) -> Path:
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         pool.starmap(_record, halves)
     return folder / "logs"
+
+
+def _surer(model: Model) -> Model:
+    """Make a model sure of itself, so that one class fills a picture of probabilities."""
+    description = model.description
+    smoothing = description.smoothing
+    surer = {
+        "inverse_temperature": 4.0 * description.inverse_temperature,
+        "smoothing": smoothing.model_copy(update={"weight": smoothing.weight / 4.0}),
+    }
+    return replace(model, description=description.model_copy(update=surer))
 
 
 def _halves() -> tuple[list[str], list[str]]:

@@ -11,19 +11,23 @@ from blobs import blobs
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation_curve
 from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
+from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.dataset import Recording, cut_recordings
 from hearthlog.analyzer.training.home_data import home_recordings, home_sequences
-from hearthlog.analyzer.training.method import inverse_temperature, prepare, softmax
-from hearthlog.analyzer.training.scenario import BUILTIN, Scenario
-from hearthlog.analyzer.training.svm_method import BANDS
+from hearthlog.analyzer.training.method import prepare, softmax
+from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
+from hearthlog.analyzer.training.svm_method import BANDS, ROOM21
 from hearthlog.analyzer.training.train import adapt_model, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.auros21.inputs import bands_of
+from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.logs.columns import read_columns
@@ -40,8 +44,10 @@ def split(data, kept):
 
 
 def rows(data, chosen):
-    names = ("windows", "target", "group", "collection", "weight")
-    return dataclasses.replace(data, **{name: getattr(data, name)[chosen] for name in names})
+    names = ("windows", "target", "group", "collection", "weight", "floor")
+    changed = {name: getattr(data, name)[chosen] for name in names}
+    copies = {name: getattr(data, name)[:, chosen] for name in ("copies", "copy_floor")}
+    return dataclasses.replace(data, **changed, **copies)
 
 
 def moved(data, amount):
@@ -61,9 +67,13 @@ def world():
 
 
 def accuracy(model, data):
+    return (predicted(model, data.windows, data.floor) == data.target).mean()
+
+
+def predicted(model, segments, floor):
     classifier = Classifier(model)
-    inputs = classifier.inputs.of_windows(data.windows)
-    return (classifier.probabilities(inputs).argmax(axis=1) == data.target).mean()
+    inputs = of_segments(classifier.inputs, segments, floor)
+    return segment_probabilities(classifier, inputs).argmax(axis=1)
 
 
 def test_a_model_that_was_adapted_knows_the_home_better(world):
@@ -84,8 +94,18 @@ def test_adapting_to_the_same_home_gives_the_same_file(world, tmp_path):
     assert a.sha256 == b.sha256
 
 
-def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world):
+def of_method(base, method):
+    """Learn a model anew from what it has kept, by another method."""
+    data, scenario = blobs(4, 60, spread=0.6)
+    learned, _ = split(data, data.group[data.group % 6 < 4])
+    assert len(learned) == len(base.training_windows)
+    return train_model(learned, scenario, ignore_progress, method)
+
+
+@pytest.mark.parametrize("method", [BANDS, ROOM21])
+def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world, method):
     base, few, _ = world
+    base = of_method(base, method)
     once = adapt_model(base, few)
     twice = adapt_model(once, few)
     for name, array in once.arrays.items():
@@ -95,17 +115,25 @@ def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world)
 def test_a_class_the_home_has_not_is_not_forgotten(world):
     base, few, _ = world
     three = rows(few, few.target != 2)
-    windows = base.training_windows[base.training_target == 2]
-    inputs = DEFAULT.inputs["bands"].of_windows(windows)
-    predicted = Classifier(adapt_model(base, three)).probabilities(inputs).argmax(axis=1)
-    assert (predicted == 2).mean() > 0.9
+    own = base.training_target == 2
+    windows, floor = base.training_windows[own], base.training_floor[own]
+    assert (predicted(adapt_model(base, three), windows, floor) == 2).mean() > 0.9
 
 
 def test_a_model_without_what_it_learned_from_is_refused(world):
     base, few, _ = world
+    base = of_method(base, BANDS)
     bare = dataclasses.replace(base, name="bare", training_windows=base.training_windows[:0])
     with pytest.raises(DataError, match="bare: has not kept what it learned from"):
         adapt_model(bare, few)
+
+
+def test_the_support_vectors_of_a_model_with_copies_in_other_rooms_are_enough(world):
+    base, few, _ = world
+    bare = dataclasses.replace(base, name="bare", training_windows=base.training_windows[:0])
+    whole, again = adapt_model(base, few), adapt_model(bare, few)
+    for name, array in whole.arrays.items():
+        np.testing.assert_array_equal(array, again.arrays[name])
 
 
 def test_a_home_without_segments_is_refused(world):
@@ -117,17 +145,13 @@ def test_a_home_without_segments_is_refused(world):
 def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
     base, few, rest = world
     adapted = adapt_model(base, few)
-    joined = dataclasses.replace(
-        few,
-        windows=np.concatenate([base.training_windows, few.windows]),
-        target=np.concatenate([base.training_target, few.target]),
-        weight=np.concatenate([np.ones(len(base.training_target)), few.weight]),
-    )
-    home = np.arange(len(joined) - len(few), len(joined))
-    learned = BANDS.fit(prepare(BANDS, joined), home=home)
-    inputs = DEFAULT.inputs["bands"].of_windows(rest.windows)
+    remembered, target = ROOM21.remembered(base)
+    examples = prepare(ROOM21, few)._replace(more_inputs=remembered, more_target=target)
+    learned = ROOM21.fit(examples, home=np.arange(len(few)))
+    inputs = of_segments(DEFAULT.inputs[ROOM21.inputs], rest.windows, rest.floor)
+    inputs = inputs.reshape(-1, inputs.shape[-1])
     decision = learned.decide(inputs, 4)
-    expected = softmax(base.description.inverse_temperature * decision)
+    expected = softmax(adapted.description.inverse_temperature * decision)
     ours = Classifier(adapted).probabilities(inputs)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
 
@@ -158,6 +182,11 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     np.testing.assert_array_equal(found[0].features, heard["values"][100:160])
     np.testing.assert_array_equal(found[1].features, heard["values"][293:313])  # a whole second
     assert found[0].group == found[1].group
+    floors = FloorTracker()(DEFAULT.band_powers(heard["values"]), int(heard["frame"][0])).powers
+    behind = len(floors) - len(stamps)  # from the end of the mark on, as the recorder tracked it
+    np.testing.assert_array_equal(found[0].floor, floors[behind + 159])
+    np.testing.assert_array_equal(found[1].floor, floors[behind + 312])
+    assert found[0].floor.all()
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
     assert data.weight.min() == 5.0
 
@@ -235,18 +264,19 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     try:
         output = tmp_path / "home.safetensors"
         done = hearthlog("train", "--base", model_file, "--home", recorded, "-o", output, "--json")
+        marked = list(home_recordings(recorded))
     finally:
         layer.unlink()
     assert done.returncode == 0, done.stderr
     about = json.loads(done.stdout)["training_data"]["home"]
     assert about["speech"]["seconds"] == pytest.approx(6.0, abs=0.1)
     assert about["silence"]["seconds"] == pytest.approx(4.0, abs=0.1)
-    adapted = load_model(output)
-    assert adapted.classes == load_model(model_file).classes
-    assert (
-        len(adapted.arrays["home_vectors"])
-        == about["speech"]["segments"] + about["silence"]["segments"]
-    )
+    adapted, base = load_model(output), load_model(model_file)
+    assert adapted.classes == base.classes
+    home = cut_recordings(marked, scenario_of(base))
+    assert len(home) == about["speech"]["segments"] + about["silence"]["segments"]
+    loud_enough = prepare(ROOM21, home).usable[0]  # three windows of each segment
+    assert len(home) < loud_enough.sum() == len(adapted.arrays["home_vectors"])
 
 
 def test_augmented_sound_is_what_the_other_microphone_would_give():

@@ -11,7 +11,11 @@ from hypothesis import strategies as st
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.report.class_words import in_words, several_in_words
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
-from hearthlog.analyzer.training.transitions import default_transitions, expected_durations
+from hearthlog.analyzer.training.transitions import (
+    default_transitions,
+    expected_durations,
+    transitions_from_durations,
+)
 from hearthlog.models.classes import (
     CLASSES,
     class_name,
@@ -19,8 +23,10 @@ from hearthlog.models.classes import (
     meant_by,
     translation,
 )
+from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.schemas.frames import FRAME_SECONDS
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"
@@ -38,6 +44,7 @@ AUDIOSET = {
     "Toilet flush": "flushing_water",
     "Water tap, faucet": "tap_water",
 }
+DURATIONS_OF_0_1_0 = {"silence": 60.0, "speech": 5.0, "coughing": 0.5, "phone_ring": 5.0}
 ALIASES = [(alias, row.name) for row in CLASSES for alias in row.aliases]
 OWN = st.from_regex(CLASS_NAME, fullmatch=True)
 
@@ -53,11 +60,11 @@ def test_every_label_has_a_colour_of_its_own_a_duration_and_words(label):
     assert CLASS_NAME.fullmatch(label)
 
 
-def test_how_long_a_sound_is_expected_to_go_on_stays_as_models_have_learned_it():
-    seconds = {"coughing": 0.5, "yelling": 2, "laughing": 2, "objects_activity": 2}
-    seconds |= dict.fromkeys(("speech", "phone_ring", "crying", "bathroom_other", "unknown"), 5)
-    seconds |= {"other": 10, "tap_water": 10, "flushing_water": 15}
-    seconds |= {"silence": 60, "music": 60, "shower": 300, "other_negative": 5}
+def test_how_long_a_sound_is_expected_to_go_on_without_a_pause():
+    seconds = {"silence": 2.5, "coughing": 1, "music": 20, "shower": 60}
+    others = ("speech", "phone_ring", "crying", "yelling", "laughing", "objects_activity")
+    others += ("flushing_water", "tap_water", "bathroom_other", "other_negative", "other")
+    seconds |= dict.fromkeys((*others, "unknown"), 10)
     assert {row.name: row.seconds for row in CLASSES} == seconds
 
 
@@ -106,7 +113,18 @@ def test_a_model_of_aliases_is_smoothed_as_one_of_our_names():
 
 def test_transitions_are_bit_for_bit_those_of_a_model_of_0_1_0():
     model = load_model(OF_0_1_0)
-    np.testing.assert_array_equal(default_transitions(model.classes), model.transitions)
+    seconds = np.array([DURATIONS_OF_0_1_0[name] for name in model.classes])
+    transitions = transitions_from_durations(seconds, FRAME_SECONDS)
+    np.testing.assert_array_equal(transitions, model.transitions)
+
+
+def test_a_model_of_0_1_0_keeps_the_durations_that_it_has_learned():
+    model = load_model(OF_0_1_0)
+    expected = 0.05 / (1 - model.transitions.diagonal())
+    seconds = [DURATIONS_OF_0_1_0[name] for name in model.classes]
+    np.testing.assert_allclose(expected, seconds)
+    assert Classifier(model).transitions is model.transitions
+    assert not np.array_equal(default_transitions(model.classes), model.transitions)
 
 
 @given(OWN)
@@ -115,7 +133,7 @@ def test_a_class_of_ones_own_keeps_its_name_and_has_words_and_a_bright_colour_ma
     assert class_name(name) == name
     assert in_words(name) == several_in_words(name) == name.replace("_", " ").capitalize()
     assert all(70 <= part <= 255 for part in colour(name))
-    assert expected_durations([name]).tolist() == [5.0]
+    assert expected_durations([name]).tolist() == [10.0]
 
 
 def test_the_colour_of_a_class_of_ones_own_never_changes():

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -122,8 +123,30 @@ def test_a_class_without_support_vectors_is_no_obstacle():
     assert np.isfinite(result).all()
 
 
-def test_novelty_is_what_the_nearest_support_vector_leaves():
+def of_older_format(model):
+    """Return a model whose novelty is that of formats 2 and 3."""
+    return replace(model, description=model.description.model_copy(update={"novelty": "machine"}))
+
+
+def test_novelty_is_how_likely_the_label_is_wrong():
+    rows = unseen(3)
+    probabilities, novelty = Classifier(trained(3)).classify(rows)
+    np.testing.assert_array_equal(novelty, 1 - probabilities.max(axis=1))
+    np.testing.assert_array_equal(probabilities, Classifier(trained(3)).probabilities(rows))
+
+
+def test_what_is_unknown_is_novel_however_sure_that_is():
     model, rows = trained(3), unseen(3)
+    names = ["class_0", "class_1", "unknown"]
+    scenario = {name: [] for name in names}
+    renamed = model.description.model_copy(update={"classes": names, "scenario": scenario})
+    probabilities, novelty = Classifier(replace(model, description=renamed)).classify(rows)
+    np.testing.assert_array_equal(novelty, 1 - probabilities[:, :2].max(axis=1))
+    assert novelty[probabilities[:, 2] > 0.9].min() > 0.9
+
+
+def test_novelty_of_older_models_is_what_the_nearest_support_vector_leaves():
+    model, rows = of_older_format(trained(3)), unseen(3)
     about = model.description
     here, there = (
         (x.astype(np.float64) - model.arrays["scaler_mean"]) / model.arrays["scaler_scale"]
@@ -131,14 +154,13 @@ def test_novelty_is_what_the_nearest_support_vector_leaves():
     )
     nearest = rbf_kernel(here, there, gamma=about.parameters["gamma"]).max(axis=1)
 
-    probabilities, novelty = Classifier(model).classify(rows)
+    _, novelty = Classifier(model).classify(rows)
 
     np.testing.assert_allclose(novelty, 1 - nearest, atol=1e-6)
-    np.testing.assert_array_equal(probabilities, Classifier(model).probabilities(rows))
 
 
-def test_what_was_learned_is_not_novel_and_what_is_far_from_it_is():
-    model = trained(3)
+def test_to_older_models_what_was_learned_is_not_novel_and_what_is_far_from_it_is():
+    model = of_older_format(trained(3))
     _, of_learned = Classifier(model).classify(model.arrays["support_vectors"])
     _, of_far = Classifier(model).classify(model.arrays["support_vectors"] * 100)
     assert of_learned.max() < 1e-6

@@ -38,8 +38,8 @@ def test_info_tells_span_topics_rates_labels_and_model(logs, hearthlog, model_fi
     assert found["seconds"] == pytest.approx(180, abs=0.1)
     assert found["topics"]["/hall/features"]["messages"] == 3600
     assert found["topics"]["/hall/features"]["rate_hz"] == pytest.approx(20)
-    assert found["topics"]["/hall/label"]["messages"] == 3581
-    assert sum(found["labels"]["hall"].values()) == pytest.approx(3581 * 0.05 / 60, abs=1e-3)
+    assert found["topics"]["/hall/label"]["messages"] == 3586
+    assert sum(found["labels"]["hall"].values()) == pytest.approx(3586 * 0.05 / 60, abs=1e-3)
     (stream,) = found["streams"]
     assert stream["model"] == model_file.stem
     assert len(stream["model_sha256"]) == 64

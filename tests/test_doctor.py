@@ -38,6 +38,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.analyzer.doctor import examine
+from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
@@ -50,6 +51,7 @@ from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.formats import MAGIC
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.times import NANOSECONDS
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
@@ -209,6 +211,18 @@ def shift(topic, number, shift):
     return edit
 
 
+def label_stamp(shift):
+    """Give a label another stamp, but leave its log time."""
+
+    def edit(log):
+        message = log.messages(LABEL)[40]
+        content = message_types.decode(message.data, message_types.LABEL)
+        time = message_types.nanoseconds(content.header.stamp) + shift
+        log.change(message, header__stamp=stamp(time))
+
+    return edit
+
+
 def late_from(topics, number, shift):
     """Give all messages of some frames on another time."""
 
@@ -356,15 +370,20 @@ def segment_too_early(log):
     log.change(segment, header__stamp=stamp(start), duration=stamp(5 * 60 * NANOSECONDS))
 
 
+def end_of(segment):
+    content = message_types.decode(segment.data, message_types.SEGMENT)
+    begin = message_types.nanoseconds(content.header.stamp)
+    return begin + message_types.nanoseconds(content.duration)
+
+
 def segment_without_duration(log):
     segment = log.messages(SEGMENT)[3]
-    log.change(segment, header__stamp=stamp(segment.log_time), duration=stamp(0))
+    log.change(segment, header__stamp=stamp(end_of(segment)), duration=stamp(0))
 
 
 def segment_too_late(log):
     segment = log.messages(SEGMENT)[3]
-    start = segment.log_time - 1
-    log.change(segment, header__stamp=stamp(start), duration=stamp(1))
+    log.change(segment, header__stamp=stamp(end_of(segment) - 1), duration=stamp(1))
 
 
 def features_of_nothing(log):
@@ -545,6 +564,10 @@ DATA = {
         {"frame-stamp", "log-time"},
     ),
     "a label missing": (drop(LABEL), {"label-frames"}),
+    "a label by the stamp of another moment": (label_stamp(1), {"frame-stamp"}),
+    "a label by the stamp of another frame": (label_stamp(FRAME_NANOSECONDS), {"frame-stamp"}),
+    "a label of what is not over": (label_stamp(NANOSECONDS), {"frame-stamp", "stamp"}),
+    "a label that is known too late": (label_stamp(-NANOSECONDS), {"frame-stamp", "stamp"}),
     "a label of another width": (change(LABEL, probabilities=np.ones(1, np.float32)), {"width"}),
     "a label of no class": (change(LABEL, label="murder"), {"class"}),
     "a confidence that is another's": (change(LABEL, confidence=0.123), {"confidence"}),
@@ -1148,7 +1171,7 @@ def test_a_log_whose_frames_do_not_continue_is_found(folder):
             data = bytearray(message.data)
             assert data[16:20] == b"mic\0"  # behind it, aligned, is the frame
             (frame,) = struct.unpack_from("<Q", data, 20)
-            struct.pack_into("<Q", data, 20, frame + 100)
+            struct.pack_into("<Q", data, 20, frame + 13 * BLOCK_FRAMES)
             message.data = bytes(data)
     log.write(path)
     assert errors(folder) == {"frames-continue"}

@@ -453,14 +453,12 @@ def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
         assert said in result.stderr
 
 
-@pytest.mark.parametrize("method", ["merge", "hmm"])
-def test_clips_are_labelled_as_the_recorder_labels_them(
-    method, day, model_file, tmp_path, hearthlog
-):
+def clip_and_log(model_file, day, tmp_path, hearthlog, *smoothing):
+    """Evaluate a model on a day as a clip, and as a recorder that starts with it labels it."""
     model = load_model(model_file)
-    smoothing = Smoothing(method=method, lag_seconds=3.0)
-    transitions = default_transitions(model.classes) if method == "hmm" else np.empty((0, 0))
-    about = model.description.model_copy(update={"smoothing": smoothing})
+    about = model.description.model_copy(update=dict(smoothing))
+    hidden = about.smoothing.method == "hmm"
+    transitions = default_transitions(model.classes) if hidden else np.empty((0, 0))
     model_file = tmp_path / "model.safetensors"
     save_model(replace(model, description=about, transitions=transitions), model_file)
     (tmp_path / "day.flac").write_bytes(day.read_bytes())
@@ -475,11 +473,28 @@ def test_clips_are_labelled_as_the_recorder_labels_them(
     track = tmp_path / "labels.txt"
     track.write_text("0\t180\tspeech\n")
     result = hearthlog("evaluate", "log", logs, "--reference", track, "--json")
-    of_log = json.loads(result.stdout)
-    assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.05
+    return of_clip, json.loads(result.stdout)
+
+
+@pytest.mark.parametrize("method", ["merge", "hmm"])
+def test_clips_are_labelled_as_the_recorder_labels_them(
+    method, day, bands_file, tmp_path, hearthlog
+):
+    smoothing = Smoothing(method=method, lag_seconds=3.0, reach_seconds=0.6, shortest_seconds=0.25)
+    asked = ("smoothing", smoothing)
+    of_clip, of_log = clip_and_log(bands_file, day, tmp_path, hearthlog, asked)
+    assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.5
     for figure in ("segment_based", "event_based", "false_alarms_per_day"):
         assert of_log[figure] == of_clip[figure]
     assert of_clip["macro_f1_interval"] is None
+
+
+def test_a_clip_was_cut_out_of_its_room_and_a_recorder_has_to_hear_the_room_first(
+    day, model_file, tmp_path, hearthlog
+):
+    of_clip, of_log = clip_and_log(model_file, day, tmp_path, hearthlog)
+    assert of_clip["evaluated_seconds"] == 179.8  # from the middle of the first window on
+    assert of_log["evaluated_seconds"] == 179.45  # the same after a block for the floor
 
 
 def test_a_model_says_that_it_is_scored_on_what_it_learned_from(tmp_path, hearthlog):

@@ -1,5 +1,6 @@
 import hashlib
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
+from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.description import read_description
+from hearthlog.models.classifiers.timing import LabelTiming, label_timing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -32,6 +38,15 @@ ARRAYS = (
 @cache
 def model():
     return train_model(*blobs(3, 12), ignore_progress)
+
+
+@cache
+def gated():
+    """A model that knows silence, and thus has a gate and may have floors."""
+    data, _ = blobs(2, 12)
+    names = ("silence", "speech")
+    data = replace(data, classes=names, seconds=dict.fromkeys(names, 12.0))
+    return train_model(data, Scenario("blobs", {n: (n,) for n in names}), ignore_progress)
 
 
 @cache
@@ -110,6 +125,30 @@ def test_a_file_that_exists_is_never_overwritten(tmp_path):
 def test_a_name_that_cannot_be_a_model_is_refused(tmp_path, name):
     with pytest.raises(ModelError):
         save_model(model(), tmp_path / name)
+
+
+def test_a_model_without_silence_has_no_gate_and_one_with_it_has_that_of_its_method(tmp_path):
+    assert (model().description.gate, gated().description.gate) == (0.0, ROOM.gate)
+    save_model(gated(), tmp_path / "a.safetensors")
+    loaded = load_model(tmp_path / "a.safetensors")
+    assert Classifier(loaded).gate == ROOM.gate > 0
+
+
+@pytest.mark.parametrize(
+    ("made", "changed", "complaint"),
+    [
+        (model, {"gate": 2.0}, "has a gate, but no class silence"),
+        (model, {"label_frame": 8}, "label_frame: a window has 8 frames"),
+        (gated, {"label_frame": 20}, "label_frame: a window has 8 frames"),
+    ],
+)
+def test_what_a_model_says_of_its_labels_must_fit_its_windows_and_classes(
+    tmp_path, made, changed, complaint
+):
+    bad = replace(made(), description=made().description.model_copy(update=changed))
+    with pytest.raises(ModelError, match=complaint):
+        save_model(bad, tmp_path / "a.safetensors")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_inconsistent_model_is_not_saved(tmp_path):
@@ -259,8 +298,17 @@ def test_an_array_too_many_is_refused(tmp_path):
     ("key", "value", "reason"),
     [
         ("format", 1, "format"),
-        ("format", 4, "format 4, newer"),
+        ("format", 5, "format 5, newer"),
         ("format", "1", "format"),
+        ("format", [3], "format"),
+        ("label_frame", 8, "label_frame"),
+        ("label_frame", -1, "label_frame"),
+        ("gate", 41.0, "gate"),
+        ("gate", 2.0, "gate"),
+        ("novelty", "magic", "novelty"),
+        ("decision_bias", {"class_0": 1e999}, "decision_bias"),
+        ("elsewhere", {}, "elsewhere"),
+        ("window_seconds", 1e999, "window_seconds"),
         ("kind", "pickle", "kind"),
         ("feature_set", "auros63", "feature set"),
         ("feature_names", ["energy"], "features"),
@@ -283,6 +331,9 @@ def test_an_array_too_many_is_refused(tmp_path):
         ("inverse_temperature", 1e999, "inverse_temperature"),
         ("calibration", "sigmoid", "calibration"),
         ("smoothing", {"method": "magic"}, "smoothing"),
+        ("smoothing", {"method": "hmm", "weight": 0.0}, "smoothing.weight"),
+        ("smoothing", {"method": "hmm", "reach_seconds": 6.0}, "smoothing.reach_seconds"),
+        ("smoothing", {"method": "hmm", "shortest_seconds": -1.0}, "smoothing.shortest_seconds"),
         ("metrics", {}, "metrics"),
         ("scenario", {}, "scenario"),
         ("unknown", 1, "unknown"),
@@ -297,6 +348,40 @@ def test_nothing_of_the_description_may_be_missing(tmp_path, key):
     about = description()
     del about[key]
     assert key in refusal(tmp_path, content(about))
+
+
+def older(number, **changed):
+    """The description of a model as an older version wrote it."""
+    about = description()
+    for key in ("label_frame", "gate", "decision_bias", "novelty", "elsewhere"):
+        del about[key]
+    about["inputs"], about["window_seconds"] = "statistics", 1.0
+    about["smoothing"] = {"method": "merge", "lag_seconds": 0.0}
+    about["format"] = number
+    if number == 2:
+        about |= about.pop("parameters")
+        del about["feature_set_version"], about["method"]
+    return json.dumps(about | changed)
+
+
+@pytest.mark.parametrize("number", [2, 3])
+@pytest.mark.parametrize("seconds", [1.0, 1])
+def test_a_label_of_an_older_model_speaks_of_the_last_frame_of_its_second(number, seconds):
+    about = read_description(older(number, window_seconds=seconds))
+    assert (about.format, about.label_frame, about.gate) == (4, 19, 0.0)
+    assert label_timing(about) == LabelTiming(20, 19, needs_floor=False)
+    assert label_timing(about).delay == 0
+    assert (about.novelty, about.decision_bias, about.elsewhere) == ("machine", {}, None)
+    smoothing = about.smoothing
+    assert (smoothing.weight, smoothing.reach_seconds, smoothing.shortest_seconds) == (1, 0, 0)
+
+
+@pytest.mark.parametrize("number", [2, 3])
+@pytest.mark.parametrize("seconds", ["1e999", "NaN", "-1.0", "0", "null", "[]", '"1"', "1e300"])
+def test_an_older_description_with_a_window_of_no_length_is_refused(number, seconds):
+    text = older(number, window_seconds=0.125).replace("0.125", seconds)
+    with pytest.raises(ModelError, match="window_seconds"):
+        read_description(text)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder import rosout
@@ -13,6 +14,8 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream_messages import opening_messages
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import (
+    DIAGNOSTICS,
+    LABEL,
     LOG,
     SEGMENT,
     STREAM_INFO,
@@ -65,7 +68,10 @@ def test_blocks_of_any_size_give_the_same_records(frames, model_file, size):
     assert in_blocks(frames, size, model_file) == whole
 
 
-def test_every_segment_is_a_line_that_follows_it_at_its_end(frames, model_file):
+def test_every_segment_is_a_line_that_follows_it_when_its_end_is_known(frames, model_file):
+    delay = label_timing(load_model(model_file).description).delay * FRAME_NANOSECONDS
+    assert delay > 0
+    sounds_end = [START + n * FRAME_NANOSECONDS for n in (len(frames) // 2, len(frames) + LOST)]
     records = in_blocks(frames, 100, model_file)
     places = [i for i, record in enumerate(records) if record.topic == "/mic/segment"]
     assert len(places) > 5
@@ -73,7 +79,8 @@ def test_every_segment_is_a_line_that_follows_it_at_its_end(frames, model_file):
         segment = decode(records[place].data, SEGMENT)
         ((time, line),) = said([records[place + 1]])
         end = nanoseconds(segment.header.stamp) + nanoseconds(segment.duration)
-        assert time == nanoseconds(line.stamp) == end
+        over = min(sound_end for sound_end in sounds_end if sound_end >= end)
+        assert time == records[place].log_time == nanoseconds(line.stamp) == min(end + delay, over)
         seconds, share = nanoseconds(segment.duration) / 1e9, 100 * segment.confidence
         assert line.msg == f"{segment.label} for {seconds:.2f} s ({share:.0f} %)"
         assert (line.level, line.name) == (line.INFO, "hearthlog.mic")
@@ -130,3 +137,78 @@ def test_the_clock_that_was_set_back_is_a_gap_of_less_than_nothing():
     gap = Gap(START, START - 3 * 10**9, "the clock was set by -3.000 s", 0)
     line = decode(rosout.gap_line("mic", gap), LOG)
     assert line.msg == "gap of -3.00 s: the clock was set by -3.000 s"
+
+
+@pytest.mark.parametrize("size", [1, 7, 300])
+@pytest.mark.parametrize(
+    ("names", "begin", "end"),
+    [
+        (("room", "room"), 600 - 3, 600 - 3),
+        (("room", "bands"), 600 - 3, 600 - 3),  # it could speak of earlier ones, too
+        (("bands", "room"), 600 - 3, 600 - 9),  # and it cannot of six of them
+        (("bands", "bands"), 600 - 9, 600 - 9),
+        ((None, "room"), 600 - 3, None),
+        (("room", None), None, 600 - 3),
+    ],
+)
+def test_a_model_that_takes_over_speaks_of_what_the_other_one_has_not(  # noqa: PLR0913, PLR0917
+    frames, model_file, bands_file, names, begin, end, size
+):
+    models = {"room": load_model(model_file), "bands": load_model(bands_file), None: None}
+    classifiers = {name: model and Classifier(model) for name, model in models.items()}
+    pipeline = Pipeline("mic", DEFAULT, classifiers[names[0]])
+    stamps = START + np.arange(1200) * FRAME_NANOSECONDS
+
+    def push(first, last):
+        return [
+            record
+            for place in range(first, last, size)
+            for block in [slice(place, min(place + size, last))]
+            for record in pipeline.push(Frames(place, frames[block], stamps[block]))
+        ]
+
+    before = push(0, 600)
+    closing, _ = pipeline.change_model(models[names[1]], classifiers[names[1]], 600, stamps[600])
+    after = push(600, 1200) + pipeline.finish()
+    labels = [
+        [(r.log_time, decode(r.data, LABEL)) for r in records if r.topic == "/mic/label"]
+        for records in (before, after)
+    ]
+    numbers = [[label.frame for _, label in found] for found in labels]
+    if end is not None:
+        assert numbers[0] == list(range(numbers[0][0], end))
+    if begin is not None:
+        delay = classifiers[names[1]].timing.delay
+        assert numbers[1] == list(range(begin, 1200 - delay))
+    for _, label in labels[0] + labels[1]:
+        assert nanoseconds(label.header.stamp) == stamps[label.frame]
+    assert all(time >= stamps[600] for time, _ in labels[1])
+    segments = [
+        [decode(r.data, SEGMENT) for r in records if r.topic == "/mic/segment"]
+        for records in (before + closing, after)
+    ]
+    if names[0]:
+        last = segments[0][-1]
+        assert nanoseconds(last.header.stamp) + nanoseconds(last.duration) == stamps[600]
+    if names[1]:
+        assert nanoseconds(segments[1][0].header.stamp) == stamps[600]
+
+
+def test_diagnostics_say_how_quiet_the_room_is():
+    rng = np.random.default_rng(0)
+    sound = (10 ** (-50 / 20) * rng.standard_normal((200, FRAME_SAMPLES))).astype(np.float32)
+    pipeline = Pipeline("mic", DEFAULT)
+    stamps = START + np.arange(400) * FRAME_NANOSECONDS
+
+    def floor(stamp):
+        (record,) = pipeline.push(SourceHealth(int(stamp), 0, "listening"))
+        (status,) = decode(record.data, DIAGNOSTICS).status
+        return {pair.key: pair.value for pair in status.values}.get("floor_dbfs")
+
+    assert floor(stamps[0]) is None
+    pipeline.push(Frames(0, sound[:7], stamps[:7]))
+    assert floor(stamps[7]) is None  # no block is complete
+    pipeline.push(Frames(7, sound[7:], stamps[7:200]))
+    assert float(floor(stamps[200])) == pytest.approx(-50, abs=0.5)
+    pipeline.push(Gap(int(stamps[200]), int(stamps[201]), "test", 1))
+    assert floor(stamps[201]) is None

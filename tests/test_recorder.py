@@ -24,7 +24,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.messages.message_types import LABEL, decode, nanoseconds
 
 pytestmark = pytest.mark.fast
 
@@ -52,7 +52,7 @@ def recorded(hearthlog, tmp_path):
     return run
 
 
-def test_a_file_gives_features_and_statistics_at_every_frame_and_labels_after_a_second(
+def test_a_file_gives_features_and_statistics_at_every_frame_and_labels_where_there_is_a_window(
     day, model_file, recorded
 ):
     logs = recorded(day, "--model", model_file, "--start", "2026-03-01T07:00:00")
@@ -62,7 +62,11 @@ def test_a_file_gives_features_and_statistics_at_every_frame_and_labels_after_a_
     np.testing.assert_array_equal(frames, np.arange(len(values)))
     np.testing.assert_array_equal(stamps, START + frames * FRAME_NANOSECONDS)
     assert [m.frame for m in read(logs, "statistics")] == frames.tolist()
-    assert [m.frame for m in read(logs, "label")] == frames[19:].tolist()
+    labels = list(LogReader(next(logs.rglob("*.mcap"))).messages(["/mic/label"]))
+    said = [item.decode() for item in labels]
+    assert [m.frame for m in said] == frames[7 + 7 - 3 : -3].tolist()
+    assert [nanoseconds(m.header.stamp) for m in said] == stamps[11:-3].tolist()
+    assert [item.log_time for item in labels] == stamps[14:].tolist()
 
 
 def test_a_label_is_the_class_of_the_highest_probability(day, model_file, recorded):
@@ -86,7 +90,8 @@ def test_segments_are_the_successive_equal_labels(day, model_file, recorded):
     assert [s.label for s in segments] == [run[0].label for run in runs]
     for segment, run in zip(segments, runs, strict=True):
         assert nanoseconds(segment.header.stamp) == nanoseconds(run[0].header.stamp)
-        assert nanoseconds(segment.duration) == len(run) * FRAME_NANOSECONDS
+        behind = 3 if run is runs[-1] else 0  # the last frames, which are too late for a window
+        assert nanoseconds(segment.duration) == (len(run) + behind) * FRAME_NANOSECONDS
         assert segment.confidence == pytest.approx(np.mean([m.confidence for m in run]), rel=1e-6)
 
 
@@ -163,7 +168,7 @@ def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model
         assert [record.data for record in again if record.topic == topic] == recorded_bytes
 
 
-def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_second(model_file):
+def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_floor_and_a_window(model_file):
     pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
     frames = as_frames(noise(2))
     stamps = START + np.arange(40) * FRAME_NANOSECONDS
@@ -176,7 +181,11 @@ def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_second(model_fi
     assert [record.topic for record in closing] == topics
     assert [record.log_time for record in closing] == [gap.start] * 2 + [gap.end] * 2
     labels = [[r for r in records if r.topic == "/mic/label"] for records in (before, after)]
-    assert [len(found) for found in labels] == [21, 21]
+    frames = [[decode(r.data, LABEL).frame for r in found] for found in labels]
+    # Blocks end with frames 7 and 55, the first windows behind them with 14 and 62.
+    assert frames == [[*range(14 - 3, 40 - 3)], [*range(62 - 3, 87 - 3)]]
+    known_at = [START + frame * FRAME_NANOSECONDS for frame in (14, 62)]
+    assert [found[0].log_time for found in labels] == known_at
     statistics = [[r.data[20:] for r in x if r.topic == "/mic/statistics"] for x in (before, after)]
     payload = [[data[12:] for data in found] for found in statistics]
     assert payload[0] == payload[1]

@@ -16,7 +16,7 @@ import soundfile
 from blobs import with_arrays
 from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
-from logs import features
+from logs import features, labelled_frames
 from lossy import LossySource
 from spliced import run, small_disk
 from stores import put
@@ -26,6 +26,7 @@ from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.relabel.layer import log_digest, read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
+from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
@@ -308,15 +309,15 @@ def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capf
     (tmp_path / "saved").mkdir()
     recover_log(log, tmp_path / "saved" / log.name, log.name)
     heard = np.concatenate([features(recorded_logs(logs)[0])[0], features(tmp_path / "saved")[0]])
-    whole = heard[19:][heard[19:] - heard[:-19] == 19]  # of frames with a second behind them
-    frames = labelled_frames(log, model)
+    whole = labelled_frames(heard, label_timing(load_model(model).description))
+    frames = frames_of_layer(log, model)
     assert frames.tolist() == whole[-len(frames) :].tolist()
     assert 200 < len(frames) < 1200 - 19
     again = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
     assert again.returncode == 3
 
 
-def labelled_frames(log, model):
+def frames_of_layer(log, model):
     name = load_model(model).name
     columns = read_columns([relabel_path(log, name)])[f"/mic/relabel/{name}/label"]
     return columns["frame"].astype(np.int64)
@@ -344,7 +345,7 @@ def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
     done = run(capfd, "relabel", log, "--model", model, "--workers", 1)
     assert done.returncode == 3
     assert "cut off" in done.stderr
-    assert len(labelled_frames(log, model)) > 200
+    assert len(frames_of_layer(log, model)) > 200
 
 
 def test_a_log_that_is_being_written_is_left_for_later(model, logs, capfd):

@@ -18,7 +18,7 @@ import typer
 from blobs import blobs
 from conftest import HEARTHLOG, spread_files
 from logreader import LogReader
-from logs import features, read
+from logs import features, labelled_frames, read
 from lossy import LossySource
 
 from hearthlog.analyzer.replay.log_set import LogSet
@@ -26,11 +26,15 @@ from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.replay import find_model
 from hearthlog.analyzer.replay.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
+from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -183,7 +187,7 @@ def test_with_another_model_it_is_as_if_that_had_recorded(folder, day, other_mod
 
 
 def test_agreement_counts_the_labels_of_the_same_name(folder, model_file, tmp_path):
-    names = {"silence": "quiet", "speech": "talk"}
+    names = {"music": "tune", "speech": "talk"}
     model = load_model(model_file)
     text = model.description.model_dump_json()
     for old, new in names.items():
@@ -195,6 +199,7 @@ def test_agreement_counts_the_labels_of_the_same_name(folder, model_file, tmp_pa
     recorded = [m.label for m in read(folder, "label")]
     assert compared.labels == len(recorded)
     assert compared.same_labels == sum(label not in names for label in recorded) > 0
+    assert compared.same_labels < compared.labels
     assert compared.identical_labels == compared.same_labels
 
 
@@ -248,18 +253,42 @@ def test_a_segment_that_began_long_before_the_start_is_as_recorded(day, model_fi
     assert (result.compared.segments, result.compared.identical_segments) == (1, 1)
 
 
-def test_a_log_from_the_middle_of_a_recording_starts_without_labels_and_says_so(
-    folder, model_file, hearthlog, tmp_path
-):
+def from_the_middle(folder, model_file, hearthlog, output):
+    """Labels replayed from the second log alone, recorded in it, and of what it alone has."""
     middle = find_logs(folder)[1]
-    result = hearthlog("replay", middle, "--model", model_file, "-o", tmp_path / "again")
+    result = hearthlog("replay", middle, "--model", model_file, "-o", output)
     assert result.returncode == 3
     assert result.stderr.splitlines()[-1].startswith(
         "hearthlog: sound before 2026-03-01T07:31:00.000Z is not in these logs"
     )
-    replayed, recorded = read(tmp_path / "again", "label"), read(middle, "label")
+    frames, stamps, values = features(middle)
+    np.testing.assert_array_equal(frames, np.arange(1200, 2400))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
+    alone = pipeline.push_features(values, 1200, stamps)
+    replayed = [encode(m) for m in read(output, "label")]
+    recorded = [encode(m) for m in read(middle, "label")]
+    return replayed, recorded, [m.data for m in alone if m.topic == "/mic/label"]
+
+
+def test_a_log_from_the_middle_of_a_recording_starts_without_labels_and_says_so(
+    folder, model_file, hearthlog, tmp_path
+):
+    again = tmp_path / "again"
+    replayed, recorded, alone = from_the_middle(folder, model_file, hearthlog, again)
+    assert len(recorded) - len(replayed) == 7 + 7  # a block for the floor, and a window
+    assert replayed == alone  # how quiet the room was before is not known, either
+    assert [m.frame for m in read(again, "label")] == [
+        m.frame for m in read(find_logs(folder)[1], "label")[14:]
+    ]
+
+
+def test_a_model_that_needs_no_floor_labels_a_log_from_the_middle_as_it_was_labelled(
+    bands_file, day, hearthlog, tmp_path
+):
+    folder = record_day(tmp_path / "recorded", day, bands_file)
+    replayed, recorded, alone = from_the_middle(folder, bands_file, hearthlog, tmp_path / "again")
     assert len(recorded) - len(replayed) == 19
-    assert [encode(m) for m in replayed] == [encode(m) for m in recorded[19:]]
+    assert replayed == recorded[19:] == alone
 
 
 def test_a_log_that_is_missing_in_between_is_a_gap(folder, model_file, tmp_path):
@@ -487,8 +516,11 @@ def test_a_hole_between_clips_is_a_gap(real_frames, model_file, tmp_path):
     replay(tmp_path / "second.mcap", tmp_path / "alone", model_file, kind="audio")
     np.testing.assert_array_equal(values[200:], features(tmp_path / "alone")[2])
     labels = [m for m in read(tmp_path / "again", "label") if m.frame >= 500]
-    assert labels[0].frame == 519
-    assert len(labels) == len(read(tmp_path / "alone", "label"))
+    timing = label_timing(load_model(model_file).description)
+    assert [m.frame for m in labels] == labelled_frames(frames[200:], timing).tolist()
+    # A block for the floor begins at 504 and ends at 511; the first window behind ends at 518.
+    assert labels[0].frame == 515
+    assert len(labels) == len(read(tmp_path / "alone", "label")) - 4
 
 
 def test_clips_of_a_sound_card_that_runs_slow_are_one_sound_on_their_clock(tmp_path):

@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import time
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, suppress
 from itertools import pairwise
 from queue import SimpleQueue
 
@@ -14,10 +14,11 @@ import soundfile
 from conftest import HEARTHLOG
 from kept import keep_models, put_by_hand
 from logreader import LogReader
-from logs import features, read
+from logs import features, labelled_frames, read
 from spliced import run
 
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
@@ -29,6 +30,7 @@ from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 
@@ -64,7 +66,9 @@ def wait_for(condition, seconds=30):
 
 
 def count(logs, kind):
-    return len(read(logs, kind)) if logs.exists() and list(logs.rglob("*.mcap*")) else 0
+    with suppress(LogError):  # a log is completed, and gets its name, at any time
+        return len(read(logs, kind)) if logs.exists() and list(logs.rglob("*.mcap*")) else 0
+    return 0
 
 
 def said(logs, level=None):
@@ -80,7 +84,8 @@ def labels_by(model_path, logs):
     frames, stamps, values = features(logs)
     records = pipeline.push_features(values, int(frames[0]), stamps)
     labels = [record.data for record in records if record.topic == "/mic/label"]
-    return dict(zip(frames[19:].tolist(), labels, strict=True))
+    timing = label_timing(load_model(model_path).description)
+    return dict(zip(labelled_frames(frames, timing).tolist(), labels, strict=True))
 
 
 def recorded_labels(log):
@@ -95,7 +100,7 @@ def check_swap(folder, logs, names):
     assert [message.frame for message in read(logs, "statistics")] == frames.tolist()
     paths = find_logs(logs)
     assert [info.model for info in read(logs, "info")] == names
-    labelled = []
+    labelled, delays, firsts = [], [], []
     for path, name in zip(paths, names, strict=True):
         model = load_model(folder / f"{name}.safetensors")
         about = LogReader(path)
@@ -103,8 +108,15 @@ def check_swap(folder, logs, names):
         assert about.attachments["model_card.md"] == model_card(model).encode()
         found, wanted = recorded_labels(path), labels_by(folder / f"{name}.safetensors", logs)
         assert found == {frame: wanted[frame] for frame in found}
-        labelled += found
-    assert labelled == frames[19:].tolist()
+        labelled.append(list(found))
+        delays.append(label_timing(model.description).delay)
+        firsts.append(int(features(path)[0][0]))
+    # Each speaks of what the one before had not heard enough of, and cannot look further back.
+    begins = [labelled[0][0]]
+    begins += [first - min(pair) for first, pair in zip(firsts[1:], pairwise(delays), strict=True)]
+    ends = [end - delay for end, delay in zip([*firsts[1:], len(frames)], delays, strict=True)]
+    spoken = [list(range(*span)) for span in zip(begins, ends, strict=True)]
+    assert labelled == spoken
     for path, name in zip(paths[1:], names[1:], strict=True):
         first = features(path)[0][0]
         digest = load_model(folder / f"{name}.safetensors").sha256[:12]

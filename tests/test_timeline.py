@@ -834,9 +834,12 @@ except DataError as error: print(error)
 """
 
 
-@pytest.mark.parametrize("left", [50_000, 1_200_000])
-def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, folder, left):
+@pytest.mark.parametrize("share", [0.05, 0.9])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, folder, timeline, share):
     output = tmp_path / "a.rrd"
+    save_timeline(timeline, output)
+    left = round(share * output.stat().st_size)
+    output.unlink()
     command = [sys.executable, "-c", _SAVE, folder, output, str(left)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"{output}: cannot be written (")

@@ -1,6 +1,7 @@
 import csv
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -211,6 +212,7 @@ def test_labels_without_meaning_are_recognised_at_chance():
     noise = np.random.default_rng(1).random(data.windows.shape, np.float32)
     model = train_model(dataclasses.replace(data, windows=noise), scenario, ignore_progress)
     assert model.description.metrics.macro_f1 < 0.62
+    assert model.description.smoothing.weight == 10.0  # so unsure that it is bounded
 
 
 def test_calibration_error_is_the_gap_of_confidence_and_truth():
@@ -223,7 +225,7 @@ def test_the_command_makes_a_model_that_knows_its_sounds(home):
     output = home / "home.safetensors"
     result = run("--data", home, "--scenario", home / "home.toml", "--output", output)
     assert result.exit_code == 0, result.output
-    assert "macro F1 1.000" in result.stdout
+    assert float(re.search(r"macro F1 (\d\.\d+)", result.stdout)[1]) > 0.98
     assert "listening to 36 clips" in result.stderr
     model = load_model(output)
     assert model.classes == ("silence", "music", "speech")
@@ -231,7 +233,8 @@ def test_the_command_makes_a_model_that_knows_its_sounds(home):
         samples = sound(label, 1, seed=99).astype(np.float32)
         features = FeatureExtractor()(samples.reshape(-1, 800))
         classifier = Classifier(model)
-        best = classifier.probabilities(classifier.inputs.stream()(features)).argmax()
+        inputs = classifier.inputs.stream()(features, np.zeros((len(features), 33)))
+        best = classifier.probabilities(inputs).mean(axis=0).argmax()
         assert model.classes[best] == label
 
 
@@ -242,7 +245,7 @@ def test_the_same_clips_give_the_same_bytes(home):
     assert (home / "a.safetensors").read_bytes() == (home / "b.safetensors").read_bytes()
     a, b = json.loads(first.stdout), json.loads(second.stdout)
     assert a["sha256"] == b["sha256"]
-    assert a["metrics"]["macro_f1"] == 1.0
+    assert a["metrics"]["macro_f1"] > 0.98
     assert a["training_data"]["collections"] == [{"name": "made up", "licence": "CC0", "clips": 36}]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import Findings
-from hearthlog.analyzer.doctor.topic_types import GAP, SEGMENT
+from hearthlog.analyzer.doctor.topic_types import GAP, LABEL, SEGMENT
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -15,7 +15,7 @@ from hearthlog.schemas.messages.topics import ROSOUT
 STAMP = "header.stamp"
 _CLOCK_SET = "the clock was set"
 _SUM_TOLERANCE = 1e-4
-_LONGEST_LAG = 61_000_000_000  # ns; of smoothing, and what stamps may be off in that time
+_LATE = {SEGMENT: 75_000_000_000, LABEL: 1_010_000_000}  # ns, with what stamps may be off
 
 
 def check_stamps(
@@ -48,8 +48,8 @@ def check_stamps(
     late = times - stamps
     if kind == "info" and not named:
         late = np.minimum(late, 0)
-    if kind == SEGMENT:  # may be decided later, but never before it is over
-        late[(late >= 0) & (late <= _LONGEST_LAG)] = 0
+    if kind in _LATE:  # may be known later, but never before it is over
+        late[(late >= 0) & (late <= _LATE[kind])] = 0
     findings.rows(
         "stamp",
         late != 0,

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_steps import Steps, check_gaps, check_steps
 from hearthlog.analyzer.doctor.topic_types import FEATURES, GAP, LABEL, SEGMENT, STATISTICS
+from hearthlog.models.classifiers.timing import LabelTiming
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
@@ -30,8 +31,8 @@ class FrameSequence:
         Its name.
     statistics_every : int or None
         Frames from one statistics message to the next, if the file has that.
-    window_frames : int
-        Frames of a window, at whose end there is a label.
+    timing : LabelTiming
+        Of the labels.
     labelled : bool
         Whether there is a model.
     """
@@ -41,7 +42,7 @@ class FrameSequence:
         findings: Findings,
         microphone: str,
         statistics_every: int | None,
-        window_frames: int,
+        timing: LabelTiming,
         *,
         labelled: bool,
     ) -> None:
@@ -52,12 +53,13 @@ class FrameSequence:
         self._findings = findings
         self._name = microphone
         self._every = statistics_every
-        self._window = window_frames
+        self._timing = timing
         self._labelled = labelled
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
         self._run: tuple[int, int] | None = None  # the first frame since the last gap
-        self._run_frames = 0  # since then, at most a window
+        self._heard = _NONE  # features of the last frames, of which there is no label yet
+        self._first_end = 0  # frame at which the first window since then ends
         self._segment_end: int | None = None
         self._gap_ends: Int64 = np.empty(0, np.int64)
         self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
@@ -80,6 +82,7 @@ class FrameSequence:
         self.finish()
         self._pending.clear()
         self._previous = self._run = self._segment_end = None
+        self._heard = _NONE
 
     def begin_anew(self, time: int) -> None:
         """Note that from a log time on this is another recording, or its next log.
@@ -91,6 +94,7 @@ class FrameSequence:
         """
         self.settle(time)
         self._previous = self._run = self._segment_end = None
+        self._heard = _NONE
 
     def finish(self) -> None:
         """Check the last frame; what a killed recorder did not write of it is not reported."""
@@ -111,7 +115,10 @@ class FrameSequence:
         runs = self._check_features(features, gaps)
         self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
         if self._labelled:
-            self._check_same(features, labels, LABEL, self._with_label(features, labels, runs))
+            self._check_label_stamps(features, labels)
+            # Their log time is the stamp of the last frame of the window.
+            ends = np.stack([labels[:, 0], labels[:, 1] + self._timing.delay, labels[:, 0]], axis=1)
+            self._check_same(features, ends, LABEL, self._with_label(features, ends, runs))
         self._check_segments(segments)
 
     def _take(self, kind: str, until: int | None) -> Int64:
@@ -185,27 +192,32 @@ class FrameSequence:
     def _with_label(
         self, features: Int64, labels: Int64, known_start: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Tell which frames end a window without a gap."""
-        run_frames = np.empty(len(features), np.int64)
-        if not len(features):
-            return run_frames > 0
-        starts = np.flatnonzero(self._begins).tolist()
-        for start, end in zip([0, *starts], [*starts, len(features)], strict=True):
-            if start == end:
-                continue
-            if self._begins[start]:
-                first = int(features[start, 1])
-                self._run_frames = 0 if known_start[start] else self._guess(first, labels)
-            run_frames[start:end] = self._run_frames + np.arange(1, end - start + 1)
-            self._run_frames = min(int(run_frames[end - 1]), self._window)
-        return run_frames >= self._window
+        """Tell which frames end a window without a gap; labels have the numbers of such frames."""
+        first_end = np.full(len(features), self._first_end)
+        for start in np.flatnonzero(self._begins).tolist():
+            frame = int(features[start, 1])
+            self._first_end = self._timing.first_window_end(frame)
+            later = labels[labels[:, 1] >= frame, 1]
+            if len(later) and not known_start[start]:  # the sound may have begun before the file
+                self._first_end = min(self._first_end, int(later[0]))
+            first_end[start:] = self._first_end
+        return features[:, 1] >= first_end
 
-    def _guess(self, frame: int, labels: Int64) -> int:
-        """Guess, by the next label, how many frames of its run precede a frame."""
-        first = np.searchsorted(labels[:, 1], frame)
-        if first == len(labels):
-            return 0
-        return int(max(self._window - 1 - (labels[first, 1] - frame), 0))
+    def _check_label_stamps(self, features: Int64, labels: Int64) -> None:
+        """Compare labels with the features of the frames that they speak of."""
+        heard = np.concatenate([self._heard, features])
+        self._heard = heard[max(len(heard) - self._timing.delay, 0) :]
+        order = np.argsort(heard[:, 1], kind="stable")
+        known = np.flatnonzero(np.isin(labels[:, 1], heard[:, 1]))
+        at = order[np.searchsorted(heard[order, 1], labels[known, 1])]
+        wrong = np.zeros(len(labels), bool)
+        wrong[known] = heard[at, 2] != labels[known, 2]
+        self._report(
+            "frame-stamp",
+            wrong,
+            labels[:, 0],
+            lambda i: f"the label of frame {labels[i, 1]} has another stamp than its features",
+        )
 
     def _check_same(
         self, features: Int64, rows: Int64, kind: str, expects: NDArray[np.bool_] | None

@@ -25,7 +25,11 @@ from hearthlog.analyzer.doctor.topic_types import (
     split_topic,
     topic_type,
 )
+from hearthlog.models.classifiers.description import read_description
+from hearthlog.models.classifiers.timing import LabelTiming, label_timing
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.card import DESCRIPTION
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -161,9 +165,9 @@ class MessageChecks:
         if microphone not in self.frames:
             every = statistics_every(self._data)
             labelled = info is not None and len(info["labels"]) > 0
-            window = _window_frames(info)
+            timing = _label_timing(self._data, info)
             self.frames[microphone] = FrameSequence(
-                self._findings, microphone, every, window, labelled=labelled
+                self._findings, microphone, every, timing, labelled=labelled
             )
         if kind in _WIDTHS and info is not None:
             names = info["labels"] if kind == LABEL else info["feature_names"]
@@ -215,12 +219,23 @@ def statistics_every(data: DataSection) -> int | None:
     return every if isinstance(every, int) and every > 0 else None
 
 
-def _window_frames(info: Mapping[str, Any] | None) -> int:
-    """Return the frames of a window, as the `AudioStreamInfo` of a log has it."""
-    seconds = DEFAULT.window_seconds if info is None else float(info["window_seconds"])
-    if not FRAME_SECONDS <= seconds <= _LONGEST_WINDOW:
-        seconds = DEFAULT.window_seconds
-    return round(seconds / FRAME_SECONDS)
+def _label_timing(data: DataSection, info: Mapping[str, Any] | None) -> LabelTiming:
+    """Return the timing of the model in a file; at the end of a window if it does not say."""
+    try:
+        content = json.loads(data.attachments[DESCRIPTION][0])
+        named = {key: value for key, value in content.items() if key not in {"name", "sha256"}}
+        description = read_description(json.dumps(named))
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, ModelError):
+        seconds = DEFAULT.window_seconds if info is None else float(info["window_seconds"])
+        if not FRAME_SECONDS <= seconds <= _LONGEST_WINDOW:
+            seconds = DEFAULT.window_seconds
+        frames = round(seconds / FRAME_SECONDS)
+        return LabelTiming(frames, frames - 1, needs_floor=False)
+    try:
+        return label_timing(description)
+    except (KeyError, ModelError):  # its feature set is not installed
+        frames = max(round(description.window_seconds / FRAME_SECONDS), 1)
+        return LabelTiming(frames, description.label_frame, needs_floor=description.gate > 0.0)
 
 
 def _rows(columns: Columns) -> Any:

@@ -104,7 +104,7 @@ def _split(data: Dataset, number: int, shuffle: int) -> _Split:
 
 def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[float]:
     examples = Examples(*arrays)
-    inputs, target = examples.inputs[0], examples.target
+    target = examples.target
     right = target[split.test]
     scores = []
     for count in CORRECTED:
@@ -113,7 +113,7 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[f
         weight[home] = HOME_WEIGHT
         seen = np.concatenate([split.others, home])
         learned = method.fit(examples._replace(weight=weight), seen, home)
-        decision = learned.decide(inputs[split.test], classes)
+        decision = examples.decide(learned, split.test, classes)
         predicted, labels = decision.argmax(axis=1), np.unique(right)
         scores.append(f1_score(right, predicted, labels=labels, average="macro", zero_division=0))
     return scores

@@ -6,14 +6,13 @@ from typing import Literal, get_args
 from sklearn.model_selection import LeaveOneGroupOut, StratifiedKFold
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.calibration import nested_probabilities
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import (
     Fold,
     Method,
     cross_validate,
-    inverse_temperature,
     prepare,
-    softmax,
 )
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, check_varied, group_folds
@@ -59,7 +58,7 @@ def evaluate_method(
     folds = divide(data, kind)
     examples = prepare(method, data)
     [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
-    probabilities = softmax(inverse_temperature(decisions, data.target) * decisions)
+    probabilities = nested_probabilities(decisions, data.target, folds)
     return CrossValidation(
         len(folds),
         score(data.target, probabilities.argmax(axis=1), data.group, data.classes),

@@ -9,15 +9,21 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.manifest import LabelledClip
-from hearthlog.analyzer.training.scenario import Scenario
+from hearthlog.analyzer.training.method import softmax
+from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
+from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.labels.segments import Segmenter
-from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.models.features.floor import Floors
+from hearthlog.models.features.window_inputs import of_segments
+from hearthlog.models.labels.labeller import Labeller
+from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
+
+_LEAST = 1e-30
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,9 @@ def evaluate_model(
     """
     check_classes(model, scenario)
     # In the order of the model's probabilities.
-    scenario = Scenario(
-        scenario.name, {name: scenario.classes[name] for name in model.classes}, scenario.ignored
-    )
+    labels = {**scenario_of(model).classes, **scenario.classes}
+    classes = {name: labels[name] for name in model.classes}
+    scenario = Scenario(scenario.name, classes, scenario.ignored)
     classifier = Classifier(model)
     features, listener = classifier.feature_set, _Listener(classifier)
     recordings = clip_recordings(clips, scenario, progress, features)
@@ -68,7 +74,9 @@ def evaluate_model(
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
         raise DataError(f"no clip has a segment to test on ({reasons[:300]})")
-    probabilities = classifier.probabilities(classifier.inputs.of_windows(data.windows))
+    probabilities = segment_probabilities(
+        classifier, of_segments(classifier.inputs, data.windows, data.floor)
+    )
     scores = score(data.target, probabilities.argmax(axis=1), data.group, data.classes)
     return ModelEvaluation(
         scores=scores,
@@ -94,8 +102,8 @@ def check_classes(model: Model, scenario: Scenario) -> None:
     DataError
         If one of the two has a class that the other lacks.
     """
-    lacking = [name for name in scenario.classes if name not in model.classes]
-    other = [name for name in model.classes if name not in scenario.classes]
+    lacking = [name for name in scenario.classes if name not in {*model.classes, UNKNOWN}]
+    other = [name for name in model.classes if name not in {*scenario.classes, UNKNOWN}]
     if lacking or other:
         differences = [
             f"{what} {', '.join(names)}"
@@ -106,6 +114,25 @@ def check_classes(model: Model, scenario: Scenario) -> None:
             f"model {model.name or model.description.scenario_name} does not fit scenario "
             f"{scenario.name}: {'; '.join(differences)}; use the scenario it was trained for"
         )
+
+
+def segment_probabilities(classifier: Classifier, inputs: Float32) -> Float64:
+    """Compute the probability of each class in each segment, by all windows in it.
+
+    Parameters
+    ----------
+    classifier : Classifier
+    inputs : np.ndarray [shape=(n, places, width)], float32
+        As of `of_segments`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+        Geometric means over the windows, which sum to 1.
+    """
+    rows = classifier.probabilities(inputs.reshape(-1, inputs.shape[-1]))
+    logarithms = np.log(np.maximum(rows, _LEAST, dtype=np.float64))
+    return softmax(logarithms.reshape(*inputs.shape[:2], -1).mean(axis=1))
 
 
 class _Listener:
@@ -129,23 +156,28 @@ class _Listener:
         for recording in recordings:
             name = scenario.find(recording.label)
             if name is not None:
-                self._listen(recording.features, name)
+                self._listen(recording, name)
             yield recording
 
-    def _listen(self, features: Float32, label: str) -> None:
+    def _listen(self, recording: Recording, label: str) -> None:
         """Add a recording of one label."""
-        inputs = self._classifier.inputs.stream()(features)
-        probabilities = self._classifier.probabilities(inputs)
-        if not len(probabilities):
+        features, recorded = recording.features, recording.floor
+        labeller, powers = Labeller(self._classifier), self._classifier.feature_set.band_powers
+        stamps = np.arange(len(features)) * FRAME_NANOSECONDS
+        floors = None
+        if powers is not None:
+            floor = np.zeros(powers(features[:1]).shape[1]) if recorded is None else recorded
+            floors = Floors(np.tile(floor, (len(features), 1)), converged=True)
+        labels, segments = labeller.push(features, floors, 0, stamps)
+        if not len(labels.frames):
             return
-        length = len(probabilities) * FRAME_NANOSECONDS
-        stamps = self._place + np.arange(0, length, FRAME_NANOSECONDS)
-        smoothing, transitions = self._classifier.smoothing, self._classifier.transitions
-        segmenter = Segmenter(smoothing, transitions, FRAME_SECONDS)
-        segments = segmenter.push(probabilities, stamps) + segmenter.close(self._place + length)
-        self._predicted += [(one.start, one.end, one.label) for one in segments]
+        end = len(features) * FRAME_NANOSECONDS
+        segments += labeller.close(end)
+        shift = self._place - int(labels.stamps[0])
+        self._predicted += [(one.start + shift, one.end + shift, one.label) for one in segments]
         true = self._classifier.classes.index(label)
-        self._reference.append((self._place, self._place + length, true))
+        self._reference.append((self._place, end + shift, true))
+        length = end + shift - self._place
         self.duration += length
         self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
 

@@ -9,7 +9,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import relabel_path, stem
 
-_MOST_EARLIER = 24  # logs: within so many a model forgets what was before them
+_MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has a minute only
 
 
 class Job(NamedTuple):

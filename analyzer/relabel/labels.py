@@ -239,7 +239,7 @@ def _write_labels(
                 labels = labeller.push(event)
                 if labels is not None:
                     columns = labels.columns(info.microphone)
-                    writer.write_columns([TopicBatch(topics[0].name, labels.stamps, columns)])
+                    writer.write_columns([TopicBatch(topics[0].name, labels.known_at, columns)])
                     frames += len(labels.stamps)
             writer.flush()
     except BaseException as error:

@@ -19,6 +19,7 @@ from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.times import NANOSECONDS
 
 _WARM_UP = 30 * NANOSECONDS
+_FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, and the four seconds of steadiness behind it
 _NEVER = (1 << 63) - 1
 _LONGEST_LOSS_TEXT = 1000  # characters
 
@@ -130,27 +131,36 @@ def warm_up(
         Ready for the first frame of the log; without a past where the earlier logs do not lead up
         to it.
     """
-    first, seconds_back = info.first_frame, _WARM_UP
+    first, labels_back = info.first_frame, _WARM_UP
+    floor_back = _FLOOR_WARM_UP if classifier.timing.needs_floor else labels_back
     while first is not None and earlier:
-        labeller, from_start = _label_earlier(earlier, info, first[1] - seconds_back, classifier)
+        back = max(floor_back, labels_back)
+        starts = first[1] - back, first[1] - labels_back
+        labeller, from_start = _label_earlier(earlier, info, starts, classifier)
         if not labeller.is_followed_by(first):
             break
         converged = labeller.states_converged and (states_only or labeller.segments_converged)
-        if from_start or converged:
+        if converged or (from_start and labels_back == back):
             return labeller
-        seconds_back *= 4
+        if labeller.floor_converged:
+            labels_back *= 4
+        else:
+            floor_back *= 4
     return StreamLabeller(classifier)
 
 
 def _label_earlier(
-    logs: Sequence[Path], info: RecorderInfo, start: int, classifier: Classifier
+    logs: Sequence[Path], info: RecorderInfo, starts: tuple[int, int], classifier: Classifier
 ) -> tuple[StreamLabeller, bool]:
-    """Label earlier logs from a time on; tell also whether there is nothing before it."""
+    """Track the floor in earlier logs from a time on, and label them from another time on.
+
+    The result tells also whether there is nothing before the first of these times.
+    """
     copies: dict[Path, Path | None] = {}  # what could be saved of damaged logs
     with TemporaryDirectory(prefix="hearthlog") as folder:
         while True:
             try:
-                return _label_readable(logs, copies, info, start, classifier)
+                return _label_readable(logs, copies, info, starts, classifier)
             except UnreadableError as error:
                 copy = None
                 if error.log not in copies.values():
@@ -163,9 +173,10 @@ def _label_readable(
     logs: Sequence[Path],
     copies: Mapping[Path, Path | None],
     info: RecorderInfo,
-    start: int,
+    starts: tuple[int, int],
     classifier: Classifier,
 ) -> tuple[StreamLabeller, bool]:
+    start, label_from = starts
     chosen: deque[RecorderInfo] = deque()
     from_start = True
     for log in logs:
@@ -177,7 +188,7 @@ def _label_readable(
         if other.first_frame[1] < start:
             from_start = False
             break
-    labeller = StreamLabeller(classifier)
+    labeller = StreamLabeller(classifier, label_from, from_start=from_start)
     for other in chosen:
         for event in read_sound(other, start):
             labeller.push(event)

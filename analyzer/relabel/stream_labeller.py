@@ -2,6 +2,7 @@
 
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels.labeller import FrameLabels, Labeller
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.recorder.events import Gap
@@ -17,16 +18,29 @@ class StreamLabeller:
     Parameters
     ----------
     classifier : Classifier
+    label_from : int
+        Time before which frames are not labelled, in nanoseconds of UTC; of these only the floor of
+        the room is tracked, which is much quicker.
+    from_start : bool
+        Whether nothing is known of the sound before the first frame.
 
     Attributes
     ----------
     segments : list of Segment
         Those that have ended.
+    floor_converged : bool
+        Whether sound before the first frame would leave no trace in the floors to come.
     """
 
-    def __init__(self, classifier: Classifier) -> None:
+    def __init__(
+        self, classifier: Classifier, label_from: int = 0, *, from_start: bool = False
+    ) -> None:
         self.segments: list[Segment] = []
+        self.floor_converged = from_start or not classifier.timing.needs_floor
+        self._label_from = label_from
         self._labeller = Labeller(classifier)
+        self._powers = classifier.feature_set.band_powers
+        self._floor = None if self._powers is None else FloorTracker()
         self._next: int | None = None  # number of the next frame
         self._end = 0  # end of the last frame, in nanoseconds of UTC
         self._from_start = False  # whether it began where the sound began, or after a gap
@@ -34,12 +48,12 @@ class StreamLabeller:
     @property
     def states_converged(self) -> bool:
         """Whether sound before the first frame would leave no trace in the states to come."""
-        return self._from_start or self._labeller.segmenter.states_converged
+        return self._from_start or self._labeller.states_converged
 
     @property
     def segments_converged(self) -> bool:
         """Whether sound before the first frame would leave no trace in the segments to come."""
-        return self._from_start or self._labeller.segmenter.segments_converged
+        return self._from_start or self._labeller.segments_converged
 
     @property
     def open_run(self) -> Run | None:
@@ -82,14 +96,27 @@ class StreamLabeller:
         if self._next is not None and not self.is_followed_by((event.first, int(event.stamps[0]))):
             self.close()
         self._from_start |= event.first == 0
-        labels, segments = self._labeller.push(event.values, event.first, event.stamps)
-        self.segments += segments
         self._next = event.first + len(event.stamps)
         self._end = int(event.stamps[-1]) + FRAME_NANOSECONDS
+        floors = self._track_floor(event)
+        if self._end <= self._label_from:
+            self._from_start = False
+            return None
+        labels, segments = self._labeller.push(event.values, floors, event.first, event.stamps)
+        self.segments += segments
         return labels
+
+    def _track_floor(self, event: Features) -> Floors | None:
+        if self._floor is None or self._powers is None:
+            return None
+        floors = self._floor(self._powers(event.values), event.first)
+        self.floor_converged |= floors.converged or event.first == 0
+        return floors._replace(converged=self.floor_converged)
 
     def close(self) -> None:
         """End the open segment where the last frame ends; the next frame begins anew."""
         self.segments += self._labeller.close(self._end)
+        if self._floor is not None:
+            self._floor.restart()
         self._next = None
-        self._from_start = True
+        self._from_start = self.floor_converged = True

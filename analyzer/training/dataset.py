@@ -11,20 +11,23 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.analyzer.training.rooms import RoomCopy, in_room
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.description import Amount
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
+from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
 from hearthlog.schemas.arrays import Float32, Float64, Indices
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
+_SEED = 20_261_122
 
 
 class Recording(NamedTuple):
@@ -38,6 +41,10 @@ class Recording(NamedTuple):
         Features of successive frames.
     weight : float
         Weight of its segments.
+    floor : np.ndarray [shape=(b,)], float64, or None
+        Floor of the room; None for none, as in a clip that was cut out of it.
+    copies : sequence of RoomCopy
+        The same sound in other rooms.
     """
 
     label: str
@@ -46,6 +53,8 @@ class Recording(NamedTuple):
     licence: str
     features: Float32
     weight: float = 1.0
+    floor: Float64 | None = None
+    copies: Sequence[RoomCopy] = ()
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,11 @@ class Dataset:
         Number of the source group, and of the collection.
     weight : np.ndarray [shape=(n,)], float64
         Weight of the segment.
+    floor : np.ndarray [shape=(n, b)], float64
+        Floor of the room; b is 0 for a feature set without bands.
+    copies : np.ndarray [shape=(k, n, window_frames, d)], float32
+        The same segments in other rooms; NaN where there is none.
+    copy_floor : np.ndarray [shape=(k, n, b)], float64
     classes : tuple of str
     seconds : dict of str to float
         Seconds of sound of each class, before it was thinned out.
@@ -78,6 +92,9 @@ class Dataset:
     group: Indices
     collection: Indices
     weight: Float64
+    floor: Float64
+    copies: Float32
+    copy_floor: Float64
     classes: tuple[str, ...]
     seconds: Mapping[str, float]
     collection_names: tuple[str, ...]
@@ -86,6 +103,11 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.target)
+
+    @property
+    def bands(self) -> int:
+        """Number of bands of the floor."""
+        return self.floor.shape[1]
 
     @property
     def digest(self) -> str:
@@ -108,12 +130,13 @@ class Dataset:
         }
 
 
-def build_dataset(
+def build_dataset(  # noqa: PLR0913, PLR0917
     clips: Sequence[LabelledClip],
     scenario: Scenario,
     progress: Progress,
     home: Iterable[Recording] = (),
     features: FeatureSet = DEFAULT,
+    rooms: int = 0,
 ) -> Dataset:
     """Cut clips, and recordings of a home, into the segments of a scenario.
 
@@ -127,6 +150,8 @@ def build_dataset(
         Further recordings; their labels may be names of classes.
     features : FeatureSet
         The features to compute; those of `home` are of the same set.
+    rooms : int
+        Number of copies of each clip in other rooms.
 
     Returns
     -------
@@ -140,7 +165,7 @@ def build_dataset(
     SourceError
         If a clip cannot be read.
     """
-    recordings = chain(clip_recordings(clips, scenario, progress, features), home)
+    recordings = chain(clip_recordings(clips, scenario, progress, features, rooms), home)
     data = cut_recordings(recordings, scenario, features)
     for name, amount in data.amounts.items():
         if not amount.segments:
@@ -154,6 +179,7 @@ def clip_recordings(
     scenario: Scenario,
     progress: Progress,
     features: FeatureSet = DEFAULT,
+    rooms: int = 0,
 ) -> Iterator[Recording]:
     """Read clips and compute their features; clips of labels outside the scenario have none.
 
@@ -165,6 +191,8 @@ def clip_recordings(
         Is told the share of the clips that is done, 0 to 1.
     features : FeatureSet, optional
         The features to compute.
+    rooms : int
+        Number of copies in other rooms; the same clips get the same ones.
 
     Yields
     ------
@@ -178,10 +206,10 @@ def clip_recordings(
     """
     for number, clip in enumerate(clips):
         progress(number / len(clips))
-        values = np.empty((0, features.width), np.float32)
+        frames = np.empty((0, FRAME_SAMPLES), np.float32)
         if scenario.find(clip.label) is not None:
-            values = clip_features(clip, features)
-        yield Recording(clip.label, clip.source_group, clip.source, clip.licence, values)
+            frames = clip_frames(clip)
+        yield _recording(clip, frames, features, rooms, np.random.default_rng([_SEED, number]))
     progress(1.0)
 
 
@@ -215,82 +243,136 @@ def cut_recordings(
     used: Counter[tuple[str, str]] = Counter()
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
-    windows = [np.empty((0, features.window_frames, features.width), np.float32)]
-    weights = [np.empty(0)]
+    chosen: list[_Chosen] = []
     rows = [np.empty((0, 3), np.intp)]
+    weights = [np.empty(0)]
     for item in recordings:
         name = scenario.find(item.label, marked=True)
         if name is None:
             skipped[f"label {item.label} is not in the scenario"] += 1
             continue
-        reason, segments = _segments(item, features)
+        reason, starts = _segments(item, features)
         if reason:
             skipped[reason] += 1
             continue
         used[item.collection, item.licence] += 1
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
-        windows.append(segments)
-        weights.append(np.full(len(segments), item.weight))
+        chosen += [_Chosen(item, start) for start in starts.tolist()]
+        weights.append(np.full(len(starts), item.weight))
         group = groups.setdefault(item.group, len(groups))
         collection = collections.setdefault(item.collection, len(collections))
-        rows.append(np.tile([classes.index(name), group, collection], (len(segments), 1)))
+        rows.append(np.tile([classes.index(name), group, collection], (len(starts), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
     kept = _thinned(target * len(groups) + group_of, weight)
+    segments = [chosen[place] for place in kept.tolist()]
+    copies = max((len(segment.recording.copies) for segment in segments), default=0)
+    cut = [_versions(segment, features, copies) for segment in segments]
+    shape = (features.window_frames, features.width)
+    windows = np.array([windows for windows, _ in cut], np.float32)
+    floors = np.array([floors for _, floors in cut])
+    windows = windows.reshape(len(kept), 1 + copies, *shape).swapaxes(0, 1)
+    floors = floors.reshape(len(kept), 1 + copies, features.bands).swapaxes(0, 1)
     return Dataset(
-        np.concatenate(windows)[kept],
-        target[kept],
-        group_of[kept],
-        collection_of[kept],
-        weight[kept],
-        classes,
-        seconds,
-        tuple(collections),
-        dict(used),
-        dict(sorted(skipped.items())),
+        windows=np.ascontiguousarray(windows[0]),
+        target=target[kept],
+        group=group_of[kept],
+        collection=collection_of[kept],
+        weight=weight[kept],
+        floor=floors[0],
+        copies=windows[1:],
+        copy_floor=floors[1:],
+        classes=classes,
+        seconds=seconds,
+        collection_names=tuple(collections),
+        collections=dict(used),
+        skipped=dict(sorted(skipped.items())),
     )
 
 
-def clip_features(clip: LabelledClip, features: FeatureSet) -> Float32:
-    """Compute the features of a clip.
+class _Chosen(NamedTuple):
+    """A segment of a recording."""
+
+    recording: Recording
+    start: int
+
+
+def _versions(
+    segment: _Chosen, features: FeatureSet, copies: int
+) -> tuple[list[Float32], list[Float64]]:
+    """Return a segment, then in other rooms, and the floors; NaN for what it has not."""
+    recording, start = segment
+    absent = np.full((features.window_frames, features.width), np.nan, np.float32)
+    floors = [np.zeros(features.bands) if recording.floor is None else recording.floor]
+    windows = [recording.features[start : start + features.window_frames]]
+    for copy in recording.copies:
+        windows.append(copy.features[start : start + features.window_frames])
+        floors.append(copy.floor)
+    lacking = copies - len(recording.copies)
+    return windows + [absent] * lacking, floors + [np.zeros(features.bands)] * lacking
+
+
+def clip_frames(clip: LabelledClip) -> Float32:
+    """Read a clip.
 
     Parameters
     ----------
     clip : LabelledClip
-    features : FeatureSet
 
     Returns
     -------
-    np.ndarray [shape=(n, d)], float32
-        A row for each frame; units as in `features.units`.
+    np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        Whole frames at 16 kHz.
 
     Raises
     ------
     SourceError
         If the clip cannot be read.
     """
-    extract = features.extractor()
-    values = [np.empty((0, features.width), np.float32)]
     cutter = FrameCutter()
-    values += [extract(cutter.push(block)) for block in read_audio(clip.path)]
-    return np.concatenate(values)
+    blocks = [cutter.push(block) for block in read_audio(clip.path)]
+    return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
 
 
-def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Float32]:
-    """Return the segments that are loud enough, and why there are none."""
+def _recording(
+    clip: LabelledClip,
+    frames: Float32,
+    features: FeatureSet,
+    rooms: int,
+    rng: np.random.Generator,
+) -> Recording:
+    """Compute the features of a clip, and of its copies in other rooms."""
+    values, copies, floor = features.extractor()(frames), [], None
+    silence = class_name(clip.label) == SILENCE
+    if len(values) >= features.window_frames and features.band_powers is not None:
+        copies = [in_room(frames, features, rng, silence=silence) for _ in range(rooms)]
+        floor = low_power(features.band_powers(values)) if silence else None
+    return Recording(
+        clip.label,
+        clip.source_group,
+        clip.source,
+        clip.licence,
+        values,
+        floor=floor,
+        copies=copies,
+    )
+
+
+def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]:
+    """Return where the segments that are loud enough begin, and why there are none."""
     values, window = recording.features, features.window_frames
-    nothing = np.empty((0, window, features.width), np.float32)
+    nothing = np.empty(0, np.intp)
     if values.shape[1] != features.width:
         return f"its features are not {features.name}", nothing
-    if len(values) < window:  # the recorder labels whole windows only
+    if len(values) < window:
         return f"shorter than {features.window_seconds:g} s", nothing
-    every = np.lib.stride_tricks.sliding_window_view(values, window, axis=0)
-    windows = every[::HOP_FRAMES].transpose(0, 2, 1)
+    starts = np.arange(0, len(values) - window + 1, HOP_FRAMES)
     if class_name(recording.label) == SILENCE:
-        return "", windows
-    power = features.power(windows).mean(axis=1, dtype=np.float64)
-    level = features.power(values).mean(dtype=np.float64)
-    loud = windows[power > max(SILENCE_POWER, level * _BELOW_CLIP)]
+        return "", starts
+    power = features.power(values)
+    windows = np.lib.stride_tricks.sliding_window_view(power, window)[starts]
+    loudest = max(SILENCE_POWER, power.mean(dtype=np.float64) * _BELOW_CLIP)
+    loud = starts[windows.mean(axis=1, dtype=np.float64) > loudest]
     return ("" if len(loud) else "nowhere above -60 dBFS"), loud
 
 

@@ -10,8 +10,9 @@ from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.models.classes import translation
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
@@ -50,10 +51,11 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
             continue
         topics = {topic(mark.microphone, "features") for mark in marks}
         columns = read_columns([log], topics, fields={"header.stamp", "frame", "values"})
+        floors = {name: _floors(recorded, features) for name, recorded in columns.items()}
         for mark in marks:
-            recorded = columns.get(topic(mark.microphone, "features"))
-            if recorded is not None and len(recorded):
-                yield from _recordings(recorded, mark, features)
+            name = topic(mark.microphone, "features")
+            if name in columns and len(columns[name]):
+                yield from _recordings(columns[name], floors[name], mark, features)
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
@@ -103,11 +105,31 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
     return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
-def _recordings(recorded: Columns, mark: Mark, features: FeatureSet) -> Iterator[Recording]:
+def _floors(recorded: Columns, features: FeatureSet) -> Float64 | None:
+    """Return the floor of the room at each frame of a log, as a recorder tracks it."""
+    if features.band_powers is None or not _is_of(recorded, features) or not len(recorded):
+        return None
+    frames = recorded["frame"].astype(np.int64)
+    floors = np.zeros((len(frames), features.bands))
+    breaks = np.flatnonzero(np.diff(frames) != 1) + 1
+    for piece in np.split(np.arange(len(frames)), breaks):
+        powers = features.band_powers(recorded["values"][piece])
+        tracked = FloorTracker()(powers, int(frames[piece[0]])).powers
+        floors[piece[len(piece) - len(tracked) :]] = tracked
+    return floors
+
+
+def _is_of(recorded: Columns, features: FeatureSet) -> bool:
+    names = array_names(recorded.metadata, "values")
+    return not names or tuple(names) == features.feature_names
+
+
+def _recordings(
+    recorded: Columns, floors: Float64 | None, mark: Mark, features: FeatureSet
+) -> Iterator[Recording]:
     """Yield the features of a mark, in pieces where there are gaps in it."""
     window, values = features.window_frames, recorded["values"]
-    names = array_names(recorded.metadata, "values")
-    if names and tuple(names) != features.feature_names:
+    if not _is_of(recorded, features):
         values = np.empty((len(values), 0), np.float32)
     stamps, frames = recorded["header.stamp"], recorded["frame"].astype(np.int64)
     first, last = np.searchsorted(stamps, [mark.start, mark.end]).tolist()
@@ -116,5 +138,6 @@ def _recordings(recorded: Columns, mark: Mark, features: FeatureSet) -> Iterator
     last = min(max(last + missing - missing // 2, first + window), len(stamps))
     day = np.datetime64(mark.start // NANOSECONDS, "s").astype("datetime64[D]")
     breaks = np.flatnonzero(np.diff(frames[first:last]) != 1) + 1
-    for piece in np.split(values[first:last], breaks):
-        yield Recording(mark.label, f"{HOME} {day}", HOME, "", piece, HOME_WEIGHT)
+    for piece in np.split(np.arange(first, last), breaks):
+        floor = None if floors is None or not len(piece) else floors[piece[-1]]
+        yield Recording(mark.label, f"{HOME} {day}", HOME, "", values[piece], HOME_WEIGHT, floor)

@@ -2,11 +2,12 @@
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.method import Method
-from hearthlog.analyzer.training.svm_method import BANDS, PAPER
+from hearthlog.analyzer.training.svm_method import BANDS, PAPER, ROOM, ROOM21
 from hearthlog.models.extensions import Extensions
 
-DEFAULT = BANDS
-_METHODS = Extensions("hearthlog.methods", Method, "method", [BANDS, PAPER], DataError)  # type: ignore[type-abstract]
+DEFAULT: Method = ROOM21
+_INSTALLED = [ROOM21, ROOM, BANDS, PAPER]
+_METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataError)  # type: ignore[type-abstract]
 
 
 def method_named(name: str) -> Method:
@@ -15,7 +16,8 @@ def method_named(name: str) -> Method:
     Parameters
     ----------
     name : str
-        `bands`, `paper`, or the name of an entry point in the group `hearthlog.methods`.
+        `room21`, `room`, `bands`, `paper`, or the name of an entry point in the group
+        `hearthlog.methods`.
 
     Raises
     ------

@@ -9,36 +9,90 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from joblib import delayed
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.rooms import empty_room
 from hearthlog.analyzer.workers.parallel import in_parallel
+from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import Description
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.models.features.window_inputs import Inputs, of_segments, window_places
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 from hearthlog.schemas.progress import Progress
 
 _SEED = 20_261_121
+_BELOW_SEGMENT = 10 ** (-6 / 10)  # 6 dB
+_ABOVE_FLOOR = 2.0
+_EMPTY_ROOMS = 60
+_PLACES = (10, 50)  # frames at which windows of an empty room begin
 
 Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
 NO_HOME: Indices = np.empty(0, np.intp)
 
 
 class Examples(NamedTuple):
-    """The inputs of segments, unchanged and augmented.
+    """The inputs of segments, unchanged and changed, window by window.
 
     Attributes
     ----------
-    inputs : np.ndarray [shape=(1 + copies, n, width)], float32
+    inputs : np.ndarray [shape=(versions, n, places, width)], float32
+        Of the windows in each segment; the first version is the unchanged one.
+    usable : np.ndarray [shape=(versions, n, places)], bool
+        Which windows may be learned from; tried are all of the first version.
     target : np.ndarray [shape=(n,)], intp
     weight : np.ndarray [shape=(n,)], float64
+    more_inputs : np.ndarray [shape=(m, width)], float32
+        Of further windows that are always learned from.
+    more_target : np.ndarray [shape=(m,)], intp
     """
 
     inputs: Float32
+    usable: Bool
     target: Indices
     weight: Float64
+    more_inputs: Float32
+    more_target: Indices
+
+    def windows(self, seen: Indices | slice) -> tuple[Float32, Indices, Float64]:
+        """Return inputs, classes and weights of the windows to learn from.
+
+        Parameters
+        ----------
+        seen : np.ndarray [shape=(m,)], intp, or slice
+            Indices of segments.
+        """
+        usable = self.usable[:, seen]
+        shape = usable.shape
+        target = np.broadcast_to(self.target[seen][:, np.newaxis], shape)[usable]
+        weight = np.broadcast_to(self.weight[seen][:, np.newaxis], shape)[usable]
+        return (
+            np.concatenate([self.inputs[:, seen][usable], self.more_inputs]),
+            np.concatenate([target, self.more_target]),
+            np.concatenate([weight, np.ones(len(self.more_target))]),
+        )
+
+    def decide(self, learned: "Learned", unseen: Indices, classes: int) -> Float64:
+        """Return decision values of segments: the means over their windows.
+
+        Parameters
+        ----------
+        learned : Learned
+        unseen : np.ndarray [shape=(m,)], intp
+            Indices of segments.
+        classes : int
+            C, the number of classes.
+
+        Returns
+        -------
+        np.ndarray [shape=(m, C)], float64
+        """
+        inputs = self.inputs[0, unseen]
+        decisions = learned.decide(inputs.reshape(-1, inputs.shape[-1]), classes)
+        means: Float64 = decisions.reshape(*inputs.shape[:2], classes).mean(axis=1)
+        return means
 
 
 class Learned(Protocol):
@@ -79,6 +133,12 @@ class Method(ABC):
         Kind of classifier.
     copies : int
         Number of augmented copies of each segment.
+    rooms : int
+        Number of copies of each clip with the noise of other rooms.
+    gate : float
+        As in `Description`.
+    observation_weight : float
+        Weight of a frame's decision values in the hidden Markov model.
     """
 
     name: str
@@ -86,6 +146,9 @@ class Method(ABC):
     inputs: str
     kind: str
     copies: int
+    rooms: int = 0
+    gate: float = 0.0
+    observation_weight: float = 1.5
 
     @property
     def features(self) -> FeatureSet:
@@ -143,6 +206,38 @@ class Method(ABC):
         """Return the methods that a grid search compares, this one among them."""
         return [self]
 
+    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
+        """Return the inputs that stand for all that a model has learned from, and their classes.
+
+        Parameters
+        ----------
+        base : Model
+            That this method has learned.
+
+        Returns
+        -------
+        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
+            None if the model must learn from its training windows again.
+        """
+        del base
+        return None
+
+    def memory(self, remembered: tuple[Float32, Indices]) -> dict[str, NDArray[Any]]:
+        """Return arrays by which an adapted model gives `remembered` again.
+
+        Parameters
+        ----------
+        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+            As of the method.
+
+        Returns
+        -------
+        dict of str to np.ndarray
+            By name of the array.
+        """
+        del remembered
+        return {}
+
     def as_of(self, description: Description) -> Self:
         """Return this method with the parameters of a model.
 
@@ -179,20 +274,70 @@ def prepare(method: Method, data: Dataset) -> Examples:
     features, rng = method.features, np.random.default_rng(_SEED)
     if method.copies and features.augmented is None:
         raise DataError(f"method {method.name}: {features.name} cannot be augmented")
-    windows = [data.windows]
+    if method.rooms and features.band_powers is None:
+        raise DataError(f"method {method.name}: {features.name} has no bands to find a floor in")
+    versions, floors = [data.windows, *data.copies], [data.floor, *data.copy_floor]
     for _ in range(method.copies):
         assert features.augmented is not None
-        windows.append(features.augmented(data.windows, rng))
+        versions.append(features.augmented(data.windows, rng))
+        floors.append(data.floor)
     inputs = features.inputs[method.inputs]
-    return Examples(np.stack([inputs.of_windows(w) for w in windows]), data.target, data.weight)
+    computed = [
+        of_segments(inputs, np.nan_to_num(version), floor)
+        for version, floor in zip(versions, floors, strict=True)
+    ]
+    usable = [
+        _usable(version, floor, data, features, inputs.window_frames)
+        for version, floor in zip(versions, floors, strict=True)
+    ]
+    more_inputs = np.empty((0, inputs.width), np.float32)
+    if method.rooms and SILENCE in data.classes:
+        more_inputs = _empty_rooms(features, inputs, rng)
+    return Examples(
+        np.stack(computed),
+        np.stack(usable),
+        data.target,
+        data.weight,
+        more_inputs,
+        np.full(len(more_inputs), data.classes.index(SILENCE) if len(more_inputs) else 0),
+    )
 
 
-def cross_validate(
+def _usable(
+    segments: Float32, floor: Float64, data: Dataset, features: FeatureSet, window_frames: int
+) -> Bool:
+    """Tell which windows of segments are loud enough to be learned from."""
+    power = features.power(segments).astype(np.float64)
+    places = window_places(segments.shape[1], window_frames)
+    windows = [power[:, place : place + window_frames].mean(axis=1) for place in places]
+    if len(places) == 1:
+        return ~np.isnan(np.stack(windows, axis=1))
+    quietest = power.mean(axis=1) * _BELOW_SEGMENT
+    if floor.shape[1]:
+        quietest = np.maximum(quietest, _ABOVE_FLOOR * floor[:, -1])
+    loud = np.stack(windows, axis=1) > quietest[:, np.newaxis]
+    if SILENCE in data.classes:
+        loud |= (data.target == data.classes.index(SILENCE))[:, np.newaxis]
+    usable: Bool = loud & ~np.isnan(power).any(axis=1, keepdims=True)
+    return usable
+
+
+def _empty_rooms(features: FeatureSet, inputs: Inputs, rng: np.random.Generator) -> Float32:
+    rooms = [empty_room(features, rng) for _ in range(_EMPTY_ROOMS)]
+    frames = inputs.window_frames
+    windows = np.stack(
+        [room.features[place : place + frames] for place in _PLACES for room in rooms]
+    )
+    return inputs.of_windows(windows, np.stack([room.floor for room in rooms * len(_PLACES)]))
+
+
+def cross_validate(  # noqa: PLR0913, PLR0917
     methods: Sequence[Method],
     examples: Examples,
     classes: int,
     folds: Iterable[Fold],
     progress: Progress,
+    home: Indices = NO_HOME,
 ) -> Float64:
     """Classify segments by classifiers that have not seen them.
 
@@ -207,6 +352,8 @@ def cross_validate(
         Indices of the segments to learn from, and of those to test on.
     progress : callable
         Is told the share of the fits that is done, 0 to 1.
+    home : np.ndarray [shape=(h,)], intp
+        Indices of segments of the home to which classifiers are adapted.
 
     Returns
     -------
@@ -217,7 +364,8 @@ def cross_validate(
     decisions = np.full((len(methods), len(examples.target), classes), np.nan)
     tasks = list(product(range(len(methods)), folds))
     calls = (
-        delayed(_decide_unseen)(methods[number], classes, fold, *examples) for number, fold in tasks
+        delayed(_decide_unseen)(methods[number], classes, fold, home, *examples)
+        for number, fold in tasks
     )
     for done, decided in enumerate(in_parallel(calls)):
         number, (_, unseen) = tasks[done]
@@ -226,38 +374,13 @@ def cross_validate(
     return decisions
 
 
-def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
+def _decide_unseen(
+    method: Method, classes: int, fold: Fold, home: Indices, *arrays: Any
+) -> Float64:
     """Classify the test segments of a fold; joblib sends each array, an argument, once."""
     examples, (seen, unseen) = Examples(*arrays), fold
-    return method.fit(examples, seen).decide(examples.inputs[0, unseen], classes)
-
-
-def inverse_temperature(decisions: Float64, target: Indices) -> float:
-    """Find the factor of decision values that minimises the log loss of their softmax.
-
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf for a class that was not learned.
-    target : np.ndarray [shape=(n,)], intp
-        Indices of the true classes.
-
-    Returns
-    -------
-    float
-        From exp(-5) to exp(5); the inverse of the temperature.
-
-    References
-    ----------
-    Guo et al., "On Calibration of Modern Neural Networks", 2017.
-    """
-
-    def loss(logarithm: float) -> float:
-        probabilities = softmax(np.exp(logarithm) * decisions)[np.arange(len(target)), target]
-        return float(-np.log(np.maximum(probabilities, 1e-300)).mean())
-
-    result = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
-    return float(np.exp(result.x))
+    learned = method.fit(examples, seen, np.intersect1d(seen, home))
+    return examples.decide(learned, unseen, classes)
 
 
 def softmax(values: Float64) -> Float64:

@@ -1,6 +1,6 @@
 """Scenarios: which labels of a manifest make up which class of a model."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ _GENERAL = (
 )
 _WATER = (sound.FLUSHING_WATER, sound.SHOWER, sound.TAP_WATER)
 _BATHROOM_OTHER = (sound.BATHROOM_OTHER, *_GENERAL[1:])
+_FEWEST_UNKNOWN = 5  # sources
 LABELS = frozenset(row.name for row in sound.CLASSES) - {sound.OTHER, sound.UNKNOWN}
 
 
@@ -59,11 +60,35 @@ class Scenario:
         str or None
             Name of the class; None if the label is ignored, or in no class.
         """
+        if marked and label == sound.UNKNOWN:  # a reviewer cannot tell
+            return None
         classes: dict[str, str | None] = dict.fromkeys(self.ignored)
         classes |= {name: name for name in self.classes} if marked else {}
         classes |= self.class_of
         meant = {classes[name] for name in sound.meant_by(label, classes)}
         return meant.pop() if len(meant) == 1 else None
+
+    def with_unknown(self, sources: Iterable[tuple[str, str]]) -> "Scenario":
+        """Return this scenario with a class `unknown` of all that is in none of its classes.
+
+        Parameters
+        ----------
+        sources : iterable of (str, str)
+            Label and source group of each clip of a manifest.
+
+        Returns
+        -------
+        Scenario
+            This one, if fewer than five sources have such labels.
+        """
+        others = {(label, group) for label, group in sources if self._is_other(label)}
+        if sound.UNKNOWN in self.classes or len({group for _, group in others}) < _FEWEST_UNKNOWN:
+            return self
+        labels = tuple(sorted({label for label, _ in others}))
+        return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
+
+    def _is_other(self, label: str) -> bool:
+        return label not in self.ignored and self.find(label) is None
 
     @property
     def labels(self) -> frozenset[str]:

@@ -15,9 +15,12 @@ from sklearn.svm import SVC
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.method import NO_HOME, Examples, Method
 from hearthlog.models.classifiers.description import Description
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
+MOST_WINDOWS = 12_000  # the time that fitting takes grows with their square
+_SEED = 20_261_122
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
 
@@ -32,13 +35,13 @@ class SvmMethod(Method):
     Attributes
     ----------
     cost : float
-        Cost of a segment on the wrong side of the margin.
+        Cost of a window on the wrong side of the margin.
     gamma : float
         Gamma of the kernel, times the number of inputs.
     """
 
-    cost: float
-    gamma: float
+    cost: float = 4.0
+    gamma: float = 1.0
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -64,20 +67,21 @@ class SvmMethod(Method):
             Indices of those among them that belong to the home to which the classifier is adapted:
             unchanged, they get votes of their own.
         """
-        copies, _, width = examples.inputs.shape
-        inputs = examples.inputs[:, seen].reshape(-1, width).astype(np.float64)
+        inputs, target, weight = examples.windows(seen)
+        if len(inputs) > MOST_WINDOWS:
+            kept = np.random.default_rng(_SEED).permutation(len(inputs))
+            kept = kept[np.argsort(-weight[kept], kind="stable")][:MOST_WINDOWS]
+            inputs, target, weight = inputs[kept], target[kept], weight[kept]
         machine = SVC(
             C=self.cost,
-            gamma=self.gamma / width,
+            gamma=self.gamma / inputs.shape[1],
             class_weight="balanced",
             decision_function_shape="ovo",
         )
         fitted = make_pipeline(StandardScaler(), machine).fit(
-            inputs,
-            np.tile(examples.target[seen], copies),
-            svc__sample_weight=np.tile(examples.weight[seen], copies),
+            inputs.astype(np.float64), target, svc__sample_weight=weight
         )
-        return LearnedSvm(fitted, examples.inputs[0, home], examples.target[home])
+        return LearnedSvm(fitted, *_home_windows(examples, home))
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with another cost or gamma.
@@ -104,6 +108,31 @@ class SvmMethod(Method):
             for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
         ]
 
+    def memory(self, remembered: tuple[Float32, Indices]) -> dict[str, NDArray[Any]]:
+        """Return arrays by which an adapted model gives `remembered` again."""
+        return {"base_vectors": remembered[0], "base_target": remembered[1].astype(np.int64)}
+
+    def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
+        """Return the support vectors, from which the same machine would be learned again.
+
+        Copies in other rooms are among them, which the training windows of a model lack.
+
+        Parameters
+        ----------
+        base : Model
+
+        Returns
+        -------
+        (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)]) or None
+            None for a method without copies in other rooms.
+        """
+        if not self.rooms:
+            return None
+        if "base_vectors" in base.arrays:
+            return base.arrays["base_vectors"], base.arrays["base_target"]
+        counts = base.arrays["support_counts"]
+        return base.arrays["support_vectors"], np.repeat(np.arange(len(counts)), counts)
+
     def as_of(self, description: Description) -> Self:
         """Return this method with cost, gamma and number of copies of a model.
 
@@ -120,6 +149,12 @@ class SvmMethod(Method):
         width = self.features.inputs[description.inputs].width
         cost, gamma = description.parameters["cost"], description.parameters["gamma"]
         return replace(self, cost=cost, gamma=gamma * width, copies=description.copies)
+
+
+def _home_windows(examples: Examples, home: Indices) -> tuple[Float32, Indices]:
+    """Return the unchanged windows of the segments of a home, and their classes."""
+    inputs, usable = examples.inputs[0, home], examples.usable[0, home]
+    return inputs[usable], np.broadcast_to(examples.target[home, np.newaxis], usable.shape)[usable]
 
 
 class LearnedSvm:
@@ -198,3 +233,16 @@ class LearnedSvm:
 
 BANDS = SvmMethod("bands", "auros21", "bands", SVM_RBF.name, copies=1, cost=4.0, gamma=1.25)
 PAPER = SvmMethod("paper", "auros21", "statistics", SVM_RBF.name, copies=0, cost=4.0, gamma=0.5)
+ROOM = SvmMethod(
+    "room",
+    "home33",
+    "above_floor",
+    SVM_RBF.name,
+    copies=0,
+    rooms=3,
+    gate=2.0,
+    observation_weight=0.45,
+    cost=4.0,
+    gamma=0.5,
+)
+ROOM21 = replace(ROOM, name="room21", feature_set="auros21")

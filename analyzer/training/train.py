@@ -6,18 +6,26 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
+from numpy.typing import NDArray
+from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.calibration import (
+    calibrate_elsewhere,
+    collection_folds,
+    home_temperature,
+    inverse_temperature,
+    unknown_bias,
+)
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.installed import DEFAULT, method_named
 from hearthlog.analyzer.training.method import (
+    Examples,
     Fold,
     Learned,
     Method,
     cross_validate,
-    inverse_temperature,
     prepare,
     softmax,
 )
@@ -25,12 +33,16 @@ from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import calibration_error
 from hearthlog.analyzer.training.transitions import (
     LAG_SECONDS,
+    REACH_SECONDS,
+    SHORTEST_SECONDS,
     default_transitions,
     expected_durations,
     transitions_from_sequences,
 )
+from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import (
     FORMAT,
+    MOST_WEIGHT,
     ClassMetrics,
     Collection,
     Description,
@@ -39,10 +51,12 @@ from hearthlog.models.classifiers.description import (
     TrainingData,
 )
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.arrays import Float64, Indices, Int64
+from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.progress import Progress, ignore_progress
 
 MOST_FOLDS = 5
+_FEWEST_OF_HOME = 10  # segments
 SMOOTHINGS = ("hmm", "merge")
 _SHUFFLES = 20
 
@@ -77,31 +91,42 @@ def train_model(
         If the feature set of the method is not installed.
     """
     check_varied(data)
-    folds = group_folds(data)
-    examples = prepare(method, data)
+    sources, collections = group_folds(data), collection_folds(data)
+    examples, fits = prepare(method, data), len(sources) + len(collections) + 1
 
-    def report(share: float) -> None:
-        progress(share * len(folds) / (len(folds) + 1))
+    def decide(folds: list[Fold], before: int) -> Float64:
+        def report(share: float) -> None:
+            progress((before + share * len(folds)) / fits)
 
-    [decisions] = cross_validate([method], examples, len(data.classes), folds, report)
-    inverse = inverse_temperature(decisions, data.target)
+        return cross_validate([method], examples, len(data.classes), folds, report)[0]
+
+    decisions = decide(sources, 0)
+    bias = unknown_bias(decisions, data.target, data.classes)
+    decisions += bias
+    inverse, elsewhere = inverse_temperature(decisions, data.target), None
+    if collections:
+        others = decide(collections, len(sources)) + bias
+        inverse, elsewhere = calibrate_elsewhere(others, data, collections)
     learned = method.fit(examples)
     progress(1.0)
-    hidden = smoothing == "hmm"
     return Model(
         Description(
-            **_method_fields(method, learned),
+            **_method_fields(method, learned, data.classes),
             **_scenario_fields(scenario, data),
             calibration="temperature",
             inverse_temperature=inverse,
-            smoothing=Smoothing(method="hmm", lag_seconds=LAG_SECONDS)
-            if hidden
-            else Smoothing(method="merge"),
-            metrics=_metrics(data, decisions, inverse, len(folds)),
+            decision_bias={
+                name: float(value) for name, value in zip(data.classes, bias, strict=True) if value
+            },
+            novelty="doubt",
+            elsewhere=elsewhere,
+            smoothing=_smoothing(smoothing, method, inverse),
+            metrics=_metrics(data, decisions, inverse, len(sources)),
         ),
         learned.arrays(),
-        transitions=default_transitions(data.classes) if hidden else np.empty((0, 0)),
+        transitions=(default_transitions(data.classes) if smoothing == "hmm" else np.empty((0, 0))),
         training_windows=data.windows,
+        training_floor=data.floor,
         training_target=data.target.astype(np.int64),
         training_group=data.group.astype(np.int64),
     )
@@ -123,8 +148,9 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
     Returns
     -------
     Model
-        With the parameters, calibration and metrics of `base`, which are those of other homes. It
-        keeps the windows of `base` only, so that it can be adapted again to more of the home.
+        With the parameters and metrics of `base`, which are those of other homes. Its temperature
+        is moved by parts of the home that were left out in turn. It keeps the windows of `base`
+        only, so that it can be adapted again to more of the home.
 
     Raises
     ------
@@ -136,37 +162,80 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
         If the method cannot be imported, or its feature set is not installed.
     """
     description = base.description
-    if not len(base.training_windows):
-        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
     if not len(home):
         reasons = "; ".join(f"{count} recordings: {why}" for why, count in home.skipped.items())
         raise DataError(
             f"the home has no segments of a class of the model ({reasons or 'nothing is marked'})"
         )
-    joined = replace(
-        home,
-        windows=np.concatenate([base.training_windows, home.windows]),
-        target=np.concatenate([base.training_target, home.target]),
-        group=np.concatenate([base.training_group, home.group]),
-        weight=np.concatenate([np.ones(len(base.training_windows)), home.weight]),
-    )
     method = method_named(description.method).as_of(description)
-    examples = prepare(method, joined)
-    learned = method.fit(examples, home=np.arange(len(base.training_windows), len(joined)))
+    memory: dict[str, NDArray[Any]] = {}
+    if (remembered := method.remembered(base)) is not None:
+        memory = method.memory(remembered)
+        examples, others = prepare(method, home), 0
+        examples = examples._replace(more_inputs=remembered[0], more_target=remembered[1])
+    else:
+        joined, others = _joined(base, home), len(base.training_windows)
+        examples = prepare(method, joined)
+    here = np.arange(others, others + len(home))
+    learned = method.fit(examples, home=here)
+    inverse = _temperature_here(method, examples, here, description)
+    smoothing = description.smoothing
+    weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
     training = description.training_data.model_copy(
         update={"home": home.amounts, "base_sha256": base.sha256}
     )
+    update = {
+        "training_data": training,
+        "inverse_temperature": inverse,
+        "smoothing": smoothing.model_copy(update={"weight": weight}),
+    }
     return Model(
-        description.model_copy(update={"training_data": training}),
-        learned.arrays(),
+        description.model_copy(update=update),
+        learned.arrays() | memory,
         transitions=(
             transitions_from_sequences(sequences, expected_durations(base.classes))
             if len(base.transitions) and len(sequences)
             else base.transitions
         ),
         training_windows=base.training_windows,
+        training_floor=base.training_floor,
         training_target=base.training_target,
         training_group=base.training_group,
+    )
+
+
+def _temperature_here(
+    method: Method, examples: Examples, home: Indices, description: Description
+) -> float:
+    """Return the inverse temperature of a model adapted to a home, by parts of it left out."""
+    if len(home) < _FEWEST_OF_HOME:
+        return description.inverse_temperature
+    everything = np.arange(len(examples.target))
+    parts = np.array_split(home, MOST_FOLDS)
+    folds = [(np.setdiff1d(everything, part), part) for part in parts]
+    classes = description.classes
+    [decisions] = cross_validate([method], examples, len(classes), folds, ignore_progress, home)
+    bias = np.array([description.decision_bias.get(name, 0.0) for name in classes])
+    return home_temperature(
+        decisions[home] + bias, examples.target[home], description.inverse_temperature
+    )
+
+
+def _joined(base: Model, home: Dataset) -> Dataset:
+    """Join the training windows of a model with the segments of a home."""
+    count = len(base.training_windows)
+    if not count:
+        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
+    floor = base.training_floor if len(base.training_floor) else np.zeros((count, home.bands))
+    return replace(
+        home,
+        windows=np.concatenate([base.training_windows, home.windows]),
+        target=np.concatenate([base.training_target, home.target]),
+        group=np.concatenate([base.training_group, home.group]),
+        weight=np.concatenate([np.ones(count), home.weight]),
+        floor=np.concatenate([floor, home.floor]),
+        copies=home.copies[:0],
+        copy_floor=home.copy_floor[:0],
     )
 
 
@@ -218,13 +287,24 @@ def group_folds(data: Dataset) -> list[Fold]:
 
 def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Metrics:
     predicted = decision.argmax(axis=1)
+    numbers = range(len(data.classes))
     precision, recall, f1, _ = precision_recall_fscore_support(
-        data.target, predicted, labels=range(len(data.classes)), zero_division=0.0
+        data.target, predicted, labels=numbers, zero_division=0.0
     )
-    confusion = confusion_matrix(data.target, predicted, labels=range(len(data.classes)))
+    confusion = confusion_matrix(data.target, predicted, labels=numbers)
+    known = [number for number in numbers if data.classes[number] != UNKNOWN]
+    of_known = np.isin(data.target, known)
     return Metrics(
         folds=folds,
-        macro_f1=float(f1.mean()),
+        macro_f1=float(
+            f1_score(
+                data.target[of_known],
+                predicted[of_known],
+                labels=known,
+                average="macro",
+                zero_division=0.0,
+            )
+        ),
         expected_calibration_error=calibration_error(softmax(inverse * decision), data.target),
         classes={
             name: ClassMetrics(
@@ -236,8 +316,21 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
     )
 
 
-def _method_fields(method: Method, learned: Learned) -> dict[str, Any]:
+def _smoothing(name: str, method: Method, inverse: float) -> Smoothing:
+    if name == "merge":
+        return Smoothing(method="merge")
+    return Smoothing(
+        method="hmm",
+        lag_seconds=LAG_SECONDS,
+        weight=min(method.observation_weight / inverse, MOST_WEIGHT),
+        reach_seconds=REACH_SECONDS,
+        shortest_seconds=SHORTEST_SECONDS,
+    )
+
+
+def _method_fields(method: Method, learned: Learned, classes: Sequence[str]) -> dict[str, Any]:
     features = method.features
+    window = features.inputs[method.inputs].window_frames
     return {
         "format": FORMAT,
         "kind": method.kind,
@@ -247,7 +340,9 @@ def _method_fields(method: Method, learned: Learned) -> dict[str, Any]:
         "feature_set_version": features.version,
         "feature_names": list(features.feature_names),
         "inputs": method.inputs,
-        "window_seconds": features.window_seconds,
+        "window_seconds": window * FRAME_SECONDS,
+        "label_frame": window // 2,
+        "gate": method.gate if SILENCE in classes else 0.0,
         "copies": method.copies,
         "versions": {name: version(name) for name in ("hearthlog", "numpy", *method.libraries)},
     }

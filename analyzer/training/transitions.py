@@ -9,8 +9,10 @@ from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real clips; 1 s does not
+REACH_SECONDS = 0.3
+SHORTEST_SECONDS = 0.25
 
-_SECONDS = 5.0  # expected duration of a class that is not in the table of classes
+_SECONDS = 10.0  # expected duration of a class that is not in the table of classes
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
@@ -19,7 +21,7 @@ def default_transitions(classes: Sequence[str]) -> Float64:
     Parameters
     ----------
     classes : sequence of str
-        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 5 s.
+        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 10 s.
 
     Returns
     -------
@@ -35,7 +37,7 @@ def expected_durations(classes: Sequence[str]) -> Float64:
     Parameters
     ----------
     classes : sequence of str
-        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 5 s.
+        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 10 s.
 
     Returns
     -------

@@ -10,7 +10,7 @@ from hearthlog.models.labels.smoothing import log_likelihoods
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 
-def viterbi(probabilities: Float32, transitions: Float64) -> Indices:
+def viterbi(probabilities: Float32, transitions: Float64, weight: float = 1.0) -> Indices:
     """Decode the likeliest path through a whole sound; all classes are equally likely to begin it.
 
     Parameters
@@ -19,6 +19,8 @@ def viterbi(probabilities: Float32, transitions: Float64) -> Indices:
         Of the classes, frame by frame, 0 to 1.
     transitions : np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class.
+    weight : float
+        As of `log_likelihoods`.
 
     Returns
     -------
@@ -33,7 +35,7 @@ def viterbi(probabilities: Float32, transitions: Float64) -> Indices:
     model = _LikelihoodHMM(count)
     model.startprob_ = np.full(count, 1.0 / count)
     model.transmat_ = transitions
-    path: Indices = model.predict(log_likelihoods(probabilities))
+    path: Indices = model.predict(log_likelihoods(probabilities, weight))
     return path
 
 

@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32
 
@@ -27,6 +29,9 @@ class Classifier:
     feature_set : FeatureSet
     inputs : Inputs
         Inputs of the feature set that `classify` takes.
+    timing : LabelTiming
+    gate : float
+        A window is silence where no band is so many dB above the floor; 0 for no gate.
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
         Those of the model.
@@ -42,9 +47,14 @@ class Classifier:
         self.classes = model.classes
         self.feature_set = feature_set(description.feature_set)
         self.inputs = self.feature_set.inputs[description.inputs]
+        self.timing = label_timing(description)
+        self.gate = description.gate
         self.smoothing = description.smoothing
         self.transitions = model.transitions
         self._inverse_temperature = description.inverse_temperature
+        self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
+        self._doubts = description.novelty == "doubt"
+        self._known = np.array([name != UNKNOWN for name in self.classes])
         self._machine = classifier_kind(description.kind).machine(model)
 
     def probabilities(self, inputs: Float32) -> Float32:
@@ -75,15 +85,19 @@ class Classifier:
         probabilities : np.ndarray [shape=(n, C)], float32
             In the order of the model's classes; every row sums to 1.
         novelty : np.ndarray [shape=(n,)], float32
-            From 0 to 1, where 1 is unlike anything learned; NaN if the kind of classifier has none.
+            Probability that it is none of the classes but `unknown` that is likeliest, 0 to 1;
+            of older models what the kind of classifier gives, or NaN.
         """
         result = np.empty((len(inputs), len(self.classes)), np.float32)
         novelty = np.empty(len(inputs), np.float32)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
             decision, novelty[rows] = self._machine.decide(inputs[rows])
+            decision += self._bias
             decision *= self._inverse_temperature
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)
+        if self._doubts:
+            novelty = 1.0 - result[:, self._known].max(axis=1, initial=0.0)
         return result, novelty

@@ -7,12 +7,14 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from hearthlog.models.errors import ModelError
+from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.text import printable
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
-FORMAT: Final = 3
+FORMAT: Final = 4
+MOST_WEIGHT: Final = 10.0
 SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
 
@@ -20,7 +22,8 @@ _ClassName = Annotated[str, StringConstraints(pattern=rf"^{CLASS_NAME.pattern}$"
 _Text = Annotated[str, StringConstraints(pattern=rf"^{TEXT.pattern}$")]
 _Digest = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 _Count = Annotated[int, Field(ge=0, lt=1 << 53)]
-_Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+_LONGEST_SECONDS = 1e6
+_Positive = Annotated[float, Field(gt=0.0, le=_LONGEST_SECONDS)]
 _Seconds = Annotated[float, Field(ge=0.0, le=1e12)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -87,6 +90,27 @@ class Metrics(_Record):
     confusion: list[list[_Count]]
 
 
+class Elsewhere(_Record):
+    """Scores in collections of which nothing was learned, which is what a new home is.
+
+    Attributes
+    ----------
+    collections : int
+        Number of collections, each of which was left out.
+    segments : int
+        Number of segments of classes that other collections have, too.
+    right : float
+        Share of them that were recognised.
+    expected_calibration_error : float
+        With the temperature from the other collections.
+    """
+
+    collections: _Count
+    segments: _Count
+    right: _Share
+    expected_calibration_error: _Share
+
+
 class Smoothing(_Record):
     """How labels become segments.
 
@@ -96,10 +120,19 @@ class Smoothing(_Record):
         `merge`: successive equal labels become one. `hmm`: the labels are those of the likeliest
         path through a hidden Markov model, decided `lag_seconds` after the sound.
     lag_seconds : float
+    weight : float
+        Weight of a frame's probabilities in the hidden Markov model.
+    reach_seconds : float
+        Time by which a border of silence is moved at most, to where the level changes.
+    shortest_seconds : float
+        States that are shorter give way to the one before.
     """
 
     method: Literal["merge", "hmm"]
     lag_seconds: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+    weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] = 1.0
+    reach_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    shortest_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
 
 
 class Description(_Record):
@@ -115,13 +148,26 @@ class Description(_Record):
         Feature set of the classifier, and which of its inputs.
     method : str
         Method by which it was learned, and is adapted.
+    label_frame : int
+        Frame of a window, from 0 on, which the label of the window speaks of.
+    gate : float
+        A window is silence where no band is so many dB above the floor of the room; 0 for no
+        gate.
     copies : int
         Number of augmented copies of each segment.
     inverse_temperature : float
         Factor of the decision values before the softmax, from calibration.
+    decision_bias : dict of str to float
+        What is added to the decision values of classes before.
+    novelty : str
+        `doubt`: the probability that a label is wrong. `machine`: what the kind of classifier
+        gives, as older models have it.
+    elsewhere : Elsewhere or None
+        Scores in collections left out, from which the temperature is; None if it is from sources
+        left out, for want of collections.
     """
 
-    format: Literal[3]
+    format: Literal[4]
     kind: _Text
     parameters: dict[_Text, Any]
     method: _Text
@@ -131,11 +177,16 @@ class Description(_Record):
     feature_names: Annotated[list[_Text], Field(min_length=1, max_length=1000)]
     inputs: _Text
     window_seconds: _Positive
+    label_frame: Annotated[int, Field(ge=0, lt=1000)]
+    gate: Annotated[float, Field(ge=0.0, le=40.0)]
     scenario_name: _Text
     scenario: dict[_ClassName, list[_Text]]
     copies: _Count = 0
     calibration: Literal["temperature"]
     inverse_temperature: _Positive
+    decision_bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]]
+    novelty: Literal["doubt", "machine"]
+    elsewhere: Elsewhere | None
     smoothing: Smoothing
     training_data: TrainingData
     metrics: Metrics
@@ -195,19 +246,24 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
     number = content.get("format")
     if isinstance(number, int) and number > FORMAT:
         raise ModelError(f"is of format {number}, newer than this version of hearthlog: update it")
-    if number != 2:
-        return content
-    inputs = content.get("inputs", "statistics")
-    parameters = {key: content[key] for key in ("cost", "gamma") if key in content}
-    rest = {key: value for key, value in content.items() if key not in parameters}
-    return {
-        **rest,
-        "format": FORMAT,
-        "parameters": parameters,
-        "feature_set_version": 1,
-        "inputs": inputs,
-        "method": _OLD_METHODS.get(inputs, "") if isinstance(inputs, str) else "",
-    }
+    if number == 2:
+        inputs = content.get("inputs", "statistics")
+        parameters = {key: content[key] for key in ("cost", "gamma") if key in content}
+        content = {
+            **{key: value for key, value in content.items() if key not in parameters},
+            "parameters": parameters,
+            "feature_set_version": 1,
+            "inputs": inputs,
+            "method": _OLD_METHODS.get(inputs, "") if isinstance(inputs, str) else "",
+        }
+    if isinstance(number, int) and 2 <= number < FORMAT:
+        # A label spoke of the second that ended with its frame.
+        seconds, frames = content.get("window_seconds"), 1
+        if isinstance(seconds, int | float) and 0 < seconds <= _LONGEST_SECONDS:
+            frames = max(round(seconds / FRAME_SECONDS), 1)
+        content = {**content, "format": FORMAT, "label_frame": frames - 1, "gate": 0.0}
+        content |= {"decision_bias": {}, "novelty": "machine", "elsewhere": None}
+    return content
 
 
 def first_problem(error: ValidationError) -> str:

@@ -27,6 +27,8 @@ class Model:
         where segments are merged.
     training_windows : np.ndarray [shape=(m, window_frames, d)], float32
         Features that it was learned from, kept for adaptation; empty if they are not kept.
+    training_floor : np.ndarray [shape=(m, b)], float64
+        Floor of the room in each training window; empty for a feature set without bands.
     training_target, training_group : np.ndarray [shape=(m,)], int64
         Classes of the training windows, and numbers of their source groups.
     name : str
@@ -39,6 +41,7 @@ class Model:
     arrays: Mapping[str, Array]
     transitions: Float64 = field(default_factory=lambda: np.empty((0, 0)))
     training_windows: Float32 = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
+    training_floor: Float64 = field(default_factory=lambda: np.empty((0, 0)))
     training_target: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     training_group: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     name: str = ""

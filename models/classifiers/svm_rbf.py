@@ -49,6 +49,10 @@ class SvmKind(ClassifierKind):
         Inputs that a home has corrected, which draw similar inputs to their class.
     home_target : [shape=(h,)], int64, optional
         Classes of the home vectors.
+    base_vectors : [shape=(b, width)], float32, optional
+        Support vectors of the model that was adapted, from which it is adapted again.
+    base_target : [shape=(b,)], int64, optional
+        Classes of the base vectors.
     """
 
     name = "svm-rbf"
@@ -64,6 +68,8 @@ class SvmKind(ClassifierKind):
     optional: Mapping[str, np.dtype[Any]] = {
         "home_vectors": np.dtype(np.float32),
         "home_target": np.dtype(np.int64),
+        "base_vectors": np.dtype(np.float32),
+        "base_target": np.dtype(np.int64),
     }
 
     def shapes(
@@ -81,11 +87,11 @@ class SvmKind(ClassifierKind):
         Returns
         -------
         dict of str to tuple of int
-            By name of the array; home vectors only if there are any.
+            By name of the array; home and base vectors only if there are any.
         """
-        total, home = (
+        total, home, base = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
-            for name in ("support_vectors", "home_vectors")
+            for name in ("support_vectors", "home_vectors", "base_vectors")
         )
         shapes: dict[str, tuple[int, ...]] = {
             "scaler_mean": (width,),
@@ -97,6 +103,8 @@ class SvmKind(ClassifierKind):
         }
         if home:
             shapes["home_vectors"], shapes["home_target"] = (home, width), (home,)
+        if base:
+            shapes["base_vectors"], shapes["base_target"] = (base, width), (base,)
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
@@ -119,9 +127,10 @@ class SvmKind(ClassifierKind):
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
         if (counts < 0).any() or counts.sum() != total:
             return f"support_counts do not add up to the {total} support vectors"
-        target = arrays.get("home_target", counts[:0])
-        if ((target < 0) | (target >= classes)).any():
-            return "home_target has classes that the model has not"
+        for name in ("home_target", "base_target"):
+            target = arrays.get(name, counts[:0])
+            if ((target < 0) | (target >= classes)).any():
+                return f"{name} has classes that the model has not"
         return None
 
     def machine(self, model: Model) -> "SvmMachine":

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.features.window_inputs import Inputs
-from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 SILENCE_POWER = 10 ** (-60 / 10)  # mean square, -60 dBFS: below it no event is learned from
@@ -50,7 +50,7 @@ class FeatureSet:
     feature_names, units : tuple of str
         Names and units of the d values of a frame.
     window_frames : int
-        Length of the window of the statistics and of a label.
+        Length of the window of the logged statistics.
     extractor : callable
         Makes an `Extractor`.
     inputs : mapping of str to Inputs
@@ -58,6 +58,9 @@ class FeatureSet:
     power : callable
         Maps features, shape (..., d), to the mean square of the samples, shape (...); full scale
         is 1.
+    band_powers : callable or None
+        Maps features, shape (n, d), to powers of b bands, shape (n, b), of which the last is that
+        of the frame; the floor of a room is tracked in them. None if the set has no bands.
     augmented : callable or None
         Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to what
         another microphone in another room would give. None if features cannot be changed so.
@@ -71,12 +74,20 @@ class FeatureSet:
     extractor: Callable[[], Extractor]
     inputs: Mapping[str, Inputs]
     power: Callable[[NDArray[Any]], NDArray[Any]]
+    band_powers: Callable[[Float32], Float64] | None = None
     augmented: Callable[[Float32, np.random.Generator], Float32] | None = None
 
     @property
     def width(self) -> int:
         """Number of values of a frame."""
         return len(self.feature_names)
+
+    @property
+    def bands(self) -> int:
+        """Number of bands in which the floor of a room is tracked."""
+        if self.band_powers is None:
+            return 0
+        return self.band_powers(np.zeros((1, self.width), np.float32)).shape[1]
 
     @property
     def window_seconds(self) -> float:

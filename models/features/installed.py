@@ -3,9 +3,10 @@
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.home33 import HOME33
 
 DEFAULT = AUROS21
-FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [AUROS21])
+FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [AUROS21, HOME33])
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:

@@ -9,18 +9,22 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Float32, Float64
 
+STEP_FRAMES = 6  # between windows of a segment
 _FRAMES_AT_ONCE = 256
 
 
 class InputStream(Protocol):
     """The inputs at the frames of one stream."""
 
-    def __call__(self, features: Float32) -> Float32:
+    def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
         """Compute the inputs at successive frames.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
+        floors : np.ndarray [shape=(n, b)], float64, optional
+            Floor of the room at each frame, as of `FloorTracker`; inputs that need it raise
+            TypeError without.
 
         Returns
         -------
@@ -40,28 +44,72 @@ class Inputs(Protocol):
     ----------
     width : int
         Number of inputs.
+    window_frames : int
+    needs_floor : bool
+        Whether they depend on the floor of the room.
     """
 
     @property
     def width(self) -> int:
         """Number of inputs."""
 
+    @property
+    def window_frames(self) -> int:
+        """Number of frames of a window."""
+
+    @property
+    def needs_floor(self) -> bool:
+        """Whether they depend on the floor of the room."""
+
     def stream(self) -> InputStream:
         """Begin a stream."""
 
-    def of_windows(self, windows: Float32) -> Float32:
+    def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
         """Compute the inputs of single windows.
 
         Parameters
         ----------
         windows : np.ndarray [shape=(n, window_frames, d)], float32
             Features.
+        floors : np.ndarray [shape=(n, b)], float64, optional
+            Floor of the room in each window.
 
         Returns
         -------
         np.ndarray [shape=(n, width)], float32
             The same bits as of a stream.
         """
+
+
+def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None) -> Float32:
+    """Compute the inputs of the windows in segments.
+
+    Parameters
+    ----------
+    inputs : Inputs
+    segments : np.ndarray [shape=(n, f, d)], float32
+        Features of successive frames, at least a window.
+    floors : np.ndarray [shape=(n, b)], float64, optional
+        Floor of the room in each segment.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, places, width)], float32
+        Of the windows at the places of `window_places`.
+    """
+    length = inputs.window_frames
+    return np.stack(
+        [
+            inputs.of_windows(segments[:, place : place + length], floors)
+            for place in window_places(segments.shape[1], length)
+        ],
+        axis=1,
+    )
+
+
+def window_places(segment_frames: int, window_frames: int) -> range:
+    """Return where the windows of a segment begin: 0.3 s from each other."""
+    return range(0, segment_frames - window_frames + 1, STEP_FRAMES)
 
 
 @dataclass(frozen=True)
@@ -77,12 +125,15 @@ class WindowStatistics:
         d'.
     changes : bool
         Whether the mean absolute difference from frame to frame is an input too.
+    needs_floor : bool
+        Whether `values` takes floors, shape (n, b), or None as a second argument.
     """
 
     window_frames: int
-    values: Callable[[Float32], NDArray[Any]]
+    values: Callable[..., NDArray[Any]]
     values_width: int
     changes: bool = False
+    needs_floor: bool = False
 
     @property
     def width(self) -> int:
@@ -93,13 +144,15 @@ class WindowStatistics:
         """Begin a stream."""
         return StatisticsStream(self)
 
-    def of_windows(self, windows: Float32) -> Float32:
+    def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
         """Compute the inputs of single windows.
 
         Parameters
         ----------
         windows : np.ndarray [shape=(n, window_frames, d)], float32
             Features.
+        floors : np.ndarray [shape=(n, b)], float64, optional
+            Floor of the room in each window.
 
         Returns
         -------
@@ -109,11 +162,19 @@ class WindowStatistics:
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
             part = windows[start : start + _FRAMES_AT_ONCE]
-            values = self.values(part.reshape(-1, part.shape[-1]))
+            repeated = None
+            if floors is not None:
+                part_floors = floors[start : start + _FRAMES_AT_ONCE]
+                repeated = part_floors.repeat(self.window_frames, axis=0)
+            values = self.values_of(part.reshape(-1, part.shape[-1]), repeated)
             frames = values.reshape(len(part), self.window_frames, -1).swapaxes(0, 1)
             changes = np.abs(np.diff(frames, axis=0)) if self.changes else ()
             self.reduce([*frames], [*changes], inputs[start : start + _FRAMES_AT_ONCE])
         return inputs
+
+    def values_of(self, features: Float32, floors: Float64 | None) -> NDArray[Any]:
+        """Return the values of each frame, by its floor if they need it."""
+        return self.values(features, floors) if self.needs_floor else self.values(features)
 
     def reduce(
         self, frames: Sequence[NDArray[Any]], changes: Sequence[NDArray[Any]], out: Float32
@@ -153,17 +214,21 @@ class StatisticsStream:
     def __init__(self, inputs: WindowStatistics) -> None:
         self.recent: Float32 | None = None
         self._inputs = inputs
+        self._values: NDArray[Any] | None = None
 
     def restart(self) -> None:
         """Forget the past: the next frame does not follow the last one."""
-        self.recent = None
+        self.recent = self._values = None
 
-    def __call__(self, features: Float32) -> Float32:
+    def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
         """Compute the inputs at successive frames.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
+        floors : np.ndarray [shape=(n, b)], float64, optional
+            Floor of the room at each frame, as of `FloorTracker`; inputs that need it raise
+            TypeError without.
 
         Returns
         -------
@@ -172,11 +237,12 @@ class StatisticsStream:
             restart.
         """
         kind, length = self._inputs, self._inputs.window_frames
+        values = kind.values_of(features, floors)
         if self.recent is not None:
             features = np.concatenate([self.recent, features])
-        self.recent = features[max(len(features) - length + 1, 0) :].copy()
-        values = kind.values(features)
+            values = np.concatenate([self._values, values])
         count = max(len(features) - length + 1, 0)
+        self.recent, self._values = features[count:].copy(), values[count:].copy()
         inputs = np.empty((count, kind.width), np.float32)
         for start in range(0, count, _FRAMES_AT_ONCE):
             end = min(start + _FRAMES_AT_ONCE, count)

@@ -1,19 +1,21 @@
 """From the features of one stream to labels and segments, and to columns of their messages."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.labels.segments import Segment, Segmenter
-from hearthlog.schemas.arrays import Float32, Int64
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.models.features.floor import Floors, is_quiet
+from hearthlog.models.labels.segments import LabelledFrames, Segment, Segmenter
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.messages.cdr_codec import Column
 
 
 class FrameLabels(NamedTuple):
-    """What a classifier says of successive frames, each by the window that ends with it.
+    """What a classifier says of successive frames, each by the window around it.
 
     Attributes
     ----------
@@ -23,6 +25,8 @@ class FrameLabels(NamedTuple):
         Numbers of the frames.
     stamps : np.ndarray [shape=(n,)], int64
         Starts of the frames in nanoseconds of UTC.
+    known_at : np.ndarray [shape=(n,)], int64
+        Starts of the last frames of the windows.
     probabilities : np.ndarray [shape=(n, C)], float32
     novelty : np.ndarray [shape=(n,)], float32
         From 0 to 1; NaN where the classifier has none.
@@ -31,6 +35,7 @@ class FrameLabels(NamedTuple):
     classes: tuple[str, ...]
     frames: Int64
     stamps: Int64
+    known_at: Int64
     probabilities: Float32
     novelty: Float32
 
@@ -70,32 +75,62 @@ class Labeller:
     ----------
     classes : tuple of str
         Names behind the columns of the probabilities.
+    timing : LabelTiming
     segmenter : Segmenter
     """
 
     def __init__(self, classifier: Classifier) -> None:
         self.classes = classifier.classes
-        self.segmenter = Segmenter(classifier.smoothing, classifier.transitions, FRAME_SECONDS)
+        self.segmenter = Segmenter(classifier.classes, classifier.smoothing, classifier.transitions)
+        self.timing = classifier.timing
         self._classifier = classifier
         self._inputs = classifier.inputs.stream()
+        self._window: _Frames | None = None  # the last frames, one less than a window
+        self._floors_converged = not self.timing.needs_floor
+        self._first_label = self._first_segment = 0  # numbers of frames
 
-    def fill_window(self, features: Float32) -> None:
-        """Put the features of successive frames into the window, and label none of them.
+    @property
+    def states_converged(self) -> bool:
+        """Whether frames before the first one would leave no trace in the states to come."""
+        return self._floors_converged and self.segmenter.states_converged
+
+    @property
+    def segments_converged(self) -> bool:
+        """Whether frames before the first one would leave no trace in the segments to come."""
+        return self._floors_converged and self.segmenter.segments_converged
+
+    def follow(
+        self, features: Float32, floors: Float64 | None, stamps: Int64, frame: int, unlabelled: int
+    ) -> None:
+        """Take the place of another labeller before a frame, with which segments begin.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
+            Of the last frames before it.
+        floors : np.ndarray [shape=(m, b)], float64, or None
+            At the last m of them, at most n; None if the feature set has no bands.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of these frames in nanoseconds of UTC.
+        frame : int
+            Number of the frame.
+        unlabelled : int
+            Number of the first frame that the other one has not labelled.
         """
-        self._inputs(features)
+        self._first_label, self._first_segment = unlabelled, frame
+        self._advance(features, floors if self.timing.needs_floor else None, stamps)
 
     def push(
-        self, features: Float32, first: int, stamps: Int64
+        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
     ) -> tuple[FrameLabels, list[Segment]]:
         """Add successive frames.
 
         Parameters
         ----------
         features : np.ndarray [shape=(n, d)], float32
+        floors : Floors or None
+            At the last of these frames, before which none is labelled. None if the feature set has
+            no bands.
         first : int
             Number of the first frame.
         stamps : np.ndarray [shape=(n,)], int64
@@ -104,16 +139,38 @@ class Labeller:
         Returns
         -------
         labels : FrameLabels
-            Of the last frames: those at which a whole window is complete.
+            Of the frames whose windows these frames complete.
         segments : list of Segment
             Those whose end these frames decide.
         """
-        inputs = self._inputs(features)
-        labelled = slice(len(features) - len(inputs), None)
+        powers = None
+        if floors is not None and self.timing.needs_floor:
+            powers = floors.powers
+            if floors.converged and not self._floors_converged:
+                self._floors_converged = True
+                self.segmenter.forget()
+        inputs, window = self._advance(features, powers, stamps)
         probabilities, novelty = self._classifier.classify(inputs)
-        frames, stamps = np.arange(first, first + len(features))[labelled], stamps[labelled]
-        segments = self.segmenter.push(probabilities, stamps) if len(inputs) else []
-        return FrameLabels(self.classes, frames, stamps, probabilities, novelty), segments
+        self._silence_quiet(probabilities, novelty, window, powers)
+        count, spoken = len(inputs), self.timing.label_frame
+        first = first + len(features) - count - self.timing.delay
+        labelled = LabelledFrames(
+            probabilities,
+            window.powers[spoken:][:count],
+            window.stamps[spoken:][:count],
+            window.stamps[self.timing.window_frames - 1 :],
+        )
+        again = max(self._first_label - first, 0)  # frames that were labelled before
+        labels = FrameLabels(
+            self.classes,
+            np.arange(first, first + count)[again:],
+            labelled.stamps[again:],
+            labelled.known_at[again:],
+            probabilities[again:],
+            novelty[again:],
+        )
+        labelled = labelled.part(slice(max(self._first_segment - first, 0), None))
+        return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
 
     def close(self, end: int) -> list[Segment]:
         """Return the remaining segments of a sound that ends, and begin anew.
@@ -129,7 +186,49 @@ class Labeller:
             In the order of time.
         """
         self._inputs.restart()
+        self._window, self._first_label, self._first_segment = None, 0, 0
         return self.segmenter.close(end)
+
+    def _advance(
+        self, features: Float32, floors: Float64 | None, stamps: Int64
+    ) -> tuple[Float32, "_Frames"]:
+        """Return the inputs of the windows that are complete now, and all their frames."""
+        if floors is not None:
+            begin = len(features) - len(floors)
+            features, stamps = features[begin:], stamps[begin:]
+        feature_set = self._classifier.feature_set
+        frames = _Frames(features, feature_set.power(features), stamps)
+        if self._window is not None:
+            before = self._window
+            frames = _Frames(
+                np.concatenate([before.features, features]),
+                np.concatenate([before.powers, frames.powers]),
+                np.concatenate([before.stamps, stamps]),
+            )
+        keep = max(len(frames.stamps) - self.timing.window_frames + 1, 0)
+        self._window = _Frames(
+            frames.features[keep:].copy(), frames.powers[keep:].copy(), frames.stamps[keep:].copy()
+        )
+        return self._inputs(features, floors), frames
+
+    def _silence_quiet(
+        self, probabilities: Float32, novelty: Float32, window: "_Frames", floors: Float64 | None
+    ) -> None:
+        """Make windows silent that are not above the floor by the gate of the model."""
+        gate, powers = self._classifier.gate, self._classifier.feature_set.band_powers
+        if not gate or floors is None or powers is None or not len(probabilities):
+            return
+        silence = self.classes.index(SILENCE)
+        floors = floors[len(floors) - len(probabilities) :]
+        quiet = is_quiet(powers(window.features), floors, self.timing.window_frames, gate)
+        probabilities[quiet] = novelty[quiet] = 0.0
+        probabilities[quiet, silence] = 1.0
+
+
+class _Frames(NamedTuple):
+    features: Float32
+    powers: NDArray[Any]
+    stamps: Int64
 
 
 def segment_columns(

@@ -8,7 +8,8 @@ import numpy as np
 
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
-_FLOOR = 1e-6  # least probability: no single frame forbids a class
+_TINY = 1e-38  # of float32
+_LEAST = np.log(1e-6)  # no single frame forbids a class
 # Logarithms are rounded to multiples of this, so that their sums are exact. The path then depends
 # neither on when the scores are rescaled to zero, nor on frames long past.
 _STEP = 2.0**-30
@@ -17,23 +18,25 @@ _LANE = 128  # frames
 _WARM_UP = 64  # frames; in real sound 99 of 100 beginnings are forgotten after 32
 
 
-def log_likelihoods(probabilities: Float32) -> Float64:
+def log_likelihoods(probabilities: Float32, weight: float) -> Float64:
     """Turn the probabilities of a classifier into the log-likelihoods of a hidden Markov model.
 
-    Probabilities are used as likelihoods without change: classes are trained with even weights, so
-    their prior is uniform. Successive windows overlap by 19 frames of 20, which would justify a
-    smaller weight, but any smaller one loses single coughs (docs/models.md).
+    Classes are trained with even weights, so their prior is uniform.
 
     Parameters
     ----------
     probabilities : np.ndarray [shape=(n, C)], float32
+    weight : float
+        Factor of the logarithms: successive windows overlap, so that each tells less than if it
+        stood alone.
 
     Returns
     -------
     np.ndarray [shape=(n, C)], float64
         Finite.
     """
-    return _rounded(np.log(np.maximum(probabilities, _FLOOR, dtype=np.float64)))
+    logarithms = weight * np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
+    return _rounded(np.maximum(logarithms, _LEAST))
 
 
 class FixedLagSmoother:
@@ -49,6 +52,8 @@ class FixedLagSmoother:
         Probability that a frame of the row's class is followed by one of the column's class. The
         first frame may be of any class.
     lag_frames : int
+    weight : float
+        As of `log_likelihoods`.
 
     Attributes
     ----------
@@ -57,11 +62,20 @@ class FixedLagSmoother:
         of these frames on do not depend on it. None if that is not reached yet.
     """
 
-    def __init__(self, transitions: Float64, lag_frames: int) -> None:
+    def __init__(self, transitions: Float64, lag_frames: int, weight: float = 1.0) -> None:
         with np.errstate(divide="ignore"):  # never: minus infinity
             self._transitions = _rounded(np.log(transitions))
         self._lag = lag_frames
+        self._weight = weight
         self._restart()
+
+    def forget(self) -> None:
+        """Doubt all frames so far: only later ones count for `converged_after`."""
+        count = len(self._transitions)
+        self.converged_after: int | None = None
+        # Scores had the sound begun in each of the states: once they differ by constants only, any
+        # other beginning would have led to the same path.
+        self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
 
     def push(self, probabilities: Float32) -> Indices:
         """Add successive frames and return the states that they decide.
@@ -78,7 +92,7 @@ class FixedLagSmoother:
         """
         starts = range(0, len(probabilities), _FRAMES_AT_ONCE)
         blocks = (probabilities[start : start + _FRAMES_AT_ONCE] for start in starts)
-        parts = [self._push(log_likelihoods(block)) for block in blocks]
+        parts = [self._push(log_likelihoods(block, self._weight)) for block in blocks]
         return np.concatenate([np.empty(0, np.intp), *parts])
 
     def close(self) -> Indices:
@@ -99,13 +113,10 @@ class FixedLagSmoother:
 
     def _restart(self) -> None:
         count = len(self._transitions)
-        self.converged_after: int | None = None
         self._count = 0  # number of frames so far
         self._score = np.zeros(count)  # score of the likeliest path to each state
         self._back = np.empty((0, count), np.intp)  # best predecessors, of undecided frames
-        # Scores had the sound begun in each of the states: once they differ by constants only, any
-        # other beginning would have led to the same path.
-        self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
+        self.forget()
 
     def _push(self, observed: Float64) -> Indices:
         count = len(observed)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from safetensors.numpy import load, save
 
+from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.description import (
     Description,
     first_problem,
@@ -22,6 +23,7 @@ from hearthlog.models.classifiers.description import (
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
@@ -36,6 +38,7 @@ _ROUNDING = 1e-9
 _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are optional
     "transitions": np.dtype(np.float64),
     "training_windows": np.dtype(np.float32),
+    "training_floor": np.dtype(np.float64),
     "training_target": np.dtype(np.int64),
     "training_group": np.dtype(np.int64),
 }
@@ -177,7 +180,16 @@ def _problem(description: Description) -> str | None:
         classifier_kind(description.kind).parameters.model_validate(description.parameters)
     except ValidationError as error:
         return first_problem(error)
-    return _problem_of_classes(description)
+    return _problem_of_labels(description, features) or _problem_of_classes(description)
+
+
+def _problem_of_labels(description: Description, features: FeatureSet) -> str | None:
+    window = features.inputs[description.inputs].window_frames
+    if description.label_frame >= window:
+        return f"label_frame: a window has {window} frames"
+    if description.gate and (features.band_powers is None or SILENCE not in description.classes):
+        return "has a gate, but no class silence, or its feature set has no bands"
+    return None
 
 
 def _problem_of_classes(description: Description) -> str | None:
@@ -239,5 +251,7 @@ def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, 
     kept = arrays.get("training_windows", np.empty(0))
     if kept.ndim and len(kept):
         shapes["training_windows"] = (len(kept), features.window_frames, features.width)
+        if "training_floor" in arrays:
+            shapes["training_floor"] = (len(kept), features.bands)
         shapes["training_target"] = shapes["training_group"] = (len(kept),)
     return shapes

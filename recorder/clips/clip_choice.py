@@ -19,6 +19,7 @@ PRIVATE_LIMIT = 0.02
 UNSURE_CONFIDENCE = 0.5
 UNSURE_NOVELTY = 0.7
 _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
+_BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
 
 
 class KeptSound(NamedTuple):
@@ -38,9 +39,9 @@ class KeptSound(NamedTuple):
 class ClipFinder:
     """Holds sound back until it is certain whether it may be kept, and is worth keeping.
 
-    A label speaks of the window that ends with its frame. A frame may be kept if all windows that
-    contain it were labelled, and none of them is likely to be of a class that is never kept. Frames
-    beside a gap are in fewer windows, and are not kept.
+    A label is known with the last frame of its window. A frame may be kept if all windows within a
+    second of it, before and behind, were labelled, and none of them is likely to be of a class that
+    is never kept. Frames beside a gap have fewer windows, and are not kept.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ class ClipFinder:
     pre_roll_frames : int
         Frames kept before a sound that is worth keeping.
     window_frames : int
-        Length of the window of a label.
+        A second, or the length of the window of a label, if that is longer.
     """
 
     def __init__(
@@ -144,8 +145,9 @@ class ClipFinder:
         """Decide on the first frames that are held."""
         if count <= 0:
             return []
-        private = self._private[_AFTER_FRAMES:][: count + self._window - 1]
-        kept = sliding_window_view(private, self._window).max(axis=1) < PRIVATE_LIMIT
+        span = _BEHIND_FRAMES + self._window
+        private = self._private[_AFTER_FRAMES - _BEHIND_FRAMES :][: count + span - 1]
+        kept = sliding_window_view(private, span).max(axis=1) < PRIVATE_LIMIT
         if self._keep != "always":
             around = self._worth[: _AFTER_FRAMES + count + self._before]
             kept &= sliding_window_view(around, _AFTER_FRAMES + self._before + 1).any(axis=1)

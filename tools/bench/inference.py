@@ -62,7 +62,7 @@ def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
     )
-    return calibrated.fit(examples.inputs[0].astype(np.float64), data.target)
+    return calibrated.fit(examples.inputs[0, :, 0].astype(np.float64), data.target)
 
 
 def _inputs(work: Workload) -> NDArray[np.float32]:

@@ -123,7 +123,7 @@ def _peer(log: Path, model: Model, data: Dataset, output: Path) -> float:
     rows = inputs.astype(np.float64)
     calls = [rows[first : first + _CALL] for first in range(0, len(rows), _CALL)]
     posteriors = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)
-    viterbi(posteriors, model.transitions)
+    viterbi(posteriors, model.transitions, model.description.smoothing.weight)
     with output.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")

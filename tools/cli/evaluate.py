@@ -181,7 +181,7 @@ def evaluate_model(
 
 @evaluate.command("method")
 def evaluate_method(
-    method: _Method = "bands",
+    method: _Method = "room21",
     *,
     data: Clips,
     scenario: _Scenario,
@@ -217,7 +217,7 @@ def evaluate_method(
 
 @evaluate.command()
 def search(
-    method: _Method = "bands",
+    method: _Method = "room21",
     *,
     data: Clips,
     scenario: _Scenario,
@@ -246,7 +246,7 @@ def search(
 
 @evaluate.command()
 def adaptation(
-    method: _Method = "bands",
+    method: _Method = "room21",
     *,
     data: Clips,
     scenario: _Scenario,
@@ -287,8 +287,11 @@ def _learning(
     with joblib_on(scheduler):
         classes = load_scenario(scenario)
         clips = read_manifest(manifest_path(data), classes.labels)
+        classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)
         with share_done(f"listening to {len(clips)} clips", announce=True) as progress:
-            segments = build_dataset(clips, classes, progress, features=method.features)
+            segments = build_dataset(
+                clips, classes, progress, features=method.features, rooms=method.rooms
+            )
         with share_done(f"learning from {len(segments)} segments", announce=True) as progress:
             yield method, segments, progress
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 _LAST = (1 << 63) - 1  # log time
 
-METHODS = "How to learn: bands, or paper (42 statistics)."
+METHODS = "How to learn: room21, room (33 features), bands, or paper (42 statistics)."
 
 
 def log_location(text: str) -> Path:

@@ -45,7 +45,7 @@ def train(
     base: Annotated[
         Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
     ] = None,
-    method: Annotated[str, typer.Option(help=METHODS)] = "bands",
+    method: Annotated[str, typer.Option(help=METHODS)] = "room21",
     cost: Annotated[
         float | None,
         typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
@@ -93,14 +93,21 @@ def _learned(
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
     from hearthlog.analyzer.training.train import SMOOTHINGS, train_model
+    from hearthlog.models.classes import UNKNOWN
 
     if smoothing not in SMOOTHINGS:
         wrong_use(f"--smoothing {smoothing}: choose one of {', '.join(SMOOTHINGS)}")
     chosen = load_scenario(scenario)
     clips = [clip for path in data for clip in read_manifest(manifest_path(path), chosen.labels)]
+    chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
+    if UNKNOWN not in chosen.classes:
+        tell(
+            "fewer than 5 sources have a label of no class, such as other_negative: the model will "
+            "take every sound for one of its classes; add some to be told what is unknown"
+        )
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         recordings = _home_recordings(home, method.features)
-        segments = build_dataset(clips, chosen, report, recordings, method.features)
+        segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         return train_model(segments, chosen, report, method, smoothing), segments
@@ -155,6 +162,12 @@ def _print(model: "Model", segments: "Dataset") -> None:
         f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "
         "sources never split)"
     )
+    if (elsewhere := description.elsewhere) is not None:
+        print(
+            f"in collections that nothing was learned from: {elsewhere.right:.0%} of "
+            f"{elsewhere.segments} segments right, expected calibration error "
+            f"{elsewhere.expected_calibration_error:.3f} ({elsewhere.collections} left out in turn)"
+        )
     parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]
     print(*parameters, classifier_kind(description.kind).summary(model), sep=", ", end="\n\n")
     print_counts(description.classes, metrics.confusion)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile import modelfile
@@ -146,14 +147,16 @@ def classify(model: Model, sound: NDArray[np.generic], rate: int, start: int = 0
     >>> sound, rate = soundfile.read("sound.flac", dtype="int16")
     >>> labels = hearthlog.classify(hearthlog.load_model("home.safetensors"), sound, rate)
     >>> labels.times[:2] / 1e9, labels.probabilities.shape
-    (array([0.95, 1.  ]), (3581, 9))
+    (array([0.55, 0.6 ]), (3586, 9))
     >>> labels.labels[0], labels.segments.labels[0]
     ('silence', 'silence')
     """
     classifier = Classifier(model)
     features = extract_features(sound, rate, classifier.feature_set.name, start)
     labeller = Labeller(classifier)
-    labels, segments = labeller.push(features.values, 0, features.times)
+    powers = classifier.feature_set.band_powers
+    floors = None if powers is None else FloorTracker()(powers(features.values), 0)
+    labels, segments = labeller.push(features.values, floors, 0, features.times)
     segments += labeller.close(int(features.times[-1]) + FRAME_NANOSECONDS)
     names = np.array(labels.classes, object)
     starts, ends, states = (

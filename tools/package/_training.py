@@ -16,7 +16,7 @@ __all__ = ["Comparison", "compare", "train"]
 
 
 def train(
-    manifest: Path | str, scenario: str, method: str = "bands", smoothing: str = "hmm"
+    manifest: Path | str, scenario: str, method: str = "room21", smoothing: str = "hmm"
 ) -> Model:
     """Learn a model from labelled clips, and measure it on sources that it has not heard.
 
@@ -27,7 +27,7 @@ def train(
     scenario : str
         What to tell apart: `bathroom`, `general`, or a TOML file.
     method : str
-        `bands`, `paper`, or one that another distribution adds.
+        `room21`, `room`, `bands`, `paper`, or one that another distribution adds.
     smoothing : str
         How labels become segments: `hmm` or `merge`.
 
@@ -53,7 +53,8 @@ def train(
     """
     chosen, way = load_scenario(scenario), method_named(method)
     clips = read_manifest(Path(manifest), chosen.labels)
-    data = build_dataset(clips, chosen, ignore_progress, features=way.features)
+    chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
+    data = build_dataset(clips, chosen, ignore_progress, features=way.features, rooms=way.rooms)
     return train_model(data, chosen, ignore_progress, way, smoothing)
 
 

@@ -42,7 +42,7 @@ class PlotKind:
 SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
 LEVEL = PlotKind("level", "Level in dBFS", 100, Style.LINE, live_scale=(-100.0, 0.0))
 NOVELTY = PlotKind(
-    "novelty", "Novelty: 0 as learnt, 1 never heard", 90, Style.LINE, _NEW, live_scale=(0.0, 1.0)
+    "novelty", "Novelty: how doubtful labels are", 90, Style.LINE, _NEW, live_scale=(0.0, 1.0)
 )
 FEATURES = PlotKind(
     "features", "Features: 0 ({first}) to {end} ({last}), dark is low", 180, Style.HEAT_MAP

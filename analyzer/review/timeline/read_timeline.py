@@ -4,6 +4,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.coverage import coverage_of
@@ -24,12 +26,14 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
+_LATE = NANOSECONDS + FRAME_NANOSECONDS  # at most, from the time of a label until it is known
 _OF_SPANS = (message_types.SEGMENT, message_types.GAP)  # logged at their end
 
 
@@ -140,7 +144,7 @@ class _Reader:
             for batch in iterate_pieces([file.path], topics, *span, decoded, every=every):
                 for columns in batch:
                     self._collect(file.path, columns)
-                if min(int(columns.log_times[0]) for columns in batch) > self._grid.end:
+                if min(int(columns.log_times[0]) for columns in batch) > self._grid.end + _LATE:
                     break  # what ended later began later, but for what lasted for minutes
 
     def _parts(self, file: TimedFile) -> Iterator[tuple[list[str] | None, int | None, int]]:
@@ -156,7 +160,8 @@ class _Reader:
         # They have chunks of their own, so all can be read even where labels are too many.
         yield [name for name in topics if name.endswith("/segment")], None, 1
         if self.every == 1:
-            yield [name for name in topics if name.endswith("/label")], self._grid.end, 1
+            labels = [name for name in topics if name.endswith("/label")]
+            yield labels, self._grid.end + _LATE, 1
 
     def _check_alone(self, path: Path, topics: Sequence[str]) -> None:
         """Raise LogError if another layer of the same log has the same labelling."""
@@ -173,7 +178,11 @@ class _Reader:
         topic = shown_topic(columns.topic)
         if topic is not None:
             self.collector.add_log(topic.microphone, path)
-        if columns.type not in _OF_SPANS:
+        if columns.type == message_types.LABEL:  # which is known later than its frame
+            stamps = columns["header.stamp"]
+            inside = (stamps >= self._grid.start) & (stamps < self._grid.end)
+            columns = columns if inside.all() else columns.take(np.flatnonzero(inside))
+        elif columns.type not in _OF_SPANS:
             columns = columns.between(self._grid.start, self._grid.end)
         rows = read_rows(path, columns) if len(columns) else None
         if rows is not None:

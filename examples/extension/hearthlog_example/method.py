@@ -23,8 +23,7 @@ class MeansMethod(Method):
     ) -> "LearnedMeans":
         """Learn from some segments; those of a home count as all others do, by their weight."""
         del home
-        inputs, target = examples.inputs[0, seen].astype(np.float64), examples.target[seen]
-        weight = examples.weight[seen]
+        inputs, target, weight = examples.windows(seen)
         classes = np.unique(target)
         means = np.stack(
             [np.average(inputs[target == c], axis=0, weights=weight[target == c]) for c in classes]

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
-from hearthlog.models.features.auros21.inputs import INPUTS, WINDOW_FRAMES
+from hearthlog.models.features.auros21.inputs import INPUTS, WINDOW_FRAMES, band_powers
 from hearthlog.models.features.auros21.names import ENERGY, FEATURE_NAMES, UNITS
 from hearthlog.models.features.feature_set import FeatureSet
 
@@ -25,5 +25,6 @@ AUROS21 = FeatureSet(
     extractor=FeatureExtractor,
     inputs=INPUTS,
     power=_energy,
+    band_powers=band_powers,
     augmented=augmented,
 )

@@ -15,7 +15,7 @@ from hearthlog.models.features.auros21.names import CEPSTRA, FEATURE_NAMES, MEL_
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
-_BINS = FRAME_SAMPLES // 2
+BINS = FRAME_SAMPLES // 2
 _PARTS = 10  # sub-frames, and sub-bands, of the two entropies
 _ROLLOFF_BANDS = 20
 _ROLLOFF_SHARE = 0.90
@@ -30,12 +30,14 @@ _FRAMES_AT_ONCE = 384  # more would leave a core's cache, fewer cost more in cal
 class FeatureExtractor:
     """Features of one stream of frames; the state is the last spectrum, for the flux."""
 
+    width = len(FEATURE_NAMES)
+
     def __init__(self) -> None:
         self._last_magnitude: Float64 | None = None
         # Scratch arrays: fresh ones of this size cost more in page faults than the transform.
         self._samples = np.empty((_FRAMES_AT_ONCE, FRAME_SAMPLES))
-        self._spectrum = np.empty((_FRAMES_AT_ONCE, _BINS + 1), np.complex128)
-        self._magnitude = np.empty((_FRAMES_AT_ONCE + 1, _BINS))
+        self._spectrum = np.empty((_FRAMES_AT_ONCE, BINS + 1), np.complex128)
+        self._magnitude = np.empty((_FRAMES_AT_ONCE + 1, BINS))
 
     def restart(self) -> None:
         """Forget the past: the next frame does not follow the last one."""
@@ -58,13 +60,20 @@ class FeatureExtractor:
         np.ndarray [shape=(n, 21)], float32
             In the order and the units of `FEATURE_NAMES` (see docs/features.md); always finite.
         """
-        values = np.empty((len(frames), len(FEATURE_NAMES)), np.float32)
+        values = np.empty((len(frames), self.width), np.float32)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
             block = slice(start, start + _FRAMES_AT_ONCE)
             self._compute(frames[block], values[block])
         return values
 
     def _compute(self, frames: Float32, out: Float32) -> None:
+        self._paper_values(frames, out)
+
+    def _paper_values(self, frames: Float32, out: Float32) -> Float64:
+        """Compute the 21 values of frames; return the powers of their bins.
+
+        Those have shape (n, 400); a full-scale sine has `BINS` squared.
+        """
         samples = self._samples[: len(frames)]
         np.copyto(samples, frames)
         part_energy = _energy_of_parts(samples, _PARTS)
@@ -79,7 +88,7 @@ class FeatureExtractor:
 
         spectrum = np.fft.rfft(samples, axis=1, out=self._spectrum[: len(frames)])
         magnitude = self._magnitude[: len(frames) + 1]  # row 0 is the frame before
-        np.abs(spectrum[:, :_BINS], out=magnitude[1:])
+        np.abs(spectrum[:, :BINS], out=magnitude[1:])
         magnitude[0] = magnitude[1] if self._last_magnitude is None else self._last_magnitude
         self._last_magnitude = magnitude[-1].copy()
 
@@ -92,12 +101,13 @@ class FeatureExtractor:
         band_power = _energy_of_parts(magnitude, _ROLLOFF_BANDS)
         power_sum = _sums(band_power)
         parts = band_power[1:, ::2] + band_power[1:, 1::2]
-        out[:, 5] = _entropy_of_shares(parts / _BINS**2, power_sum[1:] / _BINS**2)
+        out[:, 5] = _entropy_of_shares(parts / BINS**2, power_sum[1:] / BINS**2)
         out[:, 6] = _flux(magnitude, total, power_sum)
         power = np.square(magnitude[1:], out=magnitude[1:])
         out[:, 7] = _rolloff(power, band_power[1:])
         mel_db = 10.0 * np.log10(rowwise_matmul(power, _mel_weights()) + _POWER_FLOOR)
         out[:, CEPSTRA] = rowwise_matmul(mel_db, dct_weights())
+        return power
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
@@ -131,7 +141,7 @@ def mel_bank() -> Float64:
     np.ndarray [shape=(400, 32)], float64
         Weight of each spectral bin in each band; as `librosa.filters.mel(norm=None)`.
     """
-    frequency = np.arange(_BINS) * (SAMPLE_RATE / FRAME_SAMPLES)
+    frequency = np.arange(BINS) * (SAMPLE_RATE / FRAME_SAMPLES)
     corners = _mel_corners()
     width = np.diff(corners)
     distance = frequency[:, np.newaxis] - corners[np.newaxis, :]
@@ -172,14 +182,14 @@ def _mel_to_hertz(mel: Float64) -> Float64:
 
 @cache
 def _moment_weights() -> Float64:
-    position = np.arange(1, _BINS + 1) / _BINS
-    return np.stack([np.ones(_BINS), position, position**2], axis=1)
+    position = np.arange(1, BINS + 1) / BINS
+    return np.stack([np.ones(BINS), position, position**2], axis=1)
 
 
 @cache
 def _mel_weights() -> Float64:
     """Return the mel bank for squared DFT magnitudes: a full-scale sine has power 1 (0 dB)."""
-    return mel_bank() / _BINS**2
+    return mel_bank() / BINS**2
 
 
 def _energy_of_parts(rows: Float64, parts: int) -> Float64:
@@ -212,4 +222,4 @@ def _rolloff(power: Float64, band_power: Float64) -> Float64:
     left = threshold - (running[row, band] - band_power[row, band])
     inside = rowwise_matmul(power.reshape(len(power), _ROLLOFF_BANDS, -1)[row, band], _RUNNING_SUM)
     bin_in_band = np.argmax(inside + _TINY > left[:, np.newaxis], axis=1)
-    return (band * (_BINS // _ROLLOFF_BANDS) + bin_in_band) / _BINS
+    return (band * (BINS // _ROLLOFF_BANDS) + bin_in_band) / BINS

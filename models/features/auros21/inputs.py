@@ -16,22 +16,14 @@ from hearthlog.schemas.arrays import Float32, Float64
 
 WINDOW_FRAMES = 20
 _SCALARS, _WIDTH = CEPSTRA.start, len(FEATURE_NAMES)
+VALUES = _WIDTH + MEL_BANDS
 _FLOOR = 1e-7
-
-
-def features_themselves(features: Float32) -> Float32:
-    """Return the features as they are.
-
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 21)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 21)], float32
-        The same array.
-    """
-    return features
+_OVERSUBTRACTION = 1.5
+_TINY = 1e-12
+LABEL_FRAMES = 8
+# Means over quiet stretches of household recordings, in the order of the features before the
+# cepstra, with the logarithm of the flux; the first is not used.
+_OF_SILENCE = np.array([0.0, 0.17, 3.1, 0.24, 0.2, 1.28, -5.94, 0.26])
 
 
 def band_values(features: Float32) -> Float64:
@@ -55,6 +47,78 @@ def band_values(features: Float32) -> Float64:
     values[:, _SCALARS : _SCALARS + MEL_BANDS] = bands_of(cepstra)
     values[:, _SCALARS + MEL_BANDS :] = cepstra
     return values
+
+
+def band_powers(features: Float32) -> Float64:
+    """Compute the powers of the mel bands and of the frame.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 21)], float32
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 33)], float64
+        Of the 32 bands that the cepstra represent, without the constant inside their logarithm,
+        and the energy; not below 0.
+    """
+    powers = np.empty((len(features), MEL_BANDS + 1))
+    powers[:, :MEL_BANDS] = 10.0 ** (bands_of(features[:, CEPSTRA]) / 10.0) - _FLOOR
+    powers[:, MEL_BANDS] = features[:, ENERGY]
+    return np.maximum(powers, 0.0, out=powers)
+
+
+def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
+    """Compute the values behind the inputs `above_floor` from the features of each frame.
+
+    The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
+    corrupted by acoustic noise", 1979). The other values cannot be changed so; the less of the
+    energy is above the floor, the nearer they are to those of silence.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 21)], float32
+    floors : np.ndarray [shape=(n, 33)], float64
+        In the order of `band_powers`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 53)], float64
+        Like those of `band_values`.
+
+    Raises
+    ------
+    TypeError
+        If there are no floors.
+    """
+    if floors is None:
+        raise TypeError("these inputs need the floor of the room")
+    powers = band_powers(features)
+    level = 10.0 * np.log10(np.maximum(powers - _OVERSUBTRACTION * floors, 0.0) + _FLOOR)
+    share = share_above_floor(powers, floors)
+    scalars = features[:, :_SCALARS].astype(np.float64)
+    scalars[:, FLUX] = np.log(np.maximum(scalars[:, FLUX], 0.0) + _FLOOR)
+    scalars = _OF_SILENCE + share * (scalars - _OF_SILENCE)
+    scalars[:, ENERGY] = level[:, MEL_BANDS]
+    bands = level[:, :MEL_BANDS]
+    return np.concatenate([scalars, bands, rowwise_matmul(bands, dct_weights())], axis=1)
+
+
+def share_above_floor(powers: Float64, floors: Float64) -> Float64:
+    """Compute which share of the energy of each frame is above the floor.
+
+    Parameters
+    ----------
+    powers, floors : np.ndarray [shape=(n, 33)], float64
+        In the order of `band_powers`.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, 1)], float64
+        From 0 to 1.
+    """
+    energy, floor = powers[:, MEL_BANDS:], floors[:, MEL_BANDS:]
+    return np.maximum(energy - floor, 0.0) / np.maximum(energy, _TINY)
 
 
 def bands_of(cepstra: Float32) -> Float64:
@@ -90,6 +154,9 @@ def dct_weights() -> Float64:
 
 
 INPUTS = {
-    "statistics": WindowStatistics(WINDOW_FRAMES, features_themselves, _WIDTH),
-    "bands": WindowStatistics(WINDOW_FRAMES, band_values, _WIDTH + MEL_BANDS, changes=True),
+    "statistics": WindowStatistics(WINDOW_FRAMES, np.asarray, _WIDTH),
+    "bands": WindowStatistics(WINDOW_FRAMES, band_values, VALUES, changes=True),
+    "above_floor": WindowStatistics(
+        LABEL_FRAMES, values_above_floor, VALUES, changes=True, needs_floor=True
+    ),
 }

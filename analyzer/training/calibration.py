@@ -1,0 +1,192 @@
+"""Calibration: how sure a classifier may be, by segments that it has not learned from."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.method import Fold, softmax
+from hearthlog.analyzer.training.scores import calibration_error
+from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classifiers.description import Elsewhere
+from hearthlog.schemas.arrays import Bool, Float64, Indices
+
+KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`
+_FEWEST_COLLECTIONS = 3
+_FEWEST_SOURCES = 5  # in other collections, of a class that they teach
+_BASE_SEGMENTS = 30
+_FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
+
+
+def collection_folds(data: Dataset) -> list[Fold]:
+    """Leave out one collection after the other; small ones together.
+
+    Parameters
+    ----------
+    data : Dataset
+
+    Returns
+    -------
+    list of Fold
+        Empty if there are fewer than three folds, or one leaves a single class to learn from.
+    """
+    counts = np.bincount(data.collection)
+    fold = np.where(counts < _FEWEST_SEGMENTS, len(counts), np.arange(len(counts)))[data.collection]
+    folds = [
+        (np.flatnonzero(fold != number), np.flatnonzero(fold == number))
+        for number in np.unique(fold)
+    ]
+    several = all(len(np.unique(data.target[seen])) > 1 for seen, _ in folds)
+    taught = any(np.isin(data.target[unseen], data.target[seen]).any() for seen, unseen in folds)
+    return folds if len(folds) >= _FEWEST_COLLECTIONS and several and taught else []
+
+
+def calibrate_elsewhere(
+    decisions: Float64, data: Dataset, folds: Sequence[Fold]
+) -> tuple[float, Elsewhere]:
+    """Find the temperature that holds in collections of which nothing was learned.
+
+    Segments of a class of which the others have fewer than five sources are left out.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of classifiers that were not learned from the fold of the segment.
+    data : Dataset
+        Of n segments.
+    folds : sequence of Fold
+        As of `collection_folds`.
+
+    Returns
+    -------
+    inverse_temperature : float
+    elsewhere : Elsewhere
+        Scores of each fold with the temperature from the others.
+    """
+    taught = np.zeros(len(data), bool)
+    for seen, unseen in folds:
+        pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
+        sources = np.bincount(pairs[0], minlength=len(data.classes))
+        taught[unseen] = sources[data.target[unseen]] >= _FEWEST_SOURCES
+    if not taught.any():
+        taught[:] = True
+    probabilities = nested_probabilities(decisions, data.target, folds, taught)
+    right = probabilities.argmax(axis=1) == data.target
+    elsewhere = Elsewhere(
+        collections=len(np.unique(data.collection)),
+        segments=int(taught.sum()),
+        right=float(right[taught].mean()),
+        expected_calibration_error=calibration_error(probabilities[taught], data.target[taught]),
+    )
+    return inverse_temperature(decisions[taught], data.target[taught]), elsewhere
+
+
+def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
+    """Move the temperature of a model by segments of a home, as far as their number allows.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of classifiers that were adapted to other segments of the home.
+    target : np.ndarray [shape=(n,)], intp
+        Classes of the segments.
+    base : float
+        Inverse temperature of the model; it counts as much as 30 segments.
+
+    Returns
+    -------
+    float
+        Inverse temperature.
+    """
+    share = len(target) / (len(target) + _BASE_SEGMENTS)
+    here = inverse_temperature(decisions, target)
+    return float(np.exp(share * np.log(here) + (1.0 - share) * np.log(base)))
+
+
+def nested_probabilities(
+    decisions: Float64, target: Indices, folds: Sequence[Fold], used: Bool | None = None
+) -> Float64:
+    """Turn decision values into probabilities, those of each fold by the other folds' temperature.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of classifiers that were not learned from the fold of the segment.
+    target : np.ndarray [shape=(n,)], intp
+        Indices of the true classes.
+    folds : sequence of Fold
+        At least two; each segment is tried in one of them.
+    used : np.ndarray [shape=(n,)], bool, optional
+        Segments from which temperatures are found; all by default.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, C)], float64
+    """
+    used = np.ones(len(target), bool) if used is None else used
+    probabilities = np.empty_like(decisions)
+    for _, unseen in folds:
+        others = used.copy()
+        others[unseen] = False
+        if not others.any():  # nothing else can tell
+            others[unseen] = True
+        inverse = inverse_temperature(decisions[others], target[others])
+        probabilities[unseen] = softmax(inverse * decisions[unseen])
+    return probabilities
+
+
+def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) -> Float64:
+    """Find what to add to decision values so that few known segments are labelled `unknown`.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Of segments that were not learned from.
+    target : np.ndarray [shape=(n,)], intp
+        Their classes.
+    classes : sequence of str
+
+    Returns
+    -------
+    np.ndarray [shape=(C,)], float64
+        Zero but for the class `unknown`, if there is one.
+    """
+    bias = np.zeros(len(classes))
+    if UNKNOWN in classes:
+        unknown = classes.index(UNKNOWN)
+        known = target != unknown
+        best = np.delete(decisions[known], unknown, axis=1).max(axis=1)
+        margin = best - decisions[known, unknown]
+        margin = margin[np.isfinite(margin)]
+        if len(margin):
+            bias[unknown] = np.clip(np.quantile(margin, KNOWN_LOST), -100.0, 100.0)
+    return bias
+
+
+def inverse_temperature(decisions: Float64, target: Indices) -> float:
+    """Find the factor of decision values that minimises the log loss of their softmax.
+
+    Parameters
+    ----------
+    decisions : np.ndarray [shape=(n, C)], float64
+        Decision values; -inf for a class that was not learned.
+    target : np.ndarray [shape=(n,)], intp
+        Indices of the true classes.
+
+    Returns
+    -------
+    float
+        From exp(-5) to exp(5); the inverse of the temperature.
+
+    References
+    ----------
+    Guo et al., "On Calibration of Modern Neural Networks", 2017.
+    """
+
+    def loss(logarithm: float) -> float:
+        probabilities = softmax(np.exp(logarithm) * decisions)[np.arange(len(target)), target]
+        return float(-np.log(np.maximum(probabilities, 1e-300)).mean())
+
+    result = minimize_scalar(loss, bounds=(-5.0, 5.0), method="bounded", options={"xatol": 1e-6})
+    return float(np.exp(result.x))

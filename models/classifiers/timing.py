@@ -1,0 +1,59 @@
+"""When the labels of a model are known."""
+
+from typing import NamedTuple
+
+from hearthlog.models.classifiers.description import Description
+from hearthlog.models.features.floor import BLOCK_FRAMES
+from hearthlog.models.features.installed import feature_set
+
+
+class LabelTiming(NamedTuple):
+    """Which frames a label takes, and which it speaks of.
+
+    Attributes
+    ----------
+    window_frames : int
+        Frames of the window of a label.
+    label_frame : int
+        Frame of the window, from 0 on, which the label speaks of.
+    needs_floor : bool
+        Whether the floor of the room must be known at every frame of the window.
+    """
+
+    window_frames: int
+    label_frame: int
+    needs_floor: bool
+
+    @property
+    def delay(self) -> int:
+        """Frames from the one that a label speaks of to the last one of its window."""
+        return self.window_frames - 1 - self.label_frame
+
+    def first_window_end(self, start: int) -> int:
+        """Return the last frame of the first window of a sound.
+
+        Parameters
+        ----------
+        start : int
+            Number of the first frame of the sound.
+        """
+        if self.needs_floor:  # it is known with the last frame of the first whole block
+            start += -start % BLOCK_FRAMES + BLOCK_FRAMES - 1
+        return start + self.window_frames - 1
+
+
+def label_timing(description: Description) -> LabelTiming:
+    """Return the timing of a model's labels.
+
+    Parameters
+    ----------
+    description : Description
+
+    Raises
+    ------
+    ModelError
+        If its feature set is not installed.
+    """
+    inputs = feature_set(description.feature_set).inputs[description.inputs]
+    needs_floor = description.gate > 0.0 or inputs.needs_floor
+    return LabelTiming(inputs.window_frames, description.label_frame, needs_floor)

@@ -1,0 +1,205 @@
+"""The floor of a room: the power that is there in each band while nothing happens.
+
+The floor falls with the tenth percentile of the last minute, as in minimum statistics (Martin,
+"Noise power spectral density estimation based on optimal smoothing and minimum statistics", 2001),
+and rises only while the sound is as steady as noise. So a fan becomes a part of the room, and ten
+minutes of a shower or of music do not.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.schemas.arrays import Bool, Float64
+
+BLOCK_FRAMES = 8
+SECTION_BLOCKS = 10  # 4 s
+_MINUTE_BLOCKS = 150
+_SECOND_FRAMES = 20  # no window is longer
+_MEMORY_SECTIONS = 10_800  # 12 h; a relabelling looks back no further
+_SHARE = 0.1  # of the blocks of a minute that may be below the floor
+_STEADY_DB = 0.5  # noise is below 0.4, of real showers, taps, music and speech 9 in 10 are above
+NOMINAL = 1e-7  # power, -70 dBFS: differences below it are those of codecs
+
+
+class Floors(NamedTuple):
+    """Floors at successive frames.
+
+    Attributes
+    ----------
+    powers : np.ndarray [shape=(m, b)], float64
+        Powers of the bands; the last is that of the whole frame.
+    converged : bool
+        Whether frames before the first one of the stream would leave no trace in them, nor in those
+        of the second before.
+    """
+
+    powers: Float64
+    converged: bool
+
+
+class FloorTracker:
+    """Tracks the floor of one stream of frames.
+
+    Frames are averaged in blocks whose places depend on the numbers of the frames only, so that
+    the same frames give the same bits in pieces of any size.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past: the next frame does not follow the last one."""
+        self._converged_for: int | None = None  # number of frames
+        self._partial: Float64 | None = None  # frames of a block that is not complete
+        self._blocks: Float64 | None = None  # of the last minute
+        self._floor: Float64 | None = None
+        self._settled = False  # whether a whole section was heard
+        self._unsteady = 0  # number of sections since the last steady one
+
+    def __call__(self, powers: Float64, first: int) -> Floors:
+        """Add successive frames.
+
+        Parameters
+        ----------
+        powers : np.ndarray [shape=(n, b)], float64
+            Powers of the bands of each frame; the last is that of the whole frame.
+        first : int
+            Number of the first frame.
+
+        Returns
+        -------
+        Floors
+            At the last m of these frames: those at which a block has been complete since the start
+            or the last restart.
+        """
+        converged = self._converged_for is not None and self._converged_for >= _SECOND_FRAMES
+        if self._converged_for is not None:
+            self._converged_for += len(powers)
+        return Floors(self._track(powers, first), converged)
+
+    def _track(self, powers: Float64, first: int) -> Float64:
+        if self._partial is None:
+            skipped = -first % BLOCK_FRAMES
+            if skipped >= len(powers):
+                return powers[:0]
+            powers, first = powers[skipped:], first + skipped
+            self._partial = powers[:0]
+        begun, before = len(self._partial), self._floor
+        frames = np.concatenate([self._partial, powers])
+        count = len(frames) // BLOCK_FRAMES
+        self._partial = frames[count * BLOCK_FRAMES :].copy()
+        floors = self._add_blocks(_block_means(frames, count), (first - begun) // BLOCK_FRAMES)
+        complete = (begun + 1 + np.arange(len(powers))) // BLOCK_FRAMES
+        if before is None:
+            return floors[complete[complete > 0] - 1]
+        return np.concatenate([before[np.newaxis], floors])[complete]
+
+    def _add_blocks(self, blocks: Float64, number: int) -> Float64:
+        """Return the floors after each of some blocks, of which the first has this number."""
+        floors = np.empty_like(blocks)
+        past = 0 if self._blocks is None else len(self._blocks)
+        if self._blocks is not None:
+            blocks = np.concatenate([self._blocks, blocks])
+        for place in range(len(floors)):
+            end = past + place + 1
+            if (number + place + 1) % SECTION_BLOCKS == 0 and end >= SECTION_BLOCKS:
+                self._end_section(blocks[max(end - _MINUTE_BLOCKS, 0) : end])
+            elif not self._settled:
+                self._floor = _low(blocks[:end])
+            floors[place] = self._floor
+        self._blocks = blocks[-_MINUTE_BLOCKS:].copy()
+        return floors
+
+    def _end_section(self, minute: Float64) -> None:
+        """Move the floor at the end of a section, by the blocks of the minute before."""
+        low, section = _low(minute), minute[-SECTION_BLOCKS:]
+        self._settled = True
+        self._unsteady += 1
+        if decibels(section[:, :-1]).std(axis=0).mean() < _STEADY_DB:
+            self._floor, self._unsteady = section.mean(axis=0), 0
+        elif self._floor is None or self._unsteady >= _MEMORY_SECTIONS:
+            self._floor = low
+        if low[-1] < self._floor[-1]:
+            self._floor = np.minimum(self._floor, low)
+        forgotten = self._unsteady in {0, _MEMORY_SECTIONS}
+        if self._converged_for is None and forgotten and len(minute) == _MINUTE_BLOCKS:
+            self._converged_for = 0
+
+
+def decibels(powers: Float64) -> Float64:
+    """Turn powers into levels.
+
+    Parameters
+    ----------
+    powers : np.ndarray [shape=(..., b)], float64
+
+    Returns
+    -------
+    np.ndarray [shape=(..., b)], float64
+        In dB, not below -70.
+    """
+    return 10.0 * np.log10(powers + NOMINAL)
+
+
+def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) -> Bool:
+    """Tell which windows are not above the floor.
+
+    Parameters
+    ----------
+    powers : np.ndarray [shape=(n + window_frames - 1, b)], float64
+        Powers of the bands of successive frames.
+    floors : np.ndarray [shape=(n, b)], float64
+        Floor at the last frame of each window.
+    window_frames : int
+    gate : float
+        In dB.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+        True where the mean power of no band is as much as the gate above the floor.
+    """
+    total = powers[: len(floors)].copy()
+    for place in range(1, window_frames):
+        total += powers[place : place + len(floors)]
+    limit = 10.0 ** (gate / 10.0) * (floors + NOMINAL) - NOMINAL
+    quiet: Bool = (total / window_frames < limit).all(axis=1)
+    return quiet
+
+
+def low_power(powers: Float64, share: float = 0.2) -> Float64:
+    """Return the floor of a recording of nothing but the room.
+
+    Parameters
+    ----------
+    powers : np.ndarray [shape=(n, b)], float64
+        Powers of the bands of successive frames; at least one.
+    share : float
+        Share of the blocks that are below the floor.
+
+    Returns
+    -------
+    np.ndarray [shape=(b,)], float64
+        The mean of all frames where there is no whole block.
+    """
+    count = len(powers) // BLOCK_FRAMES
+    if not count:
+        mean: Float64 = powers.mean(axis=0)
+        return mean
+    return _low(_block_means(powers, count), share)
+
+
+def _low(blocks: Float64, share: float = _SHARE) -> Float64:
+    place = round(share * (len(blocks) - 1))
+    low: Float64 = np.partition(blocks, place, axis=0)[place]
+    return low
+
+
+def _block_means(frames: Float64, count: int) -> Float64:
+    """Average frames in `count` blocks, in an order of summation that does not depend on it."""
+    blocks = frames[: count * BLOCK_FRAMES].reshape(count, BLOCK_FRAMES, frames.shape[1])
+    total = blocks[:, 0].copy()
+    for place in range(1, BLOCK_FRAMES):
+        total += blocks[:, place]
+    return total / BLOCK_FRAMES

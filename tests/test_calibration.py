@@ -1,0 +1,106 @@
+"""Probabilities are as right as they say, where nothing was learned from what they are about."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blobs import blobs
+
+from hearthlog.analyzer.training.calibration import (
+    KNOWN_LOST,
+    calibrate_elsewhere,
+    collection_folds,
+    home_temperature,
+    inverse_temperature,
+    nested_probabilities,
+    unknown_bias,
+)
+from hearthlog.analyzer.training.method import softmax
+from hearthlog.analyzer.training.scores import calibration_error
+
+pytestmark = pytest.mark.fast
+
+
+def decided(count, sharpness, seed=0, classes=4):
+    """Decision values that are right as often as their softmax, times a sharpness, says."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(0.0, 2.0, (count, classes))
+    target = np.array([rng.choice(classes, p=row) for row in softmax(values)])
+    return values / sharpness, target
+
+
+@pytest.mark.parametrize("sharpness", [0.2, 1.0, 5.0])
+def test_the_temperature_is_the_one_with_which_probabilities_hold(sharpness):
+    decisions, target = decided(4000, sharpness)
+    inverse = inverse_temperature(decisions, target)
+    assert inverse == pytest.approx(sharpness, rel=0.1)
+    assert calibration_error(softmax(inverse * decisions), target) < 0.03
+
+
+def test_a_calibration_error_is_not_fitted_on_what_it_scores():
+    sure, true = decided(1000, 4.0)
+    unsure, other = decided(1000, 0.25, seed=1)
+    decisions, target = np.concatenate([sure, unsure]), np.concatenate([true, other])
+    first, second = np.arange(1000), np.arange(1000, 2000)
+    folds = [(second, first), (first, second)]
+    probabilities = nested_probabilities(decisions, target, folds)
+    np.testing.assert_allclose(
+        probabilities[first], softmax(inverse_temperature(unsure, other) * sure)
+    )
+    fitted = softmax(inverse_temperature(decisions, target) * decisions)
+    assert calibration_error(probabilities, target) > calibration_error(fitted, target) + 0.1
+
+
+def test_few_segments_of_a_home_move_the_temperature_a_little_and_many_decide_it():
+    moved = []
+    for count in (10, 100, 3000):
+        decisions, target = decided(count, 4.0)
+        moved.append(home_temperature(decisions, target, 0.5))
+    assert 0.5 < moved[0] < moved[1] < moved[2]
+    assert moved[2] == pytest.approx(4.0, rel=0.15)
+
+
+def test_unknown_takes_as_many_of_the_known_as_it_may():
+    rng = np.random.default_rng(0)
+    decisions, target = rng.normal(0.0, 1.0, (4000, 4)), rng.integers(0, 4, 4000)
+    classes = ("silence", "speech", "unknown", "music")
+    bias = unknown_bias(decisions, target, classes)
+    assert bias[[0, 1, 3]].tolist() == [0.0, 0.0, 0.0]
+    known = target != 2
+    lost = ((decisions + bias).argmax(axis=1) == 2)[known].mean()
+    assert lost == pytest.approx(KNOWN_LOST, abs=0.005)
+
+
+def test_without_unknown_nothing_is_biased():
+    assert unknown_bias(np.eye(3), np.arange(3), ("a", "b", "c")).tolist() == [0.0] * 3
+
+
+def of_collections(count, sizes):
+    data, _ = blobs(3, count)
+    collection = np.repeat(np.arange(len(sizes)), sizes)
+    return replace(data, collection=np.random.default_rng(0).permutation(collection))
+
+
+def test_collections_are_left_out_one_by_one_and_small_ones_together():
+    data = of_collections(60, [70, 60, 30, 10, 10])
+    folds = collection_folds(data)
+    left_out = [set(data.collection[unseen].tolist()) for _, unseen in folds]
+    assert left_out == [{0}, {1}, {2}, {3, 4}]
+    for seen, unseen in folds:
+        assert not set(data.collection[seen]) & set(data.collection[unseen])
+        assert len(seen) + len(unseen) == len(data)
+
+
+def test_two_collections_tell_nothing_of_a_third():
+    assert collection_folds(of_collections(30, [45, 45])) == []
+
+
+def test_a_class_that_other_collections_hardly_have_is_left_out():
+    data = of_collections(60, [60, 60, 60])
+    rare = data.target == 2
+    data = replace(data, collection=np.where(rare, 0, data.collection))
+    decisions, target = decided(len(data), 2.0, classes=3)
+    data = replace(data, target=np.where(rare, 2, np.minimum(target, 1)))
+    _, elsewhere = calibrate_elsewhere(decisions, data, collection_folds(data))
+    assert elsewhere.segments == (~rare).sum()
+    assert elsewhere.collections == 3
