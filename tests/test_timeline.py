@@ -34,6 +34,7 @@ from hearthlog.analyzer.review.timeline.model import (
     no_spans,
 )
 from hearthlog.analyzer.review.timeline.overview import BLOCKS, disagreements, overview
+from hearthlog.analyzer.review.timeline.plots import timeline_plots
 from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
@@ -395,6 +396,22 @@ def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, 
     assert np.median(far) < 1e-9
 
 
+def test_the_floor_is_drawn_beside_the_level_as_the_diagnostics_tell_it(timeline, folder):
+    expected, told = np.full(timeline.grid.count, np.nan), 0
+    for one in read(folder, "diagnostics"):
+        for pair in one.status[0].values:
+            if pair.key == "floor_dbfs":
+                expected[timeline.grid.middles >= nanoseconds(one.header.stamp)] = float(pair.value)
+                told += 1
+    assert told > 5
+    microphone = timeline.microphones["mic"]
+    expected[np.isnan(microphone.level)] = np.nan
+    np.testing.assert_array_equal(microphone.floor, expected)
+    assert np.nanmax(microphone.floor) < np.nanmax(microphone.level)
+    kinds = {plot.kind.name: plot.kind.title for plot in timeline_plots(timeline)}
+    assert kinds["floor"] == kinds["level"]  # one view
+
+
 def health(stamp, *levels):
     status = [
         message(
@@ -705,7 +722,7 @@ def test_everything_is_in_the_recording_and_nothing_else(recording):
     lanes = ["0_Etc-UTC", "mic/1_live", "mic/8_review", "mic/9_not_heard"]
     expected = {f"/{root}/{name}" for root in ("lanes", "exact") for name in lanes}
     expected |= {f"/mic/live/shares/{layer}" for layer in range(4)}
-    expected |= {"/mic/live/novelty", "/mic/level", "/mic/features", "/events"}
+    expected |= {"/mic/live/novelty", "/mic/level", "/mic/floor", "/mic/features", "/events"}
     expected |= {"/mic/frames/live", "/mic/frames/level"}
     assert entities(recording) == expected
 
@@ -785,7 +802,7 @@ def test_the_layout_shows_every_entity_and_begins_with_the_whole_time(recording,
         r["ViewBlueprint:space_origin"][0] for _, r in rows if "ViewBlueprint:space_origin" in r
     ]
     queries = [q for _, r in rows for q in r.get("ViewContents:query") or [] if q != "$origin/**"]
-    shown_ = {*origins, *queries} - {"/"}
+    shown_ = {each.removesuffix("/**") for each in {*origins, *queries} - {"/"}}
     for entity in entities(recording):
         assert any(entity.lstrip("/").startswith(each.lstrip("/")) for each in shown_), entity
     ((path, row),) = [(p, r) for p, r in rows if r.get("TimeAxis:view_range")]

@@ -25,7 +25,7 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.lanes import GAPS, NOT_HEARD, RECORDER, Changes, Lane
 from hearthlog.analyzer.review.timeline.live import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline.model import LogLines
-from hearthlog.analyzer.review.timeline.plots import FEATURES, LEVEL, NOVELTY, SHARES, Plot
+from hearthlog.analyzer.review.timeline.plots import FEATURES, FLOOR, LEVEL, NOVELTY, SHARES, Plot
 from hearthlog.analyzer.review.viewer.live import LiveServer
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, free_port
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -248,7 +248,9 @@ def test_means_are_those_of_the_frames_of_a_second(logs):
     second = times[40] // SECOND
     assert np.allclose(means[40], values[stamps // SECOND == second].mean(axis=0), atol=1e-6)
     assert len(times) < len(stamps) / 15
-    assert {each.kind for each in found} == {SHARES, LEVEL, NOVELTY, FEATURES}
+    assert {each.kind for each in found} == {SHARES, LEVEL, FLOOR, NOVELTY, FEATURES}
+    floor = np.concatenate([each.values for each in found if each.kind is FLOOR])[:, 0]
+    assert -65 < floor[-1] < -55  # the noise between the sounds of the day
     heat = np.concatenate([each.values for each in found if each.kind is FEATURES])
     assert heat.min() >= 0
     assert heat.max() <= 1

@@ -1,8 +1,10 @@
 """What was not well, from gaps and diagnostics."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
@@ -32,12 +34,16 @@ class Status(NamedTuple):
 
 
 class MicrophoneState(NamedTuple):
-    """How a microphone was at a time (ns of UTC): the worst level, and all that was not well."""
+    """How a microphone was at a time (ns of UTC): the worst level, and all that was not well.
+
+    `floor_dbfs` is the level of the floor of the room, NaN where it is not known.
+    """
 
     microphone: str
     time: int
     level: int
     text: str
+    floor_dbfs: float
 
 
 def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
@@ -115,7 +121,17 @@ def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:
         if topic is not None and topic.labelling == LIVE:
             level = max((status["level"] for status in statuses), default=0)
             bad = [status["message"] for status in statuses if status["level"]]
-            yield MicrophoneState(name, time, level, "; ".join(bad)[:_LONGEST])
+            yield MicrophoneState(name, time, level, "; ".join(bad)[:_LONGEST], _floor(statuses))
+
+
+def _floor(statuses: Sequence[Any]) -> float:
+    for status in statuses:
+        for pair in status["values"]:
+            if pair["key"] == "floor_dbfs":
+                with suppress(ValueError):
+                    value = float(pair["value"])
+                    return value if math.isfinite(value) else math.nan
+    return math.nan
 
 
 def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:

@@ -1,5 +1,6 @@
 """Rows of messages, collected on the grid of a timeline."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,7 @@ from hearthlog.analyzer.review.timeline.model import (
     SoundClip,
     no_spans,
 )
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE, REVIEW
 
@@ -215,6 +216,7 @@ class Collector:
             features=features,
             level=level,
             level_frames=rows.level_frames,
+            floor=_floor(rows.states, self._grid, features),
             gaps=self._join(rows.gaps),
             troubles=_trouble_spans(rows.states, self._grid.end),
             clips=_join_clips(rows.clips),
@@ -260,6 +262,18 @@ def _runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
         last = np.append(first[1:], len(times)) - 1
         texts = np.array(names, object)[best[first]]
         yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+
+
+def _floor(
+    states: Sequence[MicrophoneState], grid: Grid, features: GridSeries | None
+) -> Float64 | None:
+    """Let a floor last until the next message, as far as features were recorded."""
+    states = [state for state in states if not math.isnan(state.floor_dbfs)]
+    if not states or features is None:
+        return None
+    floors = np.array([math.nan, *(state.floor_dbfs for state in states)])
+    floor = floors[np.searchsorted([state.time for state in states], grid.middles, "right")]
+    return np.where(np.isnan(features.values).all(axis=1), math.nan, floor)
 
 
 def _trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans:

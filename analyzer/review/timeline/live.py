@@ -37,7 +37,14 @@ from hearthlog.analyzer.review.timeline.lanes import (
     clock,
 )
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
-from hearthlog.analyzer.review.timeline.plots import FEATURES, LEVEL, NOVELTY, SHARES, Plot
+from hearthlog.analyzer.review.timeline.plots import (
+    FEATURES,
+    FLOOR,
+    LEVEL,
+    NOVELTY,
+    SHARES,
+    Plot,
+)
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -253,7 +260,7 @@ def _gaps(rows: GapRows) -> Lane:
     return Lane(GAPS, rows.microphone, NOT_HEARD, changes(spans))
 
 
-def _states(rows: StateRows) -> Iterator[Lane]:
+def _states(rows: StateRows) -> Iterator[Lane | Plot]:
     by_microphone: dict[str, list[MicrophoneState]] = {}
     for state in rows.states:
         by_microphone.setdefault(state.microphone, []).append(state)
@@ -262,3 +269,6 @@ def _states(rows: StateRows) -> Iterator[Lane]:
         levels = (min(state.level, len(TROUBLES)) for state in states)
         texts = [TROUBLES[level - 1] if level else None for level in levels]
         yield Lane(TROUBLE, name, "trouble", Changes(times, texts))
+        floors = np.array([[state.floor_dbfs] for state in states])
+        if not np.isnan(floors).all():
+            yield Plot(FLOOR, name, "", ("floor",), times, floors)

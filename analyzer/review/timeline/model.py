@@ -140,6 +140,8 @@ class MicrophoneTimeline:
         Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
     level_frames : list of FrameValues
         The level, frame by frame.
+    floor : np.ndarray [shape=(count,)], float64, or None
+        Level of the floor of the room, in the same unit; NaN where it is not known.
     gaps : LabelledSpans
         Audio that was lost, with the reasons.
     troubles : LabelledSpans
@@ -152,6 +154,7 @@ class MicrophoneTimeline:
     features: GridSeries | None
     level: Float64 | None
     level_frames: Sequence[FrameValues]
+    floor: Float64 | None
     gaps: LabelledSpans
     troubles: LabelledSpans
     clips: list[SoundClip]

@@ -12,6 +12,7 @@ from hearthlog.analyzer.review.timeline.model import MicrophoneTimeline, Timelin
 from hearthlog.schemas.arrays import Float64, Int64
 
 _BRIGHT: Colour = (235, 215, 140)
+_GROUND: Colour = (200, 120, 90)
 _NEW: Colour = (160, 200, 255)
 _HEAT_COLUMNS = 600  # at most: each value is a square, which costs the viewer some ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
@@ -31,7 +32,9 @@ class PlotKind:
     """How plots of one kind look; they are shown in the order of `PLOTS`."""
 
     name: str  # of the entity
-    title: str  # with {first} and {last} for names of columns, and {end} for the last number
+    # Of the view; kinds of one title share it. With {first} and {last} for names of columns, and
+    # {end} for the last number.
+    title: str
     height: int  # in relation to other views
     style: Style
     colour: Colour = _BRIGHT  # of a line
@@ -40,14 +43,16 @@ class PlotKind:
 
 
 SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
-LEVEL = PlotKind("level", "Level in dBFS", 100, Style.LINE, live_scale=(-100.0, 0.0))
+_LEVELS = "Level, and floor of the room, in dBFS"
+LEVEL = PlotKind("level", _LEVELS, 100, Style.LINE, live_scale=(-100.0, 0.0))
+FLOOR = PlotKind("floor", _LEVELS, 100, Style.LINE, _GROUND, live_scale=(-100.0, 0.0))
 NOVELTY = PlotKind(
     "novelty", "Novelty: how doubtful labels are", 90, Style.LINE, _NEW, live_scale=(0.0, 1.0)
 )
 FEATURES = PlotKind(
     "features", "Features: 0 ({first}) to {end} ({last}), dark is low", 180, Style.HEAT_MAP
 )
-PLOTS = (SHARES, LEVEL, NOVELTY, FEATURES)
+PLOTS = (SHARES, LEVEL, FLOOR, NOVELTY, FEATURES)
 
 
 class Plot(NamedTuple):
@@ -92,6 +97,8 @@ def _values(
             yield SHARES, one.name, *one.probabilities
     if microphone.level is not None:
         yield LEVEL, "", ("level",), microphone.level[:, np.newaxis]
+    if microphone.floor is not None:
+        yield FLOOR, "", ("floor",), microphone.floor[:, np.newaxis]
     for one in microphone.labellings:
         if one.novelty is not None:
             yield NOVELTY, one.name, (f"novelty, {one.name}",), one.novelty[:, np.newaxis]

@@ -121,7 +121,7 @@ def plot_view(
     *,
     live: bool = False,
 ) -> rrb.View:
-    """Show plots of one kind in one view.
+    """Show plots of one kind, or of kinds with the same title, in one view.
 
     Parameters
     ----------
@@ -141,7 +141,8 @@ def plot_view(
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, last + 0.5)
     legend = rrb.PlotLegend(
-        corner="LeftTop" if live else "RightTop", visible=kind.style is Style.BANDS
+        corner="LeftTop" if live else "RightTop",
+        visible=kind.style is Style.BANDS or len(entities) > 1,
     )
     return _time_series(title, entities, scale, legend)
 
@@ -152,7 +153,7 @@ def _time_series(
     is_one = len(entities) == 1
     return rrb.TimeSeriesView(
         origin=entities[0] if is_one else "/",
-        contents="$origin/**" if is_one else list(entities),
+        contents="$origin/**" if is_one else [f"{entity}/**" for entity in entities],
         name=name,
         axis_x=_axis(),
         axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
@@ -227,11 +228,12 @@ def _view(plot: Plot, note: str = "", close_up: str = "") -> rrb.View:
 
 
 def _other_rows(plots: Sequence[Plot]) -> list[Row]:
-    """Show all but the shares; plots of one kind share a view."""
+    """Show all but the shares; plots whose kinds have one title share a view."""
     rows: list[Row] = []
-    for kind in PLOTS:
-        same = [plot for plot in plots if plot.kind is kind]
-        if same and kind is not SHARES:
+    for title in dict.fromkeys(kind.title for kind in PLOTS if kind is not SHARES):
+        same = [plot for plot in plots if plot.kind.title == title]
+        if same:
+            kind = same[0].kind
             view = plot_view(kind, [plot_entity(plot) for plot in same], same[0].names)
             rows.append((kind.height, view))
     return rows

@@ -145,10 +145,16 @@ def _layout(plots: Plots, minutes: float) -> TimelineBlueprint:
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
+    """Show the plots of a microphone; those whose kinds have one title share a view."""
     rows: list[Row] = []
-    for kind in PLOTS:
-        for root, same in plots.items():
-            if same[0].kind is kind and same[0].microphone == microphone:
-                names = max((plot.names for plot in reversed(same)), key=len)
-                rows.append((kind.height, plot_view(kind, [root], names, live=True)))
+    for title in dict.fromkeys(kind.title for kind in PLOTS):
+        shown = {
+            root: same
+            for root, same in plots.items()
+            if same[0].kind.title == title and same[0].microphone == microphone
+        }
+        if shown:
+            kind = next(iter(shown.values()))[0].kind
+            names = max((plot.names for same in shown.values() for plot in same[::-1]), key=len)
+            rows.append((kind.height, plot_view(kind, list(shown), names, live=True)))
     return stack(rows, microphone)
