@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from threading import Event
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation
 from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.relabel.home_sound import read_home_sound
 from hearthlog.analyzer.training.calibration import inverse_temperature
-from hearthlog.analyzer.training.dataset import Recording, cut_recordings
+from hearthlog.analyzer.training.dataset import Recording, build_dataset, cut_recordings
 from hearthlog.analyzer.training.home_data import home_recordings, home_sequences
+from hearthlog.analyzer.training.home_transitions import adapt_transitions
+from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare, softmax
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, ROOM21
@@ -30,6 +34,9 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.recording import record
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
@@ -231,7 +238,8 @@ def test_marks_without_time_between_them_say_what_follows_what(recorded):
 def test_a_home_teaches_how_long_its_sounds_go_on(world):
     base, few, _ = world
     sequence = np.repeat([0, 1, 0], [1000, 10, 1000])
-    learned, kept = adapt_model(base, few, [sequence]), adapt_model(base, few)
+    kept = adapt_model(base, few)
+    learned = adapt_transitions(kept, [sequence], [])
     assert learned.transitions[0, 0] > kept.transitions[0, 0]
     assert learned.transitions[1, 0] > kept.transitions[1, 0]
     np.testing.assert_array_equal(learned.transitions[2], kept.transitions[2])
@@ -277,6 +285,71 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     assert len(home) == about["speech"]["segments"] + about["silence"]["segments"]
     loud_enough = prepare(ROOM21, home).usable[0]  # three windows of each segment
     assert len(home) < loud_enough.sum() == len(adapted.arrays["home_vectors"])
+
+
+@pytest.fixture(scope="module")
+def smoothed(training_set, tmp_path_factory):
+    """A model that smooths, learned from simulated sound."""
+    output = tmp_path_factory.mktemp("smoothed") / "smoothed.safetensors"
+    scenario = BUILTIN["general"]
+    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, ignore_progress)
+    save_model(train_model(data, scenario, ignore_progress), output)
+    return output
+
+
+def test_the_last_weeks_are_labelled_as_a_recorder_does_and_long_silence_is_cut(
+    day, smoothed, tmp_path
+):
+    model = load_model(smoothed)
+    settings = Settings(output=tmp_path, model=smoothed)
+    record(settings, settings.microphone[0], FileSource([day], 1_772_348_400 * 10**9), Event())
+    (columns,) = read_columns(find_logs(tmp_path), ["/mic/label"]).values()
+    sound, losses = read_home_sound([tmp_path], model)
+    assert losses == []
+    (kept,) = sound
+    labelled = columns["probabilities"]
+    silent = labelled.argmax(axis=1) == model.classes.index("silence")
+    runs = np.split(np.arange(len(silent)), np.flatnonzero(np.diff(silent)) + 1)
+    middles = [run[100:-100] for run in runs if silent[run[0]]]  # of those between two sounds
+    assert max(len(middle) for middle in middles) > 20
+    assert len(labelled) - len(kept) >= sum(map(len, middles))
+    rows = {row.tobytes() for row in labelled}
+    assert all(row.tobytes() in rows for row in kept)
+    np.testing.assert_array_equal(kept[~(kept.argmax(axis=1) == 0)], labelled[~silent])
+
+
+def test_of_two_weeks_only_what_can_be_read_is_learned_from(smoothed, day, tmp_path):
+    model = load_model(smoothed)
+    for number, date in enumerate(("2026-01-01", "2026-03-01", "2026-03-02")):
+        output = tmp_path / "logs"
+        start = int(np.datetime64(date, "ns").astype(int))
+        settings = Settings(output=output, model=None)
+        record(settings, settings.microphone[0], FileSource([day], start), Event())
+        assert len(find_logs(output)) == number + 1
+    _, second, last = find_logs(tmp_path / "logs")
+    assert len(read_home_sound([tmp_path / "logs"], model).sound) == 2
+    data = bytearray(last.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    last.write_bytes(data)
+    sound, (loss,) = read_home_sound([tmp_path / "logs"], model)
+    assert str(last) in loss
+    expected, _ = read_home_sound([second], model)
+    np.testing.assert_array_equal(sound[-1], expected[0])
+
+
+def test_a_home_without_a_mark_teaches_what_follows_what(hearthlog, smoothed, recorded, tmp_path):
+    output = tmp_path / "home.safetensors"
+    done = hearthlog("train", "--base", smoothed, "--home", recorded, "-o", output)
+    assert done.returncode == 0, done.stderr
+    assert "nothing is marked: only what follows what is learned" in done.stderr
+    base, home = load_model(smoothed), load_model(output)
+    for name, array in base.arrays.items():
+        np.testing.assert_array_equal(array, home.arrays[name])
+    assert (home.transitions != base.transitions).any()
+    training = home.description.training_data
+    assert training.home_frames > 1000
+    assert training.base_sha256 == base.sha256
+    assert "minutes of a home without marks" in model_card(home)
 
 
 def test_augmented_sound_is_what_the_other_microphone_would_give():

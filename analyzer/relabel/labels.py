@@ -25,8 +25,8 @@ from hearthlog.analyzer.relabel.layer import (
 from hearthlog.analyzer.relabel.reading import (
     UnreadableError,
     goes_on_in,
+    info_for_model,
     read_sound,
-    recorder_info,
     recover_copy,
     warm_up,
 )
@@ -183,7 +183,7 @@ def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
 
 def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> UnfinishedLayer:
     """Label a log, or the copy that was saved of it."""
-    info = _checked_info(log, job.log, model)
+    info, _ = info_for_model(log, model, job.log)
     labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
     open_at_start = labeller.open_run
     lacks_start = job.continues_layer and open_at_start is not None
@@ -211,19 +211,6 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Unfinis
         frames=frames,
         loss="" if info.complete else "it is cut off",
     )
-
-
-def _checked_info(path: Path, log: Path, model: Model) -> RecorderInfo:
-    """Read what a log says of its recorder, and compare the feature set with the model's."""
-    info = recorder_info(path)
-    if info is None or info.first_frame is None:
-        raise LogError(f"{log}: has no features; there is nothing to label")
-    if info.feature_set not in {"", model.description.feature_set}:
-        raise LogError(
-            f"{log}: has features of set {info.feature_set!r}; model {model.name} is for "
-            f"{model.description.feature_set}"
-        )
-    return info
 
 
 def _write_labels(

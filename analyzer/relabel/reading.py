@@ -11,6 +11,7 @@ from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_in
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import is_active
@@ -47,6 +48,39 @@ def recorder_info(path: Path) -> RecorderInfo | None:
         return read_recorder_info(path, "features")
     except LogError as error:
         raise UnreadableError(path, error) from error
+
+
+def info_for_model(path: Path, model: Model, log: Path) -> tuple[RecorderInfo, tuple[int, int]]:
+    """Read what a log says of its recorder, and compare the feature set with that of a model.
+
+    Parameters
+    ----------
+    path : Path
+        The log, or a copy of it.
+    model : Model
+    log : Path
+        What errors call it.
+
+    Returns
+    -------
+    info : RecorderInfo
+    first_frame : (int, int)
+        Number and start of its first frame, in nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        If it has no features, or those of another set; an `UnreadableError` if it is damaged.
+    """
+    info = recorder_info(path)
+    if info is None or info.first_frame is None:
+        raise LogError(f"{log}: has no features; there is nothing to label")
+    if info.feature_set not in {"", model.description.feature_set}:
+        raise LogError(
+            f"{log}: has features of set {info.feature_set!r}; model {model.name} is for "
+            f"{model.description.feature_set}"
+        )
+    return info, info.first_frame
 
 
 def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:

@@ -36,8 +36,6 @@ from hearthlog.analyzer.training.transitions import (
     REACH_SECONDS,
     SHORTEST_SECONDS,
     default_transitions,
-    expected_durations,
-    transitions_from_sequences,
 )
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.description import (
@@ -51,7 +49,7 @@ from hearthlog.models.classifiers.description import (
     TrainingData,
 )
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Float64, Indices, Int64
+from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.progress import Progress, ignore_progress
 
@@ -132,7 +130,7 @@ def train_model(
     )
 
 
-def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> Model:
+def adapt_model(base: Model, home: Dataset) -> Model:
     """Learn a model again, from its own segments and those of a home.
 
     Parameters
@@ -141,16 +139,13 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
         A model with its training windows.
     home : Dataset
         Of the same classes, some of which may have no segments.
-    sequences : sequence of np.ndarray [shape=(n,)], int64
-        Indices of the classes of successive frames in the home, to estimate transitions from. By
-        default the model keeps its transitions.
 
     Returns
     -------
     Model
-        With the parameters and metrics of `base`, which are those of other homes. Its temperature
-        is moved by parts of the home that were left out in turn. It keeps the windows of `base`
-        only, so that it can be adapted again to more of the home.
+        With the parameters, transitions and metrics of `base`, which are those of other homes. Its
+        temperature is moved by parts of the home that were left out in turn. It keeps the windows
+        of `base` only, so that it can be adapted again to more of the home.
 
     Raises
     ------
@@ -192,11 +187,7 @@ def adapt_model(base: Model, home: Dataset, sequences: Sequence[Int64] = ()) -> 
     return Model(
         description.model_copy(update=update),
         learned.arrays() | memory,
-        transitions=(
-            transitions_from_sequences(sequences, expected_durations(base.classes))
-            if len(base.transitions) and len(sequences)
-            else base.transitions
-        ),
+        transitions=base.transitions,
         training_windows=base.training_windows,
         training_floor=base.training_floor,
         training_target=base.training_target,

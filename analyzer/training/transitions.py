@@ -74,28 +74,26 @@ def transitions_from_durations(durations: Float64, frame_seconds: float) -> Floa
     return transitions
 
 
-def transitions_from_sequences(
+def count_transitions(
     sequences: Sequence[Int64],
     durations: Float64,
     frame_seconds: float = FRAME_SECONDS,
 ) -> Float64:
-    """Estimate transition probabilities from labelled sequences; expected durations are the prior.
-
-    The prior counts as one visit to each class; a class that is in no sequence keeps its duration.
+    """Count the transitions in labelled sequences, and add one visit to each class.
 
     Parameters
     ----------
     sequences : sequence of np.ndarray [shape=(n,)], int64
         Indices of the classes of successive frames.
     durations : np.ndarray [shape=(C,)], float64
-        Expected durations, in seconds; less than a frame counts as a frame.
+        Of the visits that are added, in seconds; less than a frame counts as a frame.
     frame_seconds : float
         Length of a frame, in seconds.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class.
+        Number of frames of the row's class that are followed by one of the column's class.
     """
     count = len(durations)
     frames = np.maximum(durations / frame_seconds, 1.0)
@@ -103,5 +101,4 @@ def transitions_from_sequences(
     for sequence in sequences:
         pairs = sequence[:-1] * count + sequence[1:]
         counts += np.bincount(pairs, minlength=count * count).reshape(count, count)
-    transitions: Float64 = counts / counts.sum(axis=1, keepdims=True)
-    return transitions
+    return counts

@@ -54,7 +54,9 @@ class TrainingData(_Record):
     Attributes
     ----------
     home : dict of str to Amount
-        What a home added, by class, if the model was adapted.
+        What marks of a home added, by class, if the model was adapted.
+    home_frames : int
+        Frames of the home without marks, from which transitions are.
     base_sha256 : str
         SHA-256 of the model file that was adapted, or empty.
     """
@@ -63,6 +65,7 @@ class TrainingData(_Record):
     classes: dict[_ClassName, Amount]
     collections: list[Collection]
     home: dict[_ClassName, Amount] = {}
+    home_frames: _Count = 0
     base_sha256: _Text = ""
 
     @property

@@ -4,6 +4,7 @@ import json
 
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.log_stream import Attachment
 
 CARD = "model_card.md"
@@ -72,6 +73,9 @@ def model_card(model: Model) -> str:
             f"- {name}: {amount.segments} segments from {amount.sources} sources"
             for name, amount in description.training_data.home.items()
         ]
+    if frames := description.training_data.home_frames:
+        minutes = frames * FRAME_SECONDS / 60
+        lines += ["", f"What follows what is from {minutes:.0f} minutes of a home without marks."]
     if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
     lines += ["", "Learned from recordings of:", ""]

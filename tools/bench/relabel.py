@@ -13,8 +13,8 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.viterbi import viterbi
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,7 +41,9 @@ def train(
     scenario: Annotated[str | None, typer.Option(help=SCENARIO)] = None,
     home: Annotated[
         list[Path] | None,
-        typer.Option(help="Logs with review layers, and enrolled sounds, to learn from as well."),
+        typer.Option(
+            help="Logs, with review layers if there are any, and enrolled sounds, to learn from."
+        ),
     ] = None,
     base: Annotated[
         Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
@@ -110,23 +113,48 @@ def _learned(
         segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        return train_model(segments, chosen, report, method, smoothing), segments
+        model = train_model(segments, chosen, report, method, smoothing)
+    return (_with_home_transitions(model, home) if home else model), segments
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.dataset import cut_recordings
-    from hearthlog.analyzer.training.home_data import home_sequences
     from hearthlog.analyzer.training.scenario import scenario_of
     from hearthlog.analyzer.training.train import adapt_model
     from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
 
-    model = load_model(base)
+    model = adapted = load_model(base)
     features = feature_set(model.description.feature_set)
     segments = cut_recordings(_home_recordings(home, features), scenario_of(model), features)
-    with share_done(f"learning from {len(segments)} segments of the home besides", announce=True):
+    what = f"learning from {len(segments)} segments of the home besides"
+    if len(segments):
+        with share_done(what, announce=True):
+            adapted = adapt_model(model, segments)
+    adapted = _with_home_transitions(adapted, home)
+    if adapted is model:
+        return adapt_model(model, segments), segments  # which says why there are no segments
+    if not len(segments):
+        tell("nothing is marked: only what follows what is learned, not how the home sounds")
+    return adapted, segments
+
+
+def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
+    from hearthlog.analyzer.relabel.home_sound import read_home_sound
+    from hearthlog.analyzer.training.home_data import home_sequences
+    from hearthlog.analyzer.training.home_transitions import adapt_transitions
+
+    if not len(model.transitions):
+        return model
+    if find_spec("hmmlearn") is None:
+        tell("hmmlearn is not installed: transitions are not learned from the home")
+        return model
+    with share_done("learning what follows what in the home", announce=True) as report:
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
-        return adapt_model(model, segments, sequences), segments
+        sound, losses = read_home_sound(home, model, report)
+        for loss in losses:
+            tell(loss)
+        return adapt_transitions(model, sequences, sound)
 
 
 def _home_recordings(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
