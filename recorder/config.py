@@ -15,6 +15,7 @@ from pydantic_settings import (
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import check_node_name
@@ -75,7 +76,7 @@ class Settings(BaseSettings):
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds a file
     flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
     sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut
-    statistics_every: int = Field(default=1, ge=1)  # frames
+    statistics_every: int = Field(default=LOGGED_EVERY, ge=1)  # frames
     timezone: Annotated[str, _checked(check_time_zone)] = Field(default_factory=machine_zone)
     keep_audio: Keep = "off"
     never_keep: list[str] = ["speech"]  # classes

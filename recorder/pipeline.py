@@ -13,7 +13,7 @@ from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_colu
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
-from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.recorder.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -35,7 +35,7 @@ class Pipeline:
     classifier : Classifier or None
         For this feature set. Without one there are no labels.
     statistics_every : int
-        Frames from one statistics message to the next.
+        Frames from one statistics message to the next: those of the frames whose number it divides.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Pipeline:
         microphone: str,
         features: FeatureSet,
         classifier: Classifier | None = None,
-        statistics_every: int = 1,
+        statistics_every: int = LOGGED_EVERY,
     ) -> None:
         self.microphone = microphone
         self.feature_set = features

@@ -5,6 +5,8 @@ import numpy as np
 from hearthlog.models.features.window_inputs import WindowStatistics, mean_and_std
 from hearthlog.schemas.arrays import Float32
 
+LOGGED_EVERY = 20  # frames: each message is of a second of its own
+
 
 class RollingStatistics:
     """Statistics of one stream of frames over its last frames.

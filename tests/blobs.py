@@ -7,19 +7,24 @@ import numpy as np
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import DEFAULT
 
 SOURCES = 6
 
 
-def blobs(classes: int, count: int, *, spread: float = 1.5) -> tuple[Dataset, Scenario]:
+def blobs(
+    classes: int, count: int, *, spread: float = 1.5, features: FeatureSet = DEFAULT
+) -> tuple[Dataset, Scenario]:
     """Make `count` segments of each class around a centre of its own, from six sources each."""
     rng = np.random.default_rng(classes)
     names = tuple(f"class_{i}" for i in range(classes))
     target = np.repeat(np.arange(classes), count)
-    centre = rng.standard_normal((classes, 21))
-    around = centre[target] + spread * rng.standard_normal((len(target), 21))
-    windows = around[:, np.newaxis] + 0.1 * rng.standard_normal((len(target), 20, 21))
-    windows *= np.geomspace(1e-2, 10, 21)
+    width, frames = features.width, features.window_frames
+    centre = rng.standard_normal((classes, width))
+    around = centre[target] + spread * rng.standard_normal((len(target), width))
+    windows = around[:, np.newaxis] + 0.1 * rng.standard_normal((len(target), frames, width))
+    windows *= np.geomspace(1e-2, 10, width)
     windows[:, :, [0, 6]] = np.exp(windows[:, :, [0, 6]])  # energy and flux are never negative
     group = target * SOURCES + np.arange(len(target)) % SOURCES
     data = Dataset(
@@ -28,9 +33,9 @@ def blobs(classes: int, count: int, *, spread: float = 1.5) -> tuple[Dataset, Sc
         group=group,
         collection=np.zeros_like(group),
         weight=np.ones(len(target)),
-        floor=np.zeros((len(target), 33)),
+        floor=np.zeros((len(target), features.bands)),
         copies=np.empty((0, *windows.shape), np.float32),
-        copy_floor=np.empty((0, len(target), 33)),
+        copy_floor=np.empty((0, len(target), features.bands)),
         classes=names,
         seconds=dict.fromkeys(names, float(count)),
         collection_names=("made up",),

@@ -17,7 +17,7 @@ from stores import bucket, in_memory, s3_account
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario
-from hearthlog.analyzer.training.svm_method import BANDS
+from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.transitions import (
     LAG_SECONDS,
@@ -26,6 +26,7 @@ from hearthlog.analyzer.training.transitions import (
     default_transitions,
 )
 from hearthlog.models.classifiers.description import Smoothing
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
@@ -122,12 +123,13 @@ def model_file(tmp_path_factory, training_set) -> Path:
 
 
 @pytest.fixture(scope="session")
-def bands_file(tmp_path_factory, training_set) -> Path:
+def second_file(tmp_path_factory, training_set) -> Path:
     """A model that takes a whole second and no floor, and labels the middle of it."""
+    method = replace(PAPER, feature_set=DEFAULT.name)
     scenario = load_scenario("general")
     data = build_dataset(read_manifest(training_set, scenario.labels), scenario, lambda *_: None)
-    path = tmp_path_factory.mktemp("bands") / "bands.safetensors"
-    save_model(train_model(data, scenario, lambda *_: None, BANDS, "merge"), path)
+    path = tmp_path_factory.mktemp("second") / "second.safetensors"
+    save_model(train_model(data, scenario, lambda *_: None, method, "merge"), path)
     return path
 
 

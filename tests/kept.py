@@ -12,7 +12,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:
-    """Make the models `one`, `two` and `bands`, the first of them the champion."""
+    """Make the models `one`, `two` and `broad`, the first of them the champion."""
     folder.mkdir()
     one = load_model(model_file)
     rng = np.random.default_rng(3)
@@ -26,7 +26,7 @@ def keep_models(folder: Path, model_file: Path) -> Path:
     )
     save_model(one, folder / "one.safetensors")
     save_model(two, folder / "two.safetensors")
-    save_model(_of_bands(one), folder / "bands.safetensors")
+    save_model(_of_a_second(one), folder / "broad.safetensors")
     (folder / "champion.safetensors").symlink_to("one.safetensors")
     return folder
 
@@ -38,14 +38,14 @@ def put_by_hand(folder: Path, name: str) -> None:
     link.replace(folder / "champion.safetensors")
 
 
-def _of_bands(model: Model) -> Model:
+def _of_a_second(model: Model) -> Model:
     """Make a model that looks at the same sounds in another way, and smooths what it sees."""
     rng = np.random.default_rng(4)
     count = len(model.arrays["support_vectors"])
-    width, classes = DEFAULT.inputs["bands"].width, len(model.classes)
+    width, classes = DEFAULT.inputs["statistics"].width, len(model.classes)
     description = model.description.model_copy(
         update={
-            "inputs": "bands",
+            "inputs": "statistics",
             "window_seconds": 1.0,
             "label_frame": 10,
             "gate": 0.0,

@@ -6,7 +6,7 @@ import numpy as np
 from logreader import LogReader
 
 from hearthlog.models.classifiers.timing import LabelTiming
-from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 
@@ -24,10 +24,11 @@ def read(path: Path, kind: str) -> list:
 def features(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Frame numbers, stamps (ns) and values of all features."""
     found = read(path, "features")
+    width = len(found[0].values) if found else DEFAULT.width
     return (
         np.array([m.frame for m in found], np.int64),
         np.array([nanoseconds(m.header.stamp) for m in found], np.int64),
-        np.array([m.values for m in found], np.float32).reshape(-1, len(FEATURE_NAMES)),
+        np.array([m.values for m in found], np.float32).reshape(-1, width),
     )
 
 

@@ -89,7 +89,7 @@ def write_real_day(household: Path, folder: Path) -> Path:
     for clip in read_manifest(household / "manifest.csv", scenario.labels):
         clips[clip.label].append(clip)
     learnt = [clip for name in CLASSES for clip in _spread(clips[name], _CLIPS)]
-    data = build_dataset(learnt, scenario, lambda *_: None)
+    data = build_dataset(learnt, scenario, lambda *_: None, features=PAPER.features)
     model = folder / "home.safetensors"
     save_model(_surer(train_model(data, scenario, lambda *_: None, PAPER)), model)
     pieces = {name: _write_piece(folder / f"{name}.wav", clips[name]) for name in CLASSES}

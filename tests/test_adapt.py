@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from functools import cache
 from threading import Event
 
 import numpy as np
@@ -22,7 +23,7 @@ from hearthlog.analyzer.training.home_transitions import adapt_transitions
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare, softmax
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
-from hearthlog.analyzer.training.svm_method import BANDS, ROOM21
+from hearthlog.analyzer.training.svm_method import BANDS, ROOM
 from hearthlog.analyzer.training.train import adapt_model, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
@@ -64,13 +65,18 @@ def moved(data, amount):
     return dataclasses.replace(data, windows=windows, weight=np.full(len(data), 5.0))
 
 
-@pytest.fixture(scope="module")
-def world():
+@cache
+def world_of(method):
     """A model, and a home where everything sounds different: a part to learn from, and the rest."""
-    data, scenario = blobs(4, 60, spread=0.6)
+    data, scenario = blobs(4, 60, spread=0.6, features=method.features)
     learned, other = split(data, data.group[data.group % 6 < 4])
     few, rest = split(moved(other, 40.0), other.group[other.group % 6 == 4])
-    return train_model(learned, scenario, ignore_progress), few, rest
+    return train_model(learned, scenario, ignore_progress, method), few, rest
+
+
+@pytest.fixture(scope="module")
+def world():
+    return world_of(ROOM)
 
 
 def accuracy(model, data):
@@ -101,18 +107,9 @@ def test_adapting_to_the_same_home_gives_the_same_file(world, tmp_path):
     assert a.sha256 == b.sha256
 
 
-def of_method(base, method):
-    """Learn a model anew from what it has kept, by another method."""
-    data, scenario = blobs(4, 60, spread=0.6)
-    learned, _ = split(data, data.group[data.group % 6 < 4])
-    assert len(learned) == len(base.training_windows)
-    return train_model(learned, scenario, ignore_progress, method)
-
-
-@pytest.mark.parametrize("method", [BANDS, ROOM21])
-def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(world, method):
-    base, few, _ = world
-    base = of_method(base, method)
+@pytest.mark.parametrize("method", [BANDS, ROOM])
+def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(method):
+    base, few, _ = world_of(method)
     once = adapt_model(base, few)
     twice = adapt_model(once, few)
     for name, array in once.arrays.items():
@@ -127,9 +124,8 @@ def test_a_class_the_home_has_not_is_not_forgotten(world):
     assert (predicted(adapt_model(base, three), windows, floor) == 2).mean() > 0.9
 
 
-def test_a_model_without_what_it_learned_from_is_refused(world):
-    base, few, _ = world
-    base = of_method(base, BANDS)
+def test_a_model_without_what_it_learned_from_is_refused():
+    base, few, _ = world_of(BANDS)
     bare = dataclasses.replace(base, name="bare", training_windows=base.training_windows[:0])
     with pytest.raises(DataError, match="bare: has not kept what it learned from"):
         adapt_model(bare, few)
@@ -152,10 +148,10 @@ def test_a_home_without_segments_is_refused(world):
 def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
     base, few, rest = world
     adapted = adapt_model(base, few)
-    remembered, target = ROOM21.remembered(base)
-    examples = prepare(ROOM21, few)._replace(more_inputs=remembered, more_target=target)
-    learned = ROOM21.fit(examples, home=np.arange(len(few)))
-    inputs = of_segments(DEFAULT.inputs[ROOM21.inputs], rest.windows, rest.floor)
+    remembered, target = ROOM.remembered(base)
+    examples = prepare(ROOM, few)._replace(more_inputs=remembered, more_target=target)
+    learned = ROOM.fit(examples, home=np.arange(len(few)))
+    inputs = of_segments(DEFAULT.inputs[ROOM.inputs], rest.windows, rest.floor)
     inputs = inputs.reshape(-1, inputs.shape[-1])
     decision = learned.decide(inputs, 4)
     expected = softmax(adapted.description.inverse_temperature * decision)
@@ -283,7 +279,7 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     assert adapted.classes == base.classes
     home = cut_recordings(marked, scenario_of(base))
     assert len(home) == about["speech"]["segments"] + about["silence"]["segments"]
-    loud_enough = prepare(ROOM21, home).usable[0]  # three windows of each segment
+    loud_enough = prepare(ROOM, home).usable[0]  # three windows of each segment
     assert len(home) < loud_enough.sum() == len(adapted.arrays["home_vectors"])
 
 
@@ -376,7 +372,7 @@ def test_augmented_sound_is_what_the_other_microphone_would_give():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_folds_by_segment_flatter_and_all_kinds_are_scored(kind):
-    data, _ = blobs(3, 60, spread=2.0)
+    data, _ = blobs(3, 60, spread=2.0, features=BANDS.features)
     collections = dataclasses.replace(
         data, collection=data.group % 3, collection_names=("a", "b", "c")
     )
@@ -387,13 +383,13 @@ def test_folds_by_segment_flatter_and_all_kinds_are_scored(kind):
 
 
 def test_one_collection_cannot_be_left_out():
-    data, _ = blobs(3, 30)
+    data, _ = blobs(3, 30, features=BANDS.features)
     with pytest.raises(DataError, match="all recordings are of one collection"):
         evaluate_method(data, BANDS, "collection", ignore_progress)
 
 
 def test_the_curve_of_adaptation_rises_where_homes_differ():
-    data, _ = blobs(3, 400, spread=1.0)
+    data, _ = blobs(3, 400, spread=1.0, features=BANDS.features)
     group = np.arange(len(data)) // 4
     far = data.windows + np.float32(20.0) * (group % 2).astype(np.float32)[:, None, None]
     data = dataclasses.replace(
@@ -406,7 +402,7 @@ def test_the_curve_of_adaptation_rises_where_homes_differ():
 
 
 def test_no_collection_is_like_a_home_if_all_are_small():
-    data, _ = blobs(3, 30)
+    data, _ = blobs(3, 30, features=BANDS.features)
     with pytest.raises(DataError, match="none can stand for a new home"):
         adaptation_curve(data, BANDS, ignore_progress)
 

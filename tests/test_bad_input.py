@@ -12,6 +12,7 @@ from logreader import LogReader
 from logs import features
 from spliced import small_disk
 
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 
@@ -127,7 +128,7 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
     refused, hearthlog, sound, tmp_path
 ):
     long = tmp_path / "long.wav"
-    soundfile.write(long, np.random.default_rng(0).normal(0, 0.1, 16_000 * 300), 16_000)
+    soundfile.write(long, np.random.default_rng(0).normal(0, 0.1, 16_000 * 900), 16_000)
     with small_disk(tmp_path / "disk", "1m") as disk:
         message = refused("record", long, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert message == (
@@ -163,9 +164,9 @@ def test_a_model_that_is_truncated(refused, sound, model_file, tmp_path, length)
 
 def test_a_model_of_another_feature_set(refused, sound, model_file, tmp_path):
     path = tmp_path / "other.safetensors"
-    path.write_bytes(model_file.read_bytes().replace(b"auros21", b"auros99"))
+    path.write_bytes(model_file.read_bytes().replace(DEFAULT.name.encode(), b"home99"))
     message = refused("record", sound, "--model", path, "-o", tmp_path / "logs")
-    assert "auros99" in message
+    assert "home99" in message
 
 
 def test_no_portaudio(refused, tmp_path):

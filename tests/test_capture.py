@@ -10,7 +10,7 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features, read
 
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import nanoseconds
 
@@ -56,7 +56,7 @@ def batch(data, start, count):
     """Features of `count` frames of the looping data, from sample `start` on."""
     index = (start + np.arange(count * FRAME_SAMPLES)) % len(data)
     frames = (data[index].astype(np.float32) / np.float32(32768)).reshape(-1, FRAME_SAMPLES)
-    return FeatureExtractor()(frames)
+    return DEFAULT.extractor()(frames)
 
 
 def first_sample(data, values, guess):

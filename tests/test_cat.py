@@ -20,6 +20,7 @@ from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.typed_columns import decode_all
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -231,7 +232,7 @@ def test_text_has_a_short_line_for_every_message(recorded, hearthlog):
     assert gap.startswith("2026-03-01T07:00:20.473Z /mic/gap stamp=2026-03-01T07:00:20.123Z ")
     assert gap.endswith("duration=0.350s reason=overrun frames_lost=7")
     (features, *_) = (line for line in lines if " /mic/features " in line)
-    assert features.endswith(" … 21]")
+    assert features.endswith(f" … {DEFAULT.width}]")
 
 
 def test_text_leaves_the_terminal_alone(foreign):

@@ -32,6 +32,7 @@ from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed
 from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -94,7 +95,7 @@ def relabelled(log: Path, segments: list[tuple[int, str]]) -> Path:
         "model": "better.1",
         "model_sha256": "ab" * 32,
         "input_sha256": "cd" * 32,
-        "feature_set": "auros21",
+        "feature_set": DEFAULT.name,
     }
     writer = LogWriter(path, [Topic(topic, message_types.SEGMENT)], about)
     writer.write_columns([TopicBatch(topic, start + np.cumsum(lengths), fields)])
@@ -214,7 +215,7 @@ def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_pa
     catalog = write_catalog(fleet)
     row, alone = catalog.current(merged), catalog.current(log)
     assert (row.version, row.model, row.node) == (None, None, None)
-    assert row.feature_set == "auros21"
+    assert row.feature_set == DEFAULT.name
     assert row.microphones == ["hall", "mic"]
     assert row.frames > alone.frames
     assert (row.first_frame, row.last_stamp) == (None, None)

@@ -17,7 +17,6 @@ from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
-from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.progress import ignore_progress
 
 pytestmark = pytest.mark.fast
@@ -27,17 +26,18 @@ ROWS = 600
 
 @cache
 def trained(classes, count=60, spread=1.5):
-    return train_model(*blobs(classes, count, spread=spread), ignore_progress, PAPER)
+    data, scenario = blobs(classes, count, spread=spread, features=PAPER.features)
+    return train_model(data, scenario, ignore_progress, PAPER)
 
 
 def statistics(data):
-    return DEFAULT.inputs["statistics"].of_windows(data.windows)
+    return PAPER.features.inputs["statistics"].of_windows(data.windows)
 
 
 @cache
 def unseen(classes):
     rng = np.random.default_rng(7)
-    rows = statistics(blobs(classes, 60)[0])
+    rows = statistics(blobs(classes, 60, features=PAPER.features)[0])
     chosen = rows[rng.integers(0, len(rows), ROWS)]
     return (chosen * rng.uniform(0.8, 1.2, chosen.shape)).astype(np.float32)
 
@@ -46,7 +46,7 @@ def unseen(classes):
     ("classes", "count", "spread"), [(2, 60, 1.5), (3, 60, 1.5), (9, 60, 1.5), (3, 300, 9.0)]
 )
 def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
-    data, _ = blobs(classes, count, spread=spread)
+    data, _ = blobs(classes, count, spread=spread, features=PAPER.features)
     model = trained(classes, count, spread)
     machine = SVC(
         C=model.description.parameters["cost"],

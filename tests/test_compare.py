@@ -69,25 +69,25 @@ def heard(manifest):
 
 
 def test_a_model_that_guesses_is_clearly_worse(folder, unheard):
-    found = compare(folder, ["one", "bands"], heard(unheard))
+    found = compare(folder, ["one", "broad"], heard(unheard))
     assert found.clear
     assert found.difference.macro_f1 < -0.3
     assert found.difference.interval[1] < 0
-    mirrored = compare(folder, ["bands", "one"], heard(unheard))
+    mirrored = compare(folder, ["broad", "one"], heard(unheard))
     assert mirrored.difference.macro_f1 == -found.difference.macro_f1
     np.testing.assert_allclose(
         mirrored.difference.interval[::-1], -np.array(found.difference.interval)
     )
-    assert compare(folder, ["one", "bands"], heard(unheard)) == found
+    assert compare(folder, ["one", "broad"], heard(unheard)) == found
 
 
 def test_the_order_of_the_classes_changes_nothing(folder, unheard):
     scenario = load_scenario("general")
     turned = replace(scenario, classes=dict(reversed(scenario.classes.items())))
-    models = [load_model(folder / f"{name}.safetensors") for name in ("one", "bands")]
+    models = [load_model(folder / f"{name}.safetensors") for name in ("one", "broad")]
     found = compare_models(*models, list(heard(unheard)), turned)
     assert found.a.scores.classes == models[0].classes[::-1]
-    straight = compare(folder, ["one", "bands"], heard(unheard))
+    straight = compare(folder, ["one", "broad"], heard(unheard))
     assert found.difference.macro_f1 == pytest.approx(straight.difference.macro_f1)
 
 
@@ -95,10 +95,10 @@ def test_clips_of_other_names_are_those_of_the_classes(folder, unheard):
     other = unheard.with_name("other.csv")
     other.write_text(unheard.read_text().replace(",coughing,", ",Cough,"))
     found, same = (
-        compare(folder, ["one", "bands"], heard(manifest)) for manifest in (other, unheard)
+        compare(folder, ["one", "broad"], heard(manifest)) for manifest in (other, unheard)
     )
     assert found.b.scores == same.b.scores
-    model, scenario = load_model(folder / "bands.safetensors"), load_scenario("general")
+    model, scenario = load_model(folder / "broad.safetensors"), load_scenario("general")
     one, two = (
         evaluate_model(model, read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
         for manifest in (other, unheard)
@@ -135,21 +135,21 @@ def test_models_that_have_learned_from_everything_are_compared_with_a_warning(fo
 
 
 def test_the_champion_and_the_candidate_are_compared_on_reviewed_logs(folder, days, capfd):
-    run(capfd, "models", "promote", "bands", "--to", "candidate", "--folder", folder)
+    run(capfd, "models", "promote", "broad", "--to", "candidate", "--folder", folder)
     command = ("models", "compare", "--logs", days, "--folder", folder)
     result = run(capfd, *command)
     assert (result.returncode, result.stderr) == (0, "")
-    assert result.stdout.splitlines()[-1].startswith("one is better than bands: ")
+    assert result.stdout.splitlines()[-1].startswith("one is better than broad: ")
     found = json.loads(run(capfd, *command, "--json").stdout)
     assert found["clear"] is True
     assert found["difference"]["interval"][0] <= found["difference"]["macro_f1"] < 0
     assert found["a"]["scores"]["groups"] == 3
-    assert (found["a"]["name"], found["b"]["name"]) == ("one", "bands")
+    assert (found["a"]["name"], found["b"]["name"]) == ("one", "broad")
 
 
 def test_one_source_tells_no_difference(folder, days, capfd):
     log = min(days.rglob("*Z.mcap"))
-    result = run(capfd, "models", "compare", "one", "bands", "--logs", log, "--folder", folder)
+    result = run(capfd, "models", "compare", "one", "broad", "--logs", log, "--folder", folder)
     assert result.returncode == 0
     assert "no clear difference can be told from one source" in result.stdout
 

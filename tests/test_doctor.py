@@ -61,11 +61,11 @@ GAP = "gap"  # the log has one; what breaks another rule must not hide it
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory, day, model_file):
-    """Forty seconds with a gap of 7 frames, in one log."""
+    """Forty seconds with a gap of 7 frames, in one log, with statistics of every frame."""
     folder = tmp_path_factory.mktemp("recorded")
     samples, rate = soundfile.read(day, frames=40 * 16_000, dtype="int16")
     soundfile.write(folder / "sound.wav", samples, rate)
-    settings = Settings(output=folder, model=model_file)
+    settings = Settings(output=folder, model=model_file, statistics_every=1)
     source = LossySource(FileSource([folder / "sound.wav"], START), {2: 7})
     (path,) = record(settings, settings.microphone[0], source, Flag()).logs
     return path
@@ -546,16 +546,16 @@ DATA = {
     "a slow clock": (slow_clock, None),
     "features of another width": (change(FEATURES, values=np.zeros(20, np.float32)), {"width"}),
     "features that are no numbers": (
-        change(FEATURES, values=np.full(21, np.nan, np.float32)),
+        change(FEATURES, values=np.full(DEFAULT.width, np.nan, np.float32)),
         {"finite"},
     ),
     "statistics of another width": (change(STATISTICS, std=np.zeros(20, np.float32)), {"width"}),
     "statistics that are infinite": (
-        change(STATISTICS, mean=np.full(21, np.inf, np.float32)),
+        change(STATISTICS, mean=np.full(DEFAULT.width, np.inf, np.float32)),
         {"finite"},
     ),
     "a negative deviation": (
-        change(STATISTICS, std=np.full(21, -1, np.float32)),
+        change(STATISTICS, std=np.full(DEFAULT.width, -1, np.float32)),
         {"negative-std"},
     ),
     "statistics missing": (drop(STATISTICS), {"statistics-frames"}),
@@ -1152,7 +1152,7 @@ def test_a_clock_that_is_set_back_begins_another_log_that_may_overlap(tmp_path):
     info = stream_info("mic", "test", DEFAULT, None)
     about = describe_log(Settings(output=tmp_path), info, DEFAULT, None)
     log, pipeline = RollingLog(about, 3600, 1.0, 5.0), Pipeline("mic", DEFAULT)
-    values = np.random.default_rng(0).random((200, 21)).astype(np.float32)
+    values = np.random.default_rng(0).random((200, DEFAULT.width)).astype(np.float32)
     stamps = START + np.arange(200) * FRAME_NANOSECONDS
     log.write(pipeline.push_features(values, 0, stamps))
     end, back = int(stamps[-1]) + FRAME_NANOSECONDS, START + NANOSECONDS
@@ -1171,7 +1171,7 @@ def test_a_log_whose_frames_do_not_continue_is_found(folder):
             data = bytearray(message.data)
             assert data[16:20] == b"mic\0"  # behind it, aligned, is the frame
             (frame,) = struct.unpack_from("<Q", data, 20)
-            struct.pack_into("<Q", data, 20, frame + 13 * BLOCK_FRAMES)
+            struct.pack_into("<Q", data, 20, frame + 15 * BLOCK_FRAMES)
             message.data = bytes(data)
     log.write(path)
     assert errors(folder) == {"frames-continue"}

@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_data import home_recordings
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
@@ -59,7 +59,7 @@ def values(log):
 
 def features_of(path, seconds):
     samples = np.concatenate(list(read_audio(path)))[: round(seconds * RATE)]
-    return FeatureExtractor()(samples[: len(samples) // 800 * 800].reshape(-1, FRAME_SAMPLES))
+    return DEFAULT.extractor()(samples[: len(samples) // 800 * 800].reshape(-1, FRAME_SAMPLES))
 
 
 def check_marked(log, label, seconds):

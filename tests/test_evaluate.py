@@ -478,11 +478,11 @@ def clip_and_log(model_file, day, tmp_path, hearthlog, *smoothing):
 
 @pytest.mark.parametrize("method", ["merge", "hmm"])
 def test_clips_are_labelled_as_the_recorder_labels_them(
-    method, day, bands_file, tmp_path, hearthlog
+    method, day, second_file, tmp_path, hearthlog
 ):
     smoothing = Smoothing(method=method, lag_seconds=3.0, reach_seconds=0.6, shortest_seconds=0.25)
     asked = ("smoothing", smoothing)
-    of_clip, of_log = clip_and_log(bands_file, day, tmp_path, hearthlog, asked)
+    of_clip, of_log = clip_and_log(second_file, day, tmp_path, hearthlog, asked)
     assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.5
     for figure in ("segment_based", "event_based", "false_alarms_per_day"):
         assert of_log[figure] == of_clip[figure]

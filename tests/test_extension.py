@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 
@@ -133,11 +134,11 @@ def test_a_model_for_other_features_than_the_log_is_refused(installed, day, trai
     assert command(installed, "record", day, "-o", tmp_path / "logs").returncode == 0
     done = command(installed, "relabel", tmp_path / "logs", "--model", trained)
     assert done.returncode == 1
-    assert "has features of set 'auros21'; model octaves is for octaves" in done.stderr
-    asked = {"HEARTHLOG_FEATURE_SET": "auros21"} | installed
+    assert f"has features of set {DEFAULT.name}; model octaves is for octaves" in done.stderr
+    asked = {"HEARTHLOG_FEATURE_SET": DEFAULT.name} | installed
     done = command(asked, "record", day, "--model", trained, "-o", tmp_path / "other")
     assert done.returncode == 1
-    assert "the model is for feature set octaves, not 'auros21'" in done.stderr
+    assert f"the model is for feature set octaves, not '{DEFAULT.name}'" in done.stderr
 
 
 def test_a_model_for_other_features_does_not_take_over_while_recording(
@@ -166,7 +167,7 @@ def test_a_model_for_other_features_does_not_take_over_while_recording(
     recorder.communicate(timeout=60)
     assert recorder.returncode in {0, 3}  # 0 if it was stopped before it could say so in the log
     assert "octaves refused" in refusal or "champion refused" in refusal
-    assert "it is for feature set octaves, not auros21" in refusal
+    assert f"it is for feature set octaves, not {DEFAULT.name}" in refusal
 
 
 @pytest.mark.parametrize("verb", ["replay", "relabel", "record", "doctor"])

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.models.features import floor as module
-from hearthlog.models.features.auros21.inputs import band_powers
 from hearthlog.models.features.floor import (
     BLOCK_FRAMES,
     SECTION_BLOCKS,
@@ -20,7 +19,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 
 pytestmark = pytest.mark.fast
 
-BANDS = 33
+BANDS = DEFAULT.bands
 SECOND = 20  # frames
 MINUTE = 60 * SECOND
 SECTION = SECTION_BLOCKS * BLOCK_FRAMES
@@ -164,7 +163,7 @@ def test_real_noise_is_steady_and_ten_minutes_of_it_become_the_room():
     samples = rng.standard_normal((2 * MINUTE, FRAME_SAMPLES))
     samples[:MINUTE] *= 10 ** (-65 / 20)
     samples[MINUTE:] *= 10 ** (-45 / 20)
-    powers = band_powers(DEFAULT.extractor()(samples.astype(np.float32)))
+    powers = DEFAULT.band_powers(DEFAULT.extractor()(samples.astype(np.float32)))
     floors = tracked(powers)
     assert level_at(floors, powers, MINUTE + 45 * SECOND) == pytest.approx(-65, abs=0.5)
     assert level_at(floors, powers, 2 * MINUTE - 1) == pytest.approx(-45, abs=0.5)

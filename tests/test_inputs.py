@@ -7,53 +7,52 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
-from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.features.home33 import HOME33
 from hearthlog.recorder.statistics import RollingStatistics
 
 pytestmark = pytest.mark.fast
 
-KINDS = ["statistics", "bands"]
+KINDS = [(AUROS21, "statistics"), (AUROS21, "bands"), (HOME33, "statistics")]
 
 
-def features(count, seed=0):
-    values = np.abs(np.random.default_rng(seed).standard_normal((count, 21)))
+def values_of(described, count, seed=0):
+    values = np.abs(np.random.default_rng(seed).standard_normal((count, described.width)))
     return values.astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("described", "kind"), KINDS)
 @given(st.lists(st.integers(0, 70), max_size=30), st.integers(1, 700), st.integers(0, 2**32))
-def test_blocks_of_any_size_agree_bit_for_bit(kind, sizes, count, seed):
-    values = features(count, seed)
-    whole, stream = DEFAULT.inputs[kind].stream()(values), DEFAULT.inputs[kind].stream()
+def test_blocks_of_any_size_agree_bit_for_bit(described, kind, sizes, count, seed):
+    values, inputs = values_of(described, count, seed), described.inputs[kind]
+    whole, stream = inputs.stream()(values), inputs.stream()
     borders = [0, *np.cumsum(sizes).clip(0, count).tolist(), count]
     parts = [stream(values[a:b]) for a, b in pairwise(borders)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-    assert whole.shape == (max(count - 19, 0), DEFAULT.inputs[kind].width)
+    assert whole.shape == (max(count - 19, 0), inputs.width)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_windows_on_their_own_give_what_the_stream_gives(kind):
-    values = features(400)
+@pytest.mark.parametrize(("described", "kind"), KINDS)
+def test_windows_on_their_own_give_what_the_stream_gives(described, kind):
+    values, inputs = values_of(described, 400), described.inputs[kind]
     windows = np.lib.stride_tricks.sliding_window_view(values, 20, axis=0).transpose(0, 2, 1)
-    np.testing.assert_array_equal(
-        DEFAULT.inputs[kind].of_windows(windows), DEFAULT.inputs[kind].stream()(values)
-    )
+    np.testing.assert_array_equal(inputs.of_windows(windows), inputs.stream()(values))
 
 
-def test_statistics_are_those_of_the_log():
-    values = features(300)
-    logged = np.concatenate(RollingStatistics(20, 21)(values), axis=1)
-    np.testing.assert_array_equal(DEFAULT.inputs["statistics"].stream()(values), logged[19:])
+@pytest.mark.parametrize("described", [AUROS21, HOME33])
+def test_statistics_are_those_of_the_log(described):
+    values = values_of(described, 300)
+    logged = np.concatenate(RollingStatistics(20, described.width)(values), axis=1)
+    np.testing.assert_array_equal(described.inputs["statistics"].stream()(values), logged[19:])
 
 
 def test_after_a_restart_the_window_fills_again():
-    values, stream = features(100), DEFAULT.inputs["bands"].stream()
+    values, inputs = values_of(AUROS21, 100), AUROS21.inputs["bands"]
+    stream = inputs.stream()
     stream(values[:50])
     stream.restart()
-    np.testing.assert_array_equal(
-        stream(values[50:]), DEFAULT.inputs["bands"].stream()(values[50:])
-    )
+    np.testing.assert_array_equal(stream(values[50:]), inputs.stream()(values[50:]))
 
 
 def test_bands_of_a_smooth_spectrum_come_back_from_its_cepstra():

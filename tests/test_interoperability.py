@@ -190,7 +190,7 @@ def test_the_file_has_the_profile_the_metadata_and_the_attachments_of_the_contra
             channels = reader.get_summary().channels
         assert metadata.keys() == {"hearthlog", "rosbag2"}
         assert metadata["hearthlog"]["node"] == "home"
-        assert metadata["hearthlog"]["feature_set"] == "auros21"
+        assert metadata["hearthlog"]["feature_set"] == model.description.feature_set
         assert metadata["hearthlog"]["model_sha256"] == model.sha256
         assert attachments.keys() == {"configuration.json", "model.json", "model_card.md"}
         assert json.loads(attachments["configuration.json"].data)["node"] == "home"

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.fast
 
 HOUR = 3600 * NANOSECONDS
 START = 490_000 * HOUR
-VALUES = np.random.default_rng(0).random((2000, 21)).astype(np.float32)
+VALUES = np.random.default_rng(0).random((2000, DEFAULT.width)).astype(np.float32)
 
 
 class Nowhere:

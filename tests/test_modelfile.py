@@ -19,6 +19,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import read_description
 from hearthlog.models.classifiers.timing import LabelTiming, label_timing
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.progress import ignore_progress
@@ -326,7 +327,7 @@ def test_an_array_too_many_is_refused(tmp_path):
         ("parameters", {"cost": 4.0}, "gamma"),
         ("parameters", {"cost": 4.0, "gamma": 1.0, "nu": 1.0}, "nu"),
         ("inputs", "spectrogram", "inputs"),
-        ("feature_set_version", 2, "version 2 of feature set auros21"),
+        ("feature_set_version", 2, f"version 2 of feature set {DEFAULT.name}"),
         ("inverse_temperature", 0.0, "inverse_temperature"),
         ("inverse_temperature", 1e999, "inverse_temperature"),
         ("calibration", "sigmoid", "calibration"),
@@ -356,6 +357,7 @@ def older(number, **changed):
     for key in ("label_frame", "gate", "decision_bias", "novelty", "elsewhere"):
         del about[key]
     about["inputs"], about["window_seconds"] = "statistics", 1.0
+    about["feature_set"] = "auros21"
     about["smoothing"] = {"method": "merge", "lag_seconds": 0.0}
     about["format"] = number
     if number == 2:

@@ -119,7 +119,7 @@ def test_the_first_line_names_the_device_and_the_model():
         sample_rate=16_000,
         frame_seconds=0.05,
         window_seconds=1.0,
-        feature_set="auros21",
+        feature_set=DEFAULT.name,
         feature_names=[],
         model="general",
         model_sha256="0123456789abcdef" * 4,
@@ -144,17 +144,17 @@ def test_the_clock_that_was_set_back_is_a_gap_of_less_than_nothing():
     ("names", "begin", "end"),
     [
         (("room", "room"), 600 - 3, 600 - 3),
-        (("room", "bands"), 600 - 3, 600 - 3),  # it could speak of earlier ones, too
-        (("bands", "room"), 600 - 3, 600 - 9),  # and it cannot of six of them
-        (("bands", "bands"), 600 - 9, 600 - 9),
+        (("room", "second"), 600 - 3, 600 - 3),  # it could speak of earlier ones, too
+        (("second", "room"), 600 - 3, 600 - 9),  # and it cannot of six of them
+        (("second", "second"), 600 - 9, 600 - 9),
         ((None, "room"), 600 - 3, None),
         (("room", None), None, 600 - 3),
     ],
 )
 def test_a_model_that_takes_over_speaks_of_what_the_other_one_has_not(  # noqa: PLR0913, PLR0917
-    frames, model_file, bands_file, names, begin, end, size
+    frames, model_file, second_file, names, begin, end, size
 ):
-    models = {"room": load_model(model_file), "bands": load_model(bands_file), None: None}
+    models = {"room": load_model(model_file), "second": load_model(second_file), None: None}
     classifiers = {name: model and Classifier(model) for name, model in models.items()}
     pipeline = Pipeline("mic", DEFAULT, classifiers[names[0]])
     stamps = START + np.arange(1200) * FRAME_NANOSECONDS

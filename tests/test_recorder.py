@@ -15,7 +15,6 @@ from logreader import LogReader
 from logs import features, read
 
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap
@@ -52,16 +51,15 @@ def recorded(hearthlog, tmp_path):
     return run
 
 
-def test_a_file_gives_features_and_statistics_at_every_frame_and_labels_where_there_is_a_window(
+def test_a_file_gives_features_at_every_frame_and_labels_where_there_is_a_window(
     day, model_file, recorded
 ):
     logs = recorded(day, "--model", model_file, "--start", "2026-03-01T07:00:00")
     frames, stamps, values = features(logs)
     samples = np.concatenate(list(read_audio(day)))
-    np.testing.assert_array_equal(values, FeatureExtractor()(as_frames(samples)))
+    np.testing.assert_array_equal(values, DEFAULT.extractor()(as_frames(samples)))
     np.testing.assert_array_equal(frames, np.arange(len(values)))
     np.testing.assert_array_equal(stamps, START + frames * FRAME_NANOSECONDS)
-    assert [m.frame for m in read(logs, "statistics")] == frames.tolist()
     labels = list(LogReader(next(logs.rglob("*.mcap"))).messages(["/mic/label"]))
     said = [item.decode() for item in labels]
     assert [m.frame for m in said] == frames[7 + 7 - 3 : -3].tolist()
@@ -126,7 +124,7 @@ def test_several_files_in_a_row_are_one_sound(tmp_path, recorded):
     for number, part in enumerate(np.split(sound, [7_001, 30_000])):
         soundfile.write(tmp_path / f"{number}.wav", part, 16_000, subtype="FLOAT")
     logs = recorded(*(tmp_path / f"{number}.wav" for number in range(3)))
-    np.testing.assert_array_equal(features(logs)[2], FeatureExtractor()(as_frames(sound)))
+    np.testing.assert_array_equal(features(logs)[2], DEFAULT.extractor()(as_frames(sound)))
 
 
 @pytest.mark.parametrize(("rate", "channels"), [(8_000, 1), (44_100, 2), (192_000, 8)])
@@ -139,10 +137,22 @@ def test_any_rate_and_channel_count_is_heard_as_16_khz_mono(tmp_path, recorded, 
     np.testing.assert_allclose(values[5:-5, 7], 1000 / 8000, atol=1e-6)
 
 
-def test_statistics_can_be_logged_less_often(tmp_path, recorded):
+def test_statistics_are_of_the_seconds_that_follow_each_other(tmp_path, recorded):
+    soundfile.write(tmp_path / "noise.wav", noise(3.05), 16_000)
+    logs = recorded(tmp_path / "noise.wav")
+    _, _, values = features(logs)
+    first, *others = read(logs, "statistics")
+    np.testing.assert_array_equal(first.mean, values[0])
+    assert [m.frame for m in others] == [20, 40, 60]
+    for second, found in zip(np.split(values[1:], 3), others, strict=True):
+        np.testing.assert_allclose(found.mean, second.mean(axis=0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_statistics_are_logged_as_often_as_asked(tmp_path, recorded, every):
     soundfile.write(tmp_path / "noise.wav", noise(3), 16_000)
-    logs = recorded(tmp_path / "noise.wav", env={"HEARTHLOG_STATISTICS_EVERY": "7"})
-    assert [m.frame for m in read(logs, "statistics")] == list(range(0, 60, 7))
+    logs = recorded(tmp_path / "noise.wav", env={"HEARTHLOG_STATISTICS_EVERY": str(every)})
+    assert [m.frame for m in read(logs, "statistics")] == list(range(0, 60, every))
 
 
 def test_diagnostics_come_at_least_every_ten_seconds(day, recorded):
@@ -169,7 +179,7 @@ def test_labels_from_logged_features_are_those_of_the_log_bit_for_bit(day, model
 
 
 def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_floor_and_a_window(model_file):
-    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)))
+    pipeline = Pipeline("mic", DEFAULT, Classifier(load_model(model_file)), statistics_every=1)
     frames = as_frames(noise(2))
     stamps = START + np.arange(40) * FRAME_NANOSECONDS
     before = pipeline.push(Frames(0, frames, stamps))
@@ -237,7 +247,7 @@ def test_killed_at_any_moment_at_most_a_second_is_lost_and_the_next_start_comple
     reader = LogReader(left.with_suffix(""))
     assert [(m.topic, m.log_time, m.data) for m in reader.messages()] == content
     assert reader.complete
-    np.testing.assert_array_equal(kept, FeatureExtractor()(as_frames(sound))[: len(kept)])
+    np.testing.assert_array_equal(kept, DEFAULT.extractor()(as_frames(sound))[: len(kept)])
 
 
 def start_realtime(file, logs):

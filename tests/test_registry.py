@@ -32,7 +32,7 @@ def test_a_model_that_is_loaded_by_an_alias_has_the_name_of_its_file(folder):
 def test_a_promoted_model_is_the_champion_and_the_one_before_comes_back(folder):
     model, before = promote(folder, "two")
     assert (model.name, before, champion(folder)) == ("two", "one", "two")
-    promote(folder, "bands")
+    promote(folder, "broad")
     assert [rollback(folder)[0].name for _ in range(2)] == ["two", "one"]
     assert champion(folder) == "one"
     with pytest.raises(ModelError, match="no champion before one"):
@@ -62,7 +62,7 @@ def test_a_model_that_cannot_be_used_is_not_promoted(folder):
 
 def test_rollback_passes_over_champions_that_cannot_be_used(folder):
     promote(folder, "two")
-    promote(folder, "bands")
+    promote(folder, "broad")
     (folder / "two.safetensors").unlink()
     assert rollback(folder)[0].name == "one"
 
@@ -98,7 +98,7 @@ def test_the_list_has_every_file_and_what_is_wrong_with_it(folder):
     promote(folder, "two", "candidate")
     put_by_hand(folder, "gone.safetensors")
     found = {entry.name: entry for entry in list_models(folder)}
-    assert list(found) == ["bad", "bands", "gone", "one", "two"]
+    assert list(found) == ["bad", "broad", "gone", "one", "two"]
     assert found["gone"].aliases == ("champion",)
     assert found["two"].aliases == ("candidate",)
     assert {name for name, entry in found.items() if entry.model is None} == {"bad", "gone"}
@@ -112,7 +112,7 @@ from itertools import cycle
 from pathlib import Path
 from hearthlog.models.modelfile.registry import promote, rollback
 folder = Path(sys.argv[1])
-for number, name in enumerate(cycle(["two", "bands", "one"])):
+for number, name in enumerate(cycle(["two", "broad", "one"])):
     promote(folder, name)
     if number % 4 == 3:
         rollback(folder)
@@ -132,9 +132,9 @@ def test_killed_at_any_moment_of_a_promotion_there_is_a_champion_and_one_before(
                 assert (folder / "champion.safetensors").exists()  # at every moment
             process.kill()
         before = champion(folder)
-        assert before in {"one", "two", "bands"}
+        assert before in {"one", "two", "broad"}
         lines = (folder / "history").read_text().splitlines()
-        assert set(lines) <= {"one", "two", "bands"}
+        assert set(lines) <= {"one", "two", "broad"}
         assert len(lines) <= 100
         assert rollback(folder)[0].name != before
     promote(folder, "two")
@@ -156,7 +156,7 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
         "sha256",
         "size",
     ]
-    assert [row.split()[0] for row in rows] == ["bands", "one", "two"]
+    assert [row.split()[0] for row in rows] == ["broad", "one", "two"]
     assert "champion" in rows[1]
     assert load(folder, "one").sha256[:12] in rows[1]
     (folder / "bad.safetensors").write_bytes(b"garbage")

@@ -118,7 +118,7 @@ def test_with_its_model_a_recording_comes_out_again_message_for_message(
     assert len(recorded) == 7
     assert content(tmp_path / "again") == recorded
     topics = {topic for log in recorded.values() for topic, _, _ in log}
-    assert topics == {t.name for t in topics_of("mic", FEATURE_NAMES, ["silence"])}
+    assert topics == {t.name for t in topics_of("mic", DEFAULT.feature_names, ["silence"])}
     assert result.compared.identical
     assert result.compared.labels == result.labels == len(read(folder, "label"))
     assert result.compared.segments == result.segments == len(read(folder, "segment"))
@@ -283,10 +283,10 @@ def test_a_log_from_the_middle_of_a_recording_starts_without_labels_and_says_so(
 
 
 def test_a_model_that_needs_no_floor_labels_a_log_from_the_middle_as_it_was_labelled(
-    bands_file, day, hearthlog, tmp_path
+    second_file, day, hearthlog, tmp_path
 ):
-    folder = record_day(tmp_path / "recorded", day, bands_file)
-    replayed, recorded, alone = from_the_middle(folder, bands_file, hearthlog, tmp_path / "again")
+    folder = record_day(tmp_path / "recorded", day, second_file)
+    replayed, recorded, alone = from_the_middle(folder, second_file, hearthlog, tmp_path / "again")
     assert len(recorded) - len(replayed) == 19
     assert replayed == recorded[19:] == alone
 
@@ -369,7 +369,7 @@ def test_the_recorded_model_is_found_beside_the_logs_and_asked_for_by_name_if_no
     what = "which was not found; no labels: give it, or another, with --model"
     assert missing.stderr.splitlines()[0] == f"{recorded}, {what}"
     assert read(tmp_path / "bare", "label") == []
-    assert len(read(tmp_path / "bare", "statistics")) == 7200
+    assert len(read(tmp_path / "bare", "statistics")) == 7200 / 20
     shutil.copy(other_model, logs / "simulated.safetensors")  # of that name, but not the one
     assert hearthlog("replay", logs).returncode == 3
     shutil.copy(model_file, logs / "simulated.safetensors")
@@ -546,7 +546,7 @@ def test_a_part_of_clips_is_as_in_the_whole(real_frames, model_file, tmp_path):
         if START + 7 * SECOND <= m[1] < START + 16.5 * SECOND
     ]
     assert payloads(part, "features", "statistics", "label") == inside
-    assert len(inside) == 3 * 190
+    assert len(inside) == 2 * 190 + 10  # every 20th has statistics
 
 
 @pytest.mark.parametrize(
@@ -595,6 +595,14 @@ def write_log(path, values, *, metadata=None, configuration=b"{}", microphones=(
 
 
 SOUND = np.ones((30, 21))
+
+
+@pytest.mark.parametrize(("configuration", "every"), [(b"{}", 1), (b'{"statistics_every": 7}', 7)])
+def test_a_log_that_does_not_say_how_often_has_statistics_of_every_frame(
+    tmp_path, configuration, every
+):
+    replay(write_log(tmp_path / "log.mcap", SOUND, configuration=configuration), tmp_path / "again")
+    assert [m.frame for m in read(tmp_path / "again", "statistics")] == list(range(0, 30, every))
 
 
 @pytest.mark.parametrize(
@@ -665,7 +673,7 @@ def test_a_label_that_the_recorded_model_does_not_give_is_told(
 ):
     reader = LogReader(find_logs(folder)[0])
     classes = load_model(model_file).classes
-    topics, about = topics_of("mic", FEATURE_NAMES, classes), reader.metadata["hearthlog"]
+    topics, about = topics_of("mic", DEFAULT.feature_names, classes), reader.metadata["hearthlog"]
     log = LogWriter(tmp_path / "changed.mcap", topics, about)
     changed = 0
     for m in reader.messages():

@@ -49,7 +49,7 @@ def test_a_search_tries_less_as_much_and_more_of_both():
 
 
 def test_a_search_puts_first_what_tells_segments_apart_best():
-    data, _ = blobs(3, 40)
+    data, _ = blobs(3, 40, features=PAPER.features)
     useless = dataclasses.replace(
         PAPER, gamma=1e4
     )  # so sharp that it knows nothing but what it has seen
@@ -59,7 +59,7 @@ def test_a_search_puts_first_what_tells_segments_apart_best():
 
 
 def test_a_search_finds_the_figures_that_cross_validation_finds():
-    data, _ = blobs(3, 40)
+    data, _ = blobs(3, 40, features=PAPER.features)
     steps = []
     methods = PAPER.variations()[:2]
     tried = search(data, methods, "source", steps.append)
@@ -69,14 +69,14 @@ def test_a_search_finds_the_figures_that_cross_validation_finds():
 
 
 def test_a_search_over_segments_that_are_all_alike_is_refused():
-    data, _ = blobs(2, 20)
+    data, _ = blobs(2, 20, features=PAPER.features)
     flat = dataclasses.replace(data, windows=np.ones_like(data.windows))
     with pytest.raises(DataError, match="all segments are alike"):
         search(flat, PAPER.variations(), "source", ignore_progress)
 
 
 def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
-    data, _ = blobs(3, 60)
+    data, _ = blobs(3, 60, features=PAPER.features)
     methods, examples = PAPER.variations()[:3], prepare(PAPER, data)
     arguments = (methods, examples, 3, group_folds(data), ignore_progress)
     here = cross_validate(*arguments)
@@ -87,7 +87,7 @@ def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
 
 
 def test_a_cluster_adapts_as_threads_do(cluster):
-    data, _ = blobs(3, 400, spread=3.0)
+    data, _ = blobs(3, 400, spread=3.0, features=PAPER.features)
     group = np.arange(len(data)) // 4
     data = dataclasses.replace(data, group=group, collection=group % 2, collection_names=("a", "b"))
     here = adaptation_curve(data, PAPER, ignore_progress)

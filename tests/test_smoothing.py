@@ -26,7 +26,6 @@ from hearthlog.analyzer.training.transitions import (
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.segments import LabelledFrames, Segmenter
@@ -73,7 +72,7 @@ def decided(smoother, probabilities, size):
 def of_sounds(model_file, frames):
     """Probabilities of a model's classes in real sound."""
     classifier = Classifier(load_model(model_file))
-    features = FeatureExtractor()(frames)
+    features = DEFAULT.extractor()(frames)
     floors = FloorTracker()(DEFAULT.band_powers(features), 0).powers
     inputs = classifier.inputs.stream()(features[len(features) - len(floors) :], floors)
     return classifier.probabilities(inputs), default_transitions(classifier.classes)

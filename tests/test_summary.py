@@ -20,6 +20,7 @@ from hearthlog.analyzer.logs.health import Status
 from hearthlog.analyzer.logs.summarise import summarise
 from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
@@ -166,7 +167,7 @@ def test_labels_segments_and_gaps_are_those_of_the_messages(logs, model_file):
     assert summary.gap_seconds == pytest.approx(sum(LOST.values()) * 0.05)
     (stream,) = summary.streams
     assert stream["microphone"] == "hall"
-    assert stream["feature_set"] == "auros21"
+    assert stream["feature_set"] == DEFAULT.name
     assert stream["model_sha256"] == load_model(model_file).sha256
 
 

@@ -19,7 +19,6 @@ from spliced import run
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.timing import label_timing
-from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
@@ -97,7 +96,7 @@ def check_swap(folder, logs, names):
     """See that each model labelled its own log, and that they are one recording without a hole."""
     frames, _, _ = features(logs)
     np.testing.assert_array_equal(frames, np.arange(len(frames)))
-    assert [message.frame for message in read(logs, "statistics")] == frames.tolist()
+    assert [message.frame for message in read(logs, "statistics")] == frames[::20].tolist()
     paths = find_logs(logs)
     assert [info.model for info in read(logs, "info")] == names
     labelled, delays, firsts = [], [], []
@@ -127,7 +126,7 @@ def check_swap(folder, logs, names):
         assert start + duration.sec * SECOND + duration.nanosec == following
 
 
-@pytest.mark.parametrize("names", [["one", "two"], ["one", "bands"], ["bands", "two"]])
+@pytest.mark.parametrize("names", [["one", "two"], ["one", "broad"], ["broad", "two"]])
 def test_a_promoted_model_speaks_from_a_frame_on_and_nothing_is_lost(
     folder, tmp_path, day, capfd, names
 ):
@@ -144,7 +143,7 @@ def test_a_promoted_model_speaks_from_a_frame_on_and_nothing_is_lost(
     sound = np.concatenate(list(read_audio(day)))
     values = features(logs)[2]
     heard = sound[: len(values) * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
-    np.testing.assert_array_equal(values, FeatureExtractor()(heard))
+    np.testing.assert_array_equal(values, DEFAULT.extractor()(heard))
     assert run(capfd, "doctor", logs).returncode == 0
     with chdir(tmp_path):  # the models are looked for in `models`
         result = run(capfd, "replay", logs, "-o", tmp_path / "again")
@@ -164,7 +163,7 @@ def test_one_model_for_logs_of_two_gives_what_it_would_have_given_alone(
         wait_for(lambda: count(logs, "label") > 20)
         promote(folder, "two")
         wait_for(lambda: count(logs, "info") == 2)
-    other = folder / "bands.safetensors"
+    other = folder / "broad.safetensors"
     result = run(capfd, "replay", logs, "--model", other, "-o", tmp_path / "again")
     assert result.returncode == 0, result.stderr
     (log,) = find_logs(tmp_path / "again")
@@ -176,14 +175,14 @@ def test_a_microphone_is_heard_on_while_the_model_changes(folder, tmp_path, labm
     labmic.configure(data=rng.normal(0, 3000, 16_000 * 7 + 311).astype(np.int16))
     logs = tmp_path / "logs"
     with recording(folder, logs, "--device", labmic.device, env=labmic.env) as process:
-        for number, name in enumerate(["two", "bands"], 2):
+        for number, name in enumerate(["two", "broad"], 2):
             before = count(logs, "label")
             wait_for(lambda before=before: count(logs, "label") > before + 10)
             promote(folder, name)
             process.send_signal(signal.SIGHUP)
             wait_for(lambda number=number: count(logs, "info") == number)
     assert (process.returncode, process.errors) == (0, "")
-    check_swap(folder, logs, ["one", "two", "bands"])
+    check_swap(folder, logs, ["one", "two", "broad"])
 
 
 def test_a_bad_model_is_refused_once_and_the_old_one_goes_on(folder, tmp_path, day, capfd):

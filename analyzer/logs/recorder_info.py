@@ -12,9 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
+from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.installed import DEFAULT, feature_set
+from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.logs.log_stream import Attachment
@@ -29,6 +31,7 @@ TYPES = {
     "features": (message_types.FEATURES, ("frame", "header.stamp", "values")),
     "audio": (message_types.RAW_AUDIO, CLIP_FIELDS),
 }
+_METHODS = {"auros21": "room21", "home33": "room"}  # which learns best, of the sets of ours
 _DIGEST = re.compile("[0-9a-f]{64}")
 _FRAME = ("frame", "header.stamp")
 _INFO = ("device", "feature_set", "model", "model_sha256")
@@ -44,7 +47,8 @@ class Configuration(BaseModel):
     flush_seconds, sync_seconds : float
         Seconds that a killed process, and a power cut, lose at most; 1 to 3600.
     statistics_every : int
-        Frames from one message of statistics to the next; at least 1.
+        Frames from one message of statistics to the next; at least 1, which is that of every log
+        that does not say.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
@@ -154,15 +158,44 @@ def attachments_of(file: LogFile) -> list[Attachment]:
     return [Attachment(r.name, r.media_type, r.data) for r in attached]
 
 
+def models_for(features: str) -> str:
+    """Say which models a feature set needs, as advice in a message.
+
+    Parameters
+    ----------
+    features : str
+        Name of the set.
+    """
+    method = _METHODS.get(features)
+    how = f"; `hearthlog train --method {method}` learns one" if method else ""
+    return f"take a model for {features[:64]}{how}"
+
+
+def check_model(origin: RecorderInfo, model: Model) -> None:
+    """Check that a model is for the features of a log.
+
+    Raises
+    ------
+    LogError
+        If it is for others, or the log's are not installed, or installed in another version.
+    """
+    features, wanted = features_of(origin), model.description.feature_set
+    if features.name != wanted:
+        raise LogError(
+            f"{origin.path}: has features of set {features.name}; model {model.name} is for "
+            f"{wanted}: {models_for(features.name)}"
+        )
+
+
 def features_of(origin: RecorderInfo) -> FeatureSet:
-    """Return the feature set of a log; the default one where the log names none.
+    """Return the feature set of a log; `auros21` where the log names none, as there was no other.
 
     Raises
     ------
     LogError
         If the set is not installed, cannot be imported, or is installed in another version.
     """
-    name = origin.feature_set or DEFAULT.name
+    name = origin.feature_set or AUROS21.name
     try:
         features = feature_set(name)
     except ModelError as error:

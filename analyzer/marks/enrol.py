@@ -17,6 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import SILENCE, class_name
@@ -28,10 +29,10 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds
 from hearthlog.recorder.sources.microphone import MicrophoneSource
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
-from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_log, log_path
+from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, find_logs, is_log, log_path
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.storage.new_files import new_file
@@ -214,8 +215,7 @@ def _enrol(
             "output": Path(folder),
             "model": None,
             "max_bag_duration": 86_400,
-            "statistics_every": 1,
-        }
+        } | _feature_set(home)
         settings = load_settings(None, options, microphone.model_dump())
         logs = record(settings, microphone, _First(source, seconds), stop).logs
         frames = {log: _frames([log], microphone.name) for log in logs}
@@ -230,6 +230,17 @@ def _enrol(
                 shutil.copyfile(log, temporary)
             enrolled.append(_marked(path, microphone.name, label, stamps))
     return enrolled
+
+
+def _feature_set(home: Path) -> dict[str, str]:
+    """Return the setting that gives the features of the latest log, else of an enrolled sound."""
+    try:
+        logs = find_logs(home, enrolled=True)
+    except LogError:
+        return {}  # the sound is the first of the home
+    logs.sort(key=lambda log: ENROLLED not in log.relative_to(home).parts)
+    key = "feature_set"
+    return next(({key: each[key]} for each in latest_records(logs) if each.get(key)), {})
 
 
 def _check_label(label: str) -> None:

@@ -4,10 +4,11 @@ import shutil
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_info
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, read_recorder_info
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
@@ -75,11 +76,7 @@ def info_for_model(path: Path, model: Model, log: Path) -> tuple[RecorderInfo, t
     info = recorder_info(path)
     if info is None or info.first_frame is None:
         raise LogError(f"{log}: has no features; there is nothing to label")
-    if info.feature_set not in {"", model.description.feature_set}:
-        raise LogError(
-            f"{log}: has features of set {info.feature_set!r}; model {model.name} is for "
-            f"{model.description.feature_set}"
-        )
+    check_model(replace(info, path=log), model)
     return info, info.first_frame
 
 
@@ -216,7 +213,7 @@ def _label_readable(
     for log in logs:
         path = copies.get(log, log)
         other = None if path is None else recorder_info(path)
-        if other is None or other.first_frame is None or not _same_microphone(other, info):
+        if other is None or other.first_frame is None or not _same_sound(other, info):
             break
         chosen.appendleft(other)
         if other.first_frame[1] < start:
@@ -251,8 +248,9 @@ def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> 
         other = read_recorder_info(next_log, "features")
     if other is None or other.first_frame is None:
         return None if is_active(next_log) else False
-    return _same_microphone(other, info) and labeller.is_followed_by(other.first_frame)
+    return _same_sound(other, info) and labeller.is_followed_by(other.first_frame)
 
 
-def _same_microphone(first: RecorderInfo, second: RecorderInfo) -> bool:
-    return (first.node, first.microphone) == (second.node, second.microphone)
+def _same_sound(first: RecorderInfo, second: RecorderInfo) -> bool:
+    one, other = ((info.node, info.microphone, info.feature_set) for info in (first, second))
+    return one == other

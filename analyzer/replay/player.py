@@ -6,19 +6,19 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event as Flag
 
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo, features_of
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, features_of
 from hearthlog.analyzer.replay.description import describe
 from hearthlog.analyzer.replay.options import Replay, ReplayOptions
 from hearthlog.analyzer.replay.recorded import Features, RecordedBatch
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.stream_messages import EncodedMessage
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.times import NANOSECONDS
@@ -168,11 +168,11 @@ class Player:
     def _begin(self, info: RecorderInfo) -> None:
         model = self._options.model(info)
         configuration = info.configuration
+        features = self._features(info, model)
         classifier = None if model is None else Classifier(model)
-        features = self._features(info, classifier)
-        self._pipeline = Pipeline(
-            info.microphone, features, classifier, configuration.statistics_every
-        )
+        clips = self._options.kind != "features"  # which do not say how often
+        every = LOGGED_EVERY if clips else configuration.statistics_every
+        self._pipeline = Pipeline(info.microphone, features, classifier, every)
         if self._options.output is not None:
             self._log = RollingLog(
                 self._describe(info, model),
@@ -184,17 +184,13 @@ class Player:
         self._info = info
         self._next, self._end, self._after_gap = 0, None, False
 
-    def _features(self, info: RecorderInfo, classifier: Classifier | None) -> FeatureSet:
+    def _features(self, info: RecorderInfo, model: Model | None) -> FeatureSet:
         """Return the feature set of the pipeline; clips suit any."""
         if self._options.kind != "features":
-            return DEFAULT if classifier is None else classifier.feature_set
-        features = features_of(info)
-        if classifier is not None and classifier.feature_set != features:
-            raise LogError(
-                f"{info.path}: has features of set {features.name}; the model is for "
-                f"{classifier.feature_set.name}"
-            )
-        return features
+            return DEFAULT if model is None else feature_set(model.description.feature_set)
+        if model is not None:
+            check_model(info, model)
+        return features_of(info)
 
     def _goes_on(self, info: RecorderInfo) -> bool:
         """Tell whether a log is of the same run of a recorder, but of another model."""
@@ -213,8 +209,8 @@ class Player:
         if sha256 == self._sha256:
             return
         assert info.first_frame is not None
+        self._features(info, model)
         classifier = None if model is None else Classifier(model)
-        self._features(info, classifier)
         closing, opening = self._pipeline.change_model(model, classifier, *info.first_frame)
         self._write(closing)
         if self._log is not None:

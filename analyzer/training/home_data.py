@@ -1,11 +1,14 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.models.classes import translation
@@ -44,7 +47,11 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
     ------
     LogError
         If there is no log, or if a log or a layer is damaged.
+    DataError
+        If there are marks, and all of them are in logs of other sets.
     """
+    others: Counter[str] = Counter()  # sets of logs that are not of this one
+    usable = False
     for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
         if not marks:
@@ -54,8 +61,19 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
         floors = {name: _floors(recorded, features) for name, recorded in columns.items()}
         for mark in marks:
             name = topic(mark.microphone, "features")
-            if name in columns and len(columns[name]):
-                yield from _recordings(columns[name], floors[name], mark, features)
+            if name not in columns or not len(columns[name]):
+                continue
+            if _is_of(columns[name], features):
+                usable = True
+            else:
+                others[_set_of(log, mark.microphone)] += 1
+            yield from _recordings(columns[name], floors[name], mark, features)
+    if others and not usable:
+        name, _ = others.most_common(1)[0]
+        raise DataError(
+            f"{folder}: what is marked there has features of set {name}, and {features.name} is "
+            f"needed: {models_for(name)}"
+        )
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
@@ -122,6 +140,13 @@ def _floors(recorded: Columns, features: FeatureSet) -> Float64 | None:
 def _is_of(recorded: Columns, features: FeatureSet) -> bool:
     names = array_names(recorded.metadata, "values")
     return not names or tuple(names) == features.feature_names
+
+
+def _set_of(log: Path, microphone: str) -> str:
+    """Return the name of the feature set of a microphone in a log."""
+    name = topic(microphone, "info")
+    said = read_columns([log], {name}, fields={"feature_set"}).get(name)
+    return "unknown" if said is None or not len(said) else str(said["feature_set"][0])
 
 
 def _recordings(

@@ -5,8 +5,8 @@ from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.svm_method import BANDS, PAPER, ROOM, ROOM21
 from hearthlog.models.extensions import Extensions
 
-DEFAULT: Method = ROOM21
-_INSTALLED = [ROOM21, ROOM, BANDS, PAPER]
+DEFAULT: Method = ROOM
+_INSTALLED = [ROOM, ROOM21, BANDS, PAPER]
 _METHODS = Extensions("hearthlog.methods", Method, "method", _INSTALLED, DataError)  # type: ignore[type-abstract]
 
 
@@ -16,7 +16,7 @@ def method_named(name: str) -> Method:
     Parameters
     ----------
     name : str
-        `room21`, `room`, `bands`, `paper`, or the name of an entry point in the group
+        `room`, `room21`, `bands`, `paper`, or the name of an entry point in the group
         `hearthlog.methods`.
 
     Raises

@@ -5,8 +5,8 @@ from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 
-DEFAULT = AUROS21
-FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [AUROS21, HOME33])
+DEFAULT = HOME33
+FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [HOME33, AUROS21])
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
@@ -15,7 +15,7 @@ def feature_set(name: str = DEFAULT.name) -> FeatureSet:
     Parameters
     ----------
     name : str
-        Such as "auros21".
+        Such as "home33".
 
     Raises
     ------

@@ -3,15 +3,17 @@
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import prepare, softmax
-from hearthlog.analyzer.training.svm_method import BANDS, LearnedSvm
+from hearthlog.analyzer.training.svm_method import ROOM, LearnedSvm
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.floor import FloorTracker
+from hearthlog.schemas.arrays import Float32
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of
 from hearthlog.tools.bench.workload import Workload
@@ -56,8 +58,8 @@ def measure(work: Workload) -> Table:
 
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
     """Fit what `hearthlog.analyzer.training.train` does, and calibrate it as scikit-learn does."""
-    examples = prepare(BANDS, data)
-    machine = BANDS.fit(examples).machine
+    examples = prepare(ROOM, data)
+    machine = ROOM.fit(examples).machine
     machine[-1].decision_function_shape = "ovr"  # the default, which its calibration needs
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
@@ -65,6 +67,14 @@ def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
     return calibrated.fit(examples.inputs[0, :, 0].astype(np.float64), data.target)
 
 
-def _inputs(work: Workload) -> NDArray[np.float32]:
-    features = BANDS.features
-    return features.inputs[BANDS.inputs].stream()(features.extractor()(work.frames(_SECONDS)))
+def _inputs(work: Workload) -> Float32:
+    features = ROOM.features.extractor()(work.frames(_SECONDS))
+    return inputs_above_floor(ROOM.features, features)
+
+
+def inputs_above_floor(described: FeatureSet, features: Float32) -> Float32:
+    """Compute the inputs of a model from the features of successive frames, the first being 0."""
+    assert described.band_powers is not None
+    floors = FloorTracker()(described.band_powers(features), 0).powers
+    heard = features[len(features) - len(floors) :]
+    return described.inputs[ROOM.inputs].stream()(heard, floors)

@@ -1,4 +1,4 @@
-"""A day's statistics to arrays: ours, its peers, and the decompressor alone."""
+"""A day's features to arrays: ours, its peers, and the decompressor alone."""
 
 import subprocess
 import sys
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.columns import Columns, iterate_columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.formats import HEAD
@@ -28,11 +29,12 @@ from hearthlog.tools.bench.workload import Workload
 
 _DAY = 86_400
 _MIDNIGHT = "2026-03-01T00:00"  # so that it becomes one file
-_TOPIC = "/mic/statistics"
+_TOPIC = "/mic/features"
 _TWICE = Target(2, at_most=True)
 _PEAK_MEGABYTES = Target(100, at_most=True)
 _PEAK = """
 from pathlib import Path
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.columns import iterate_columns
 def peak():  # of this process; what getrusage says begins with that of the one before it
     return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])
@@ -71,7 +73,7 @@ def measure(work: Workload) -> Table:
         _check((stamps, frames, values), peer(log, 1000))
     rows.append(Row("peak memory, batch by batch", _peak(log), "MB", target=_PEAK_MEGABYTES))
     size = log.stat().st_size / 1e6
-    return Table(f"reading: statistics of {len(frames):,} frames from {size:.0f} MB, elapsed", rows)
+    return Table(f"reading: features of {len(frames):,} frames from {size:.0f} MB, elapsed", rows)
 
 
 def _day(work: Workload) -> Path:
@@ -100,8 +102,7 @@ def _columns(log: Path) -> Columns:
 
 def _ours(log: Path) -> Read:
     columns = _columns(log)
-    values = np.concatenate([columns["mean"], columns["std"]], axis=1)
-    return columns["header.stamp"], columns["frame"], values
+    return columns["header.stamp"], columns["frame"], columns["values"]
 
 
 def _iterate(log: Path) -> int:
@@ -134,12 +135,11 @@ def _mcap_ros2(log: Path, count: int) -> Read:
 def _filled(decoded: Iterable[Any], count: int) -> Read:
     """Put the first messages into arrays."""
     stamps, frames = np.empty(count, np.int64), np.empty(count, np.uint64)
-    values = np.empty((count, 42), np.float32)
+    values = np.empty((count, DEFAULT.width), np.float32)
     for row, message in zip(range(count), decoded, strict=False):
         stamps[row] = nanoseconds(message.header.stamp)
         frames[row] = message.frame
-        values[row, :21] = message.mean
-        values[row, 21:] = message.std
+        values[row] = message.values
     return stamps, frames, values
 
 

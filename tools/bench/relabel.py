@@ -29,7 +29,7 @@ from hearthlog.schemas.messages.message_types import (
     nanoseconds,
 )
 from hearthlog.schemas.progress import ignore_progress
-from hearthlog.tools.bench.inference import fit_scikit_learn
+from hearthlog.tools.bench.inference import fit_scikit_learn, inputs_above_floor
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import HEARTHLOG, BenchError, hearthlog
 from hearthlog.tools.bench.workload import Workload
@@ -88,8 +88,10 @@ def _part(work: Workload) -> Dataset:
     share = min(_SUPPORT / len(work.model.arrays["support_vectors"]), 1.0) ** 1.2
     rows = np.random.default_rng(0).permutation(len(data))[: round(share * len(data))]
     rows.sort()
-    fields = ("windows", "target", "group", "collection", "weight")
-    return dataclasses.replace(data, **{name: getattr(data, name)[rows] for name in fields})
+    fields = ("windows", "target", "group", "collection", "weight", "floor")
+    chosen = {name: getattr(data, name)[rows] for name in fields}
+    copies = {name: getattr(data, name)[:, rows] for name in ("copies", "copy_floor")}
+    return dataclasses.replace(data, **chosen, **copies)
 
 
 def _ours(logs: Path, model: Path, workers: int) -> _Run:
@@ -119,8 +121,8 @@ def _peer(log: Path, model: Model, data: Dataset, output: Path) -> float:
         chosen = [c for c in reader.connections if c.topic == "/mic/features"]
         read = (reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen))
         frames: list[Any] = [message for _, message in zip(range(_SAMPLE), read, strict=False)]
-    inputs = Classifier(model).inputs.stream()(np.array([m.values for m in frames]))
-    rows = inputs.astype(np.float64)
+    values = np.array([m.values for m in frames])
+    rows = inputs_above_floor(Classifier(model).feature_set, values).astype(np.float64)
     calls = [rows[first : first + _CALL] for first in range(0, len(rows), _CALL)]
     posteriors = np.concatenate([machine.predict_proba(call) for call in calls]).astype(np.float32)
     viterbi(posteriors, model.transitions, model.description.smoothing.weight)

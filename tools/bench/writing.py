@@ -1,4 +1,4 @@
-"""Features, statistics and labels from arrays to a log: as columns, and message by message."""
+"""Features and labels from arrays to a log: as columns, and message by message."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.timing import best_of, hearthlog
 from hearthlog.tools.bench.workload import Workload
 
-_KINDS = ("/mic/features", "/mic/statistics", "/mic/label")
+_KINDS = ("/mic/features", "/mic/label")
 _AT_ONCE = 7_200  # frames
 _TEN_TIMES = Target(10)
 
@@ -42,7 +42,7 @@ def measure(work: Workload) -> Table:
     columns_rate, messages_rate = (frames / seconds for seconds in best.values())
     ratio = columns_rate / messages_rate
     return Table(
-        f"writing: {frames:,} frames, three messages each, from arrays to a log, elapsed",
+        f"writing: {frames:,} frames, two messages each, from arrays to a log, elapsed",
         [
             Row("hearthlog, columns", columns_rate, "frames/s"),
             Row("rosbags + mcap, messages", messages_rate, "frames/s", ratio, _TEN_TIMES),

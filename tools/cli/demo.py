@@ -68,14 +68,14 @@ def demo(
 
 
 def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) -> float:
-    """Share of the labels that the simulation meant in the middle of their window."""
+    """Share of the labels that the simulation meant in the middle of their frame."""
     import numpy as np
 
     from hearthlog.schemas.logs.columns import read_columns
     from hearthlog.schemas.logs.files import find_logs
 
     labels = read_columns(find_logs(logs), ["/mic/label"])["/mic/label"]
-    middle = (labels["header.stamp"] - start) / 1e9 - 0.45
+    middle = (labels["header.stamp"] - start) / 1e9 + 0.025
     meant = np.searchsorted([end for _, end, _ in truth], middle, side="right")
     names = [name for _, _, name in truth]
     true = np.array([*names, names[-1]], object)[meant]

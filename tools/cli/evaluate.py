@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
 from hearthlog.tools.cli.options import (
+    METHOD,
     METHODS,
     SCENARIO,
     Clips,
@@ -181,7 +182,7 @@ def evaluate_model(
 
 @evaluate.command("method")
 def evaluate_method(
-    method: _Method = "room21",
+    method: _Method = METHOD,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -217,7 +218,7 @@ def evaluate_method(
 
 @evaluate.command()
 def search(
-    method: _Method = "room21",
+    method: _Method = METHOD,
     *,
     data: Clips,
     scenario: _Scenario,
@@ -246,7 +247,7 @@ def search(
 
 @evaluate.command()
 def adaptation(
-    method: _Method = "room21",
+    method: _Method = METHOD,
     *,
     data: Clips,
     scenario: _Scenario,

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 _LAST = (1 << 63) - 1  # log time
 
-METHODS = "How to learn: room21, room (33 features), bands, or paper (42 statistics)."
+METHOD = "room"  # the default one; what has it takes long to import
+METHODS = "How to learn: room, room21 (the 21 features of auros21), bands, or paper."
 
 
 def log_location(text: str) -> Path:

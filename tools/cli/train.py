@@ -10,6 +10,7 @@ import typer
 
 from hearthlog.tools.cli.options import (
     CLIPS,
+    METHOD,
     METHODS,
     SCENARIO,
     Json,
@@ -20,7 +21,7 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
 from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import tell, wrong_use
+from hearthlog.tools.cli.text import first_of, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.training.dataset import Dataset, Recording
@@ -48,7 +49,7 @@ def train(
     base: Annotated[
         Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
     ] = None,
-    method: Annotated[str, typer.Option(help=METHODS)] = "room21",
+    method: Annotated[str, typer.Option(help=METHODS)] = METHOD,
     cost: Annotated[
         float | None,
         typer.Option(help="Cost of a wrong segment; `evaluate search` finds a good one."),
@@ -108,8 +109,8 @@ def _learned(
             "fewer than 5 sources have a label of no class, such as other_negative: the model will "
             "take every sound for one of its classes; add some to be told what is unknown"
         )
+    recordings = list(_home_recordings(home, method.features))
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
-        recordings = _home_recordings(home, method.features)
         segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
@@ -152,8 +153,8 @@ def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
     with share_done("learning what follows what in the home", announce=True) as report:
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         sound, losses = read_home_sound(home, model, report)
-        for loss in losses:
-            tell(loss)
+        for line in first_of("not learned from", losses):
+            tell(line)
         return adapt_transitions(model, sequences, sound)
 
 

@@ -106,7 +106,7 @@ class Logs:
         --------
         >>> features = hearthlog.open_logs("logs").columns("/mic/features")
         >>> features["values"].shape, features["values"].dtype
-        ((3600, 21), dtype('float32'))
+        ((3600, 33), dtype('float32'))
         """
         selection = self._select(topic)
         columns = read_columns(selection.logs, [topic], self.start, self.end, fields)

@@ -10,6 +10,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import FloorTracker
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile import modelfile
@@ -74,7 +75,7 @@ class SoundLabels(NamedTuple):
 
 
 def extract_features(
-    sound: NDArray[np.generic], rate: int, feature_set: str = "auros21", start: int = 0
+    sound: NDArray[np.generic], rate: int, feature_set: str = DEFAULT.name, start: int = 0
 ) -> SoundFeatures:
     """Compute the features of sound, to the bits that a recorder would log.
 
@@ -106,7 +107,7 @@ def extract_features(
     >>> tone = 0.1 * np.sin(2 * np.pi * 440 * np.arange(8000) / 16000)
     >>> features = hearthlog.extract_features(tone, 16000)
     >>> features.values.shape, features.names[:2]
-    ((10, 21), ('energy', 'zero_crossing_rate'))
+    ((10, 33), ('energy', 'zero_crossing_rate'))
     >>> features.values[0, :2].round(3)
     array([0.005, 0.054], dtype=float32)
     """
@@ -193,7 +194,7 @@ def load_model(path: Path | str) -> Model:
     --------
     >>> model = hearthlog.load_model("home.safetensors")
     >>> model.classes[:3], model.description.feature_set
-    (('silence', 'speech', 'music'), 'auros21')
+    (('silence', 'speech', 'music'), 'home33')
     """
     return modelfile.load_model(Path(path))
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.evaluation.compare_models import Comparison, compare_models
 from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings
-from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.installed import DEFAULT, method_named
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
 from hearthlog.analyzer.training.train import train_model
@@ -16,7 +16,7 @@ __all__ = ["Comparison", "compare", "train"]
 
 
 def train(
-    manifest: Path | str, scenario: str, method: str = "room21", smoothing: str = "hmm"
+    manifest: Path | str, scenario: str, method: str = DEFAULT.name, smoothing: str = "hmm"
 ) -> Model:
     """Learn a model from labelled clips, and measure it on sources that it has not heard.
 
@@ -27,7 +27,8 @@ def train(
     scenario : str
         What to tell apart: `bathroom`, `general`, or a TOML file.
     method : str
-        `room21`, `room`, `bands`, `paper`, or one that another distribution adds.
+        `room`, `room21` (the same of the 21 features of auros21), `bands`, `paper`, or one that
+        another distribution adds.
     smoothing : str
         How labels become segments: `hmm` or `merge`.
 

@@ -111,7 +111,9 @@ def _shades(times: Int64, values: Float64) -> tuple[Int64, Float64]:
     present = ~np.isnan(values[:, 0])
     if not present.any():
         return times[:0], values[:0]
-    times, values = _thin(times[present], values[present])
+    times, values = times[present], values[present]
+    absent = np.isnan(values)  # where the logs are of another feature set
+    times, values = _thin(times, np.where(absent, np.nanmin(values, axis=0), values))
     low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
     return times, np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
 
