@@ -1,4 +1,4 @@
-"""Probabilities from statistics: ours, and scikit-learn's of the same calibrated model."""
+"""Probabilities from inputs: ours, and scikit-learn's of the same calibrated model."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ _THE_SAME = Target(1e-5, at_most=True)
 
 
 def measure(work: Workload) -> Table:
-    """Measure both on statistics of the sound."""
+    """Measure both on the sound."""
     ours = Classifier(work.model).probabilities
     calibrated = fit_scikit_learn(work.training[0])
     machine = calibrated.estimator.estimator

@@ -153,7 +153,7 @@ def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
     with share_done("learning what follows what in the home", announce=True) as report:
         sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
         sound, losses = read_home_sound(home, model, report)
-        for line in first_of("not learned from", losses):
+        for line in first_of("not learned from", losses, hint=""):
             tell(line)
         return adapt_transitions(model, sequences, sound)
 
