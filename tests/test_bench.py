@@ -53,9 +53,9 @@ def test_recordings_of_a_folder_are_recorded_and_the_log_is_accounted_for_byte_b
 def test_every_peer_that_is_installed_gets_a_speed_and_a_ratio(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
     rows = features.measure(Workload(tmp_path, minutes=0.1)).rows
-    assert len(rows) == 7
+    assert len(rows) == 8
     assert all(math.isfinite(row.value) and row.value > 0 for row in rows)
-    assert rows[4].ratio == pytest.approx(rows[0].value / rows[4].value)
+    assert rows[5].ratio == pytest.approx(rows[0].value / rows[5].value)
 
 
 def test_a_peer_that_is_missing_is_named_and_the_others_are_measured(tmp_path, monkeypatch):
