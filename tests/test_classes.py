@@ -14,7 +14,6 @@ from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
 from hearthlog.analyzer.training.transitions import (
     default_transitions,
     expected_durations,
-    transitions_from_durations,
 )
 from hearthlog.models.classes import (
     CLASSES,
@@ -26,7 +25,6 @@ from hearthlog.models.classes import (
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.frames import FRAME_SECONDS
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"
@@ -109,13 +107,6 @@ def test_an_alias_is_drawn_told_and_expected_to_last_as_its_class(alias, name):
 def test_a_model_of_aliases_is_smoothed_as_one_of_our_names():
     one, other = (default_transitions(["silence", *names]) for names in zip(*ALIASES, strict=True))
     np.testing.assert_array_equal(one, other)
-
-
-def test_transitions_are_bit_for_bit_those_of_a_model_of_0_1_0():
-    model = load_model(OF_0_1_0)
-    seconds = np.array([DURATIONS_OF_0_1_0[name] for name in model.classes])
-    transitions = transitions_from_durations(seconds, FRAME_SECONDS)
-    np.testing.assert_array_equal(transitions, model.transitions)
 
 
 def test_a_model_of_0_1_0_keeps_the_durations_that_it_has_learned():

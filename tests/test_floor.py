@@ -143,7 +143,7 @@ def test_a_fan_is_a_part_of_the_room_after_a_minute_and_not_before():
         assert level_at(floors, powers, 2 * MINUTE + second * SECOND) == pytest.approx(-50, abs=0.5)
 
 
-@pytest.mark.parametrize("spread", [0.9, 1.5, 3.0, 6.0])
+@pytest.mark.parametrize("spread", [0.7, 1.5, 3.0, 6.0])
 def test_ten_minutes_of_a_shower_or_of_music_never_raise_it(spread):
     quiet = noise(-60, 2 * MINUTE)
     powers = np.concatenate([quiet, sound(-25, 10 * MINUTE, spread, 1)])

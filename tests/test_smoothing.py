@@ -21,7 +21,6 @@ from hearthlog.analyzer.training.transitions import (
     LAG_SECONDS,
     count_transitions,
     default_transitions,
-    transitions_from_durations,
 )
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.description import Smoothing
@@ -165,23 +164,29 @@ def test_once_converged_no_other_past_gives_other_states(seed):
         assert whole[len(past) + converged - 1 :].tolist() == states.tolist()
 
 
-def test_sounds_go_on_for_as_long_as_expected():
-    transitions = transitions_from_durations(np.array([0.5, 5.0, 0.01]), 0.05)
+def test_sounds_go_on_for_as_long_as_expected_and_end_in_silence():
+    transitions = default_transitions(["silence", "coughing", "music", "kettle"])
     np.testing.assert_allclose(transitions.sum(axis=1), 1.0)
-    np.testing.assert_allclose(1 / (1 - transitions.diagonal()), [10, 100, 1])
-    assert transitions[0, 1] == transitions[0, 2]
+    np.testing.assert_allclose(0.05 / (1 - transitions.diagonal()), [2.5, 1.0, 20.0, 10.0])
+    assert transitions[0, 1] == transitions[0, 2] == transitions[0, 3]
+    others = np.array([transitions[1, 2:].sum(), transitions[2, 1], transitions[3, 1]])
+    assert (transitions[1:, 0] > 20 * others).all()
+
+
+def test_without_a_class_of_silence_all_other_classes_are_as_likely_to_follow():
+    transitions = default_transitions(["music", "kettle", "speech"])
+    assert transitions[0, 1] == transitions[0, 2] == pytest.approx(0.05 / 20.0 / 2)
 
 
 def test_transitions_are_learned_from_sequences_and_what_was_never_seen_is_as_expected():
-    durations = np.array([1.0, 1.0, 1.0])
+    classes = ["kettle", "drill", "saw"]
     sequence = np.tile(np.repeat([0, 1], 100), 50)
-    counts = count_transitions([sequence, sequence[:0], sequence[:1]], durations)
+    counts = count_transitions([sequence, sequence[:0], sequence[:1]], classes)
     transitions = learn_transitions([], counts, 1.0)
     np.testing.assert_allclose(transitions.sum(axis=1), 1.0)
     np.testing.assert_allclose(transitions[0, 1], 0.01, rtol=0.1)
     assert 0 < transitions[0, 2] < 0.001
-    expected = transitions_from_durations(durations, FRAME_SECONDS)
-    np.testing.assert_allclose(transitions[2], expected[2])
+    np.testing.assert_allclose(transitions[2], default_transitions(classes)[2])
 
 
 def noisy_sound(seed, frames=6000):
@@ -198,7 +203,7 @@ def noisy_sound(seed, frames=6000):
 
 def test_transitions_are_learned_from_sound_that_nobody_labelled():
     truth, emissions, symbols, _ = noisy_sound(0)
-    counts = count_transitions([], np.array([1.0, 1.0, 1.0]))
+    counts = count_transitions([], ["kettle", "drill", "saw"])
     sound = (emissions / emissions.sum(axis=0)).T[symbols].astype(np.float32)
     expected = learn_transitions([], counts, 1.0)
     learned = learn_transitions([sound[:2000], sound[:0], sound[2000:]], counts, 4.0)
@@ -208,7 +213,7 @@ def test_transitions_are_learned_from_sound_that_nobody_labelled():
 
 def test_transitions_are_those_that_hmmlearn_learns_where_the_emissions_are_known(caplog):
     _, emissions, symbols, _ = noisy_sound(1)
-    counts = count_transitions([], np.array([1.0, 2.0, 0.5]))
+    counts = count_transitions([], ["silence", "coughing", "speech"])
     peer = hmm.CategoricalHMM(3, transmat_prior=1.0 + counts, params="t", init_params="", n_iter=10)
     peer.startprob_, peer.emissionprob_ = np.full(3, 1 / 3), emissions
     peer.transmat_ = counts / counts.sum(axis=1, keepdims=True)

@@ -47,7 +47,8 @@ def calibrate_elsewhere(
 ) -> tuple[float, Elsewhere]:
     """Find the temperature that holds in collections of which nothing was learned.
 
-    Segments of a class of which the others have fewer than five sources are left out.
+    Segments of no class of the scenario are left out, and those of a class of which the others
+    have fewer than five sources.
 
     Parameters
     ----------
@@ -69,6 +70,8 @@ def calibrate_elsewhere(
         pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
         sources = np.bincount(pairs[0], minlength=len(data.classes))
         taught[unseen] = sources[data.target[unseen]] >= _FEWEST_SOURCES
+    if UNKNOWN in data.classes:
+        taught &= data.target != data.classes.index(UNKNOWN)
     if not taught.any():
         taught[:] = True
     probabilities = nested_probabilities(decisions, data.target, folds, taught)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from hearthlog.analyzer.training.hidden_markov import learn_transitions
-from hearthlog.analyzer.training.transitions import count_transitions, expected_durations
+from hearthlog.analyzer.training.transitions import count_transitions
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float32, Int64
 
@@ -28,7 +28,7 @@ def adapt_transitions(model: Model, sequences: Sequence[Int64], sound: Sequence[
     """
     if not (sequences or sound):
         return model
-    counts = count_transitions(sequences, expected_durations(model.classes))
+    counts = count_transitions(sequences, model.classes)
     description, training = model.description, model.description.training_data
     update = {
         "home_frames": sum(map(len, sound)),

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hearthlog.models.classes import find_class
+from hearthlog.models.classes import SILENCE, class_name, find_class
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
@@ -12,23 +12,34 @@ LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real cli
 REACH_SECONDS = 0.3
 SHORTEST_SECONDS = 0.25
 
+_SOUND_AFTER_SOUND = 0.02  # times as likely as it were if all classes were equally likely
 _SECONDS = 10.0  # expected duration of a class that is not in the table of classes
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
     """Return the transition probabilities of classes by their expected durations.
 
+    A sound is mostly followed by silence, if that is a class, and seldom by another sound: most
+    changes from one sound to another are mistakes in the middle of one of them.
+
     Parameters
     ----------
     classes : sequence of str
-        Names of the C classes; one that `hearthlog.models.classes` does not know lasts 10 s.
+        Names of the C classes, at least two; one that `hearthlog.models.classes` does not know
+        lasts 10 s.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class.
     """
-    return transitions_from_durations(expected_durations(classes), FRAME_SECONDS)
+    leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
+    is_sound = np.array([class_name(name) != SILENCE for name in classes])
+    following = np.where(np.outer(is_sound, is_sound), _SOUND_AFTER_SOUND, 1.0)
+    np.fill_diagonal(following, 0.0)
+    transitions: Float64 = following * (leave / following.sum(axis=1))[:, np.newaxis]
+    np.fill_diagonal(transitions, 1.0 - leave)
+    return transitions
 
 
 def expected_durations(classes: Sequence[str]) -> Float64:
@@ -48,56 +59,24 @@ def expected_durations(classes: Sequence[str]) -> Float64:
     return np.array([_SECONDS if row is None else row.seconds for row in rows])
 
 
-def transitions_from_durations(durations: Float64, frame_seconds: float) -> Float64:
-    """Return the transition probabilities of classes with these mean durations.
-
-    All other classes are equally likely to follow a sound.
-
-    Parameters
-    ----------
-    durations : np.ndarray [shape=(C,)], float64
-        In seconds; less than a frame counts as a frame.
-    frame_seconds : float
-        Length of a frame, in seconds.
-
-    Returns
-    -------
-    np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class.
-    """
-    leave = 1.0 / np.maximum(durations / frame_seconds, 1.0)
-    count = len(durations)
-    if count == 1:
-        return np.ones((1, 1))
-    transitions = np.repeat(leave[:, np.newaxis] / (count - 1), count, axis=1)
-    np.fill_diagonal(transitions, 1.0 - leave)
-    return transitions
-
-
-def count_transitions(
-    sequences: Sequence[Int64],
-    durations: Float64,
-    frame_seconds: float = FRAME_SECONDS,
-) -> Float64:
-    """Count the transitions in labelled sequences, and add one visit to each class.
+def count_transitions(sequences: Sequence[Int64], classes: Sequence[str]) -> Float64:
+    """Count the transitions in labelled sequences, and add those expected of a visit to each class.
 
     Parameters
     ----------
     sequences : sequence of np.ndarray [shape=(n,)], int64
         Indices of the classes of successive frames.
-    durations : np.ndarray [shape=(C,)], float64
-        Of the visits that are added, in seconds; less than a frame counts as a frame.
-    frame_seconds : float
-        Length of a frame, in seconds.
+    classes : sequence of str
+        Names of the C classes.
 
     Returns
     -------
     np.ndarray [shape=(C, C)], float64
         Number of frames of the row's class that are followed by one of the column's class.
     """
-    count = len(durations)
-    frames = np.maximum(durations / frame_seconds, 1.0)
-    counts = transitions_from_durations(durations, frame_seconds) * frames[:, np.newaxis]
+    count = len(classes)
+    frames = np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
+    counts = default_transitions(classes) * frames[:, np.newaxis]
     for sequence in sequences:
         pairs = sequence[:-1] * count + sequence[1:]
         counts += np.bincount(pairs, minlength=count * count).reshape(count, count)

@@ -18,7 +18,7 @@ _MINUTE_BLOCKS = 150
 _SECOND_FRAMES = 20  # no window is longer
 _MEMORY_SECTIONS = 10_800  # 12 h; a relabelling looks back no further
 _SHARE = 0.1  # of the blocks of a minute that may be below the floor
-_STEADY_DB = 0.5  # noise is below 0.4, of real showers, taps, music and speech 9 in 10 are above
+_STEADY_DB = 0.42  # noise is below 0.4; real showers, taps, music and speech are above
 NOMINAL = 1e-7  # power, -70 dBFS: differences below it are those of codecs
 
 
