@@ -3,12 +3,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_log import evaluate_labelling
+from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
 from hearthlog.analyzer.evaluation.event_scores import (
     Events,
     event_based,
@@ -18,6 +20,10 @@ from hearthlog.analyzer.evaluation.event_scores import (
 )
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, common, joined
+from hearthlog.analyzer.training.dataset import clip_frames
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.rooms import steady_noise
+from hearthlog.analyzer.training.scenario import BUILTIN, scenario_of
 from hearthlog.analyzer.training.scores import (
     Bin,
     calibration_error,
@@ -28,6 +34,7 @@ from hearthlog.analyzer.training.scores import (
 from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.tools.cli.scores import print_scores
 from hearthlog.tools.home.simulate import write_training_set
 
@@ -375,6 +382,7 @@ def test_a_model_is_scored_on_real_household_sound(all_household, model_file, tm
     assert table.returncode == 0
     assert max(map(len, table.stdout.splitlines())) <= 100
     assert f"{found['macro_f1']:.3f}" in table.stdout
+    assert f": {found['segments']} segments of 1 s from " in table.stdout
 
 
 def test_a_log_is_scored_against_a_label_file_and_against_its_review(recorded, tmp_path, hearthlog):
@@ -454,7 +462,7 @@ def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
 
 
 def clip_and_log(model_file, day, tmp_path, hearthlog, *smoothing):
-    """Evaluate a model on a day as a clip, and as a recorder that starts with it labels it."""
+    """Evaluate a model on a day as a clip, and as a recorder labels it between quiet seconds."""
     model = load_model(model_file)
     about = model.description.model_copy(update=dict(smoothing))
     hidden = about.smoothing.method == "hmm"
@@ -466,12 +474,14 @@ def clip_and_log(model_file, day, tmp_path, hearthlog, *smoothing):
     manifest.write_text("path,label,source_group\nday.flac,speech,a\n")
     words = (model_file, "--data", manifest, "--json")
     of_clip = json.loads(hearthlog("evaluate", "model", *words).stdout)
-    logs = tmp_path / "logs"
-    start = "2026-03-01T08:00:00"
-    recording = hearthlog("record", day, "--model", model_file, "-o", logs, "--start", start)
+    sound, rate = soundfile.read(day, dtype="int16")
+    room = np.rint(32767 * steady_noise(2 * rate, -80.0, np.random.default_rng(0))).astype(np.int16)
+    soundfile.write(tmp_path / "room.flac", np.concatenate([room, sound, room]), rate)
+    logs, words = tmp_path / "logs", ("--model", model_file, "--start", "2026-03-01T08:00:00")
+    recording = hearthlog("record", tmp_path / "room.flac", *words, "-o", logs)
     assert recording.returncode == 0, recording.stderr
     track = tmp_path / "labels.txt"
-    track.write_text("0\t180\tspeech\n")
+    track.write_text("0\t2\tsilence\n2\t182\tspeech\n182\t184\tsilence\n")
     result = hearthlog("evaluate", "log", logs, "--reference", track, "--json")
     return of_clip, json.loads(result.stdout)
 
@@ -483,18 +493,35 @@ def test_clips_are_labelled_as_the_recorder_labels_them(
     smoothing = Smoothing(method=method, lag_seconds=3.0, reach_seconds=0.6, shortest_seconds=0.25)
     asked = ("smoothing", smoothing)
     of_clip, of_log = clip_and_log(second_file, day, tmp_path, hearthlog, asked)
-    assert of_log["evaluated_seconds"] == of_clip["evaluated_seconds"] == 179.5
-    for figure in ("segment_based", "event_based", "false_alarms_per_day"):
-        assert of_log[figure] == of_clip[figure]
+    assert (of_clip["evaluated_seconds"], of_log["evaluated_seconds"]) == (184.0, 183.5)
+    clip, log = (one["event_based"]["per_class"] for one in (of_clip, of_log))
+    assert {**clip, "silence": None} == {**log, "silence": None}
     assert of_clip["macro_f1_interval"] is None
 
 
-def test_a_clip_was_cut_out_of_its_room_and_a_recorder_has_to_hear_the_room_first(
-    day, model_file, tmp_path, hearthlog
-):
-    of_clip, of_log = clip_and_log(model_file, day, tmp_path, hearthlog)
-    assert of_clip["evaluated_seconds"] == 179.8  # from the middle of the first window on
-    assert of_log["evaluated_seconds"] == 179.45  # the same after a block for the floor
+def test_labels_beside_their_sounds_are_errors(training_set, model_file):
+    model, scenario = load_model(model_file), BUILTIN["general"]
+    clips = [c for c in read_manifest(training_set, scenario.labels) if c.label != "silence"][::3]
+    early = model.description.model_copy(update={"label_frame": 0})
+    right, wrong = (
+        evaluate_model(one, clips, scenario, ignore_progress).detections.event_based.macro_f1
+        for one in (model, replace(model, description=early))
+    )
+    assert wrong < right - 0.2
+
+
+def test_a_model_without_silence_is_judged_in_its_clips_alone(training_set, second_file):
+    model = load_model(second_file)
+    names = ["quiet" if name == "silence" else name for name in model.classes]
+    about = model.description
+    renamed = about.model_copy(update={"classes": names, "scenario": {n: [n] for n in names}})
+    model = replace(model, description=renamed)
+    clips = [
+        c for c in read_manifest(training_set, BUILTIN["general"].labels) if c.label == "speech"
+    ]
+    found = evaluate_model(model, clips, scenario_of(model), ignore_progress)
+    assert found.evaluated_seconds == sum(len(clip_frames(clip)) for clip in clips) / 20
+    assert found.detections.segment_based.per_class["speech"].recall > 0.5
 
 
 def test_a_model_says_that_it_is_scored_on_what_it_learned_from(tmp_path, hearthlog):

@@ -10,20 +10,24 @@ from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detec
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.method import softmax
+from hearthlog.analyzer.training.rooms import captured, steady_noise
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
-from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _LEAST = 1e-30
+_ROOM_SECONDS = 2  # longer than any label lasts by its window
+_ROOM_DBFS = -80.0
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,7 @@ class ModelEvaluation:
     scores: Scores  # of segments of a second; the groups are the source groups
     expected_calibration_error: float
     reliability: list[Bin]
-    # each clip is a recording with one event, its label from the first frame that the model
-    # labels to the last
-    detections: Detections
+    detections: Detections  # of clips in a quiet room
     evaluated_seconds: float  # of what the detections are about
     skipped: Mapping[str, int]  # why clips gave no segment, and how many
     learned_from: bool  # whether the model learned from just these segments
@@ -138,15 +140,23 @@ def segment_probabilities(classifier: Classifier, inputs: Float32) -> Float64:
 class _Listener:
     """Collects the events of recordings that are laid out one after the other.
 
+    Each is played in a quiet room, so that a label which begins late or goes on after the sound is
+    an error. Silence is judged in the recording only; a model without it hears no room.
+
     Attributes
     ----------
     duration : int
-        Labelled time, in nanoseconds.
+        Time of the recordings and of the room, in nanoseconds.
     """
 
     def __init__(self, classifier: Classifier) -> None:
         self.duration = 0
         self._classifier = classifier
+        self._silence, self._room = -1, _quiet_room(classifier.feature_set)
+        if SILENCE in classifier.classes:
+            self._silence = classifier.classes.index(SILENCE)
+        else:
+            self._room = self._room[:0]
         self._place = 0
         self._reference: list[tuple[int, int, int]] = []
         self._predicted: list[tuple[int, int, int]] = []
@@ -161,25 +171,35 @@ class _Listener:
 
     def _listen(self, recording: Recording, label: str) -> None:
         """Add a recording of one label."""
-        features, recorded = recording.features, recording.floor
-        labeller, powers = Labeller(self._classifier), self._classifier.feature_set.band_powers
+        features = np.concatenate([self._room, recording.features, self._room])
         stamps = np.arange(len(features)) * FRAME_NANOSECONDS
-        floors = None
-        if powers is not None:
-            floor = np.zeros(powers(features[:1]).shape[1]) if recorded is None else recorded
-            floors = Floors(np.tile(floor, (len(features), 1)), converged=True)
-        labels, segments = labeller.push(features, floors, 0, stamps)
-        if not len(labels.frames):
+        length = len(features) * FRAME_NANOSECONDS
+        begin = len(self._room) * FRAME_NANOSECONDS
+        end = length - begin
+        if begin == end:
             return
-        end = len(features) * FRAME_NANOSECONDS
-        segments += labeller.close(end)
-        shift = self._place - int(labels.stamps[0])
-        self._predicted += [(one.start + shift, one.end + shift, one.label) for one in segments]
-        true = self._classifier.classes.index(label)
-        self._reference.append((self._place, end + shift, true))
-        length = end + shift - self._place
+        labeller, floors = Labeller(self._classifier), self._floors(recording, len(features))
+        segments = [*labeller.push(features, floors, 0, stamps)[1], *labeller.close(length)]
+        self._add(self._reference, begin, end, self._classifier.classes.index(label))
+        for one in segments:
+            if one.label == self._silence:
+                self._add(self._predicted, max(one.start, begin), min(one.end, end), one.label)
+            else:
+                self._add(self._predicted, one.start, one.end, one.label)
         self.duration += length
         self._place += (length // NANOSECONDS + 2) * NANOSECONDS  # a second between two of them
+
+    def _add(self, events: list[tuple[int, int, int]], start: int, end: int, label: int) -> None:
+        if start < end:
+            events.append((self._place + start, self._place + end, label))
+
+    def _floors(self, recording: Recording, frames: int) -> Floors | None:
+        """Return the floor of the room in a recording at each of some frames."""
+        features = self._classifier.feature_set
+        if not features.bands:
+            return None
+        floor = np.zeros(features.bands) if recording.floor is None else recording.floor
+        return Floors(np.tile(floor, (frames, 1)), converged=True)
 
     def detections(self) -> Detections:
         """Score all of them."""
@@ -187,3 +207,9 @@ class _Listener:
             Events(*np.array(rows, np.int64).T) for rows in (self._reference, self._predicted)
         )
         return detect(reference, predicted, self._classifier.classes, self.duration)
+
+
+def _quiet_room(features: FeatureSet) -> Float32:
+    """Return the features of two seconds of a room in which nothing can be heard."""
+    samples = _ROOM_SECONDS * SAMPLE_RATE
+    return captured(steady_noise(samples, _ROOM_DBFS, np.random.default_rng(0)), features)

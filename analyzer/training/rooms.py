@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import fftconvolve
 
-from hearthlog.models.features.feature_set import Extractor, FeatureSet
+from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
@@ -74,12 +74,12 @@ def in_room(
     if silence:
         noise_level = rng.uniform(*_SILENCE_DBFS)
     noise = steady_noise(len(sound), float(np.clip(noise_level, *_NOISE_DBFS)), rng)
-    copy = _features(sound + noise, features.extractor())
+    copy = captured(sound + noise, features)
     assert features.band_powers is not None
     if silence:
         floor = low_power(features.band_powers(copy))
     else:
-        floor = features.band_powers(_features(noise, features.extractor())).mean(axis=0)
+        floor = features.band_powers(captured(noise, features)).mean(axis=0)
     return RoomCopy(copy, floor * _error(len(floor), rng))
 
 
@@ -94,7 +94,7 @@ def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
     """
     level = rng.uniform(*_STEADY_DBFS)
     noise = steady_noise(_STEADY_SECONDS * SAMPLE_RATE, level, rng)
-    copy = _features(noise, features.extractor())
+    copy = captured(noise, features)
     assert features.band_powers is not None
     floor = low_power(features.band_powers(copy), rng.uniform(0.05, 0.5))
     return RoomCopy(copy, floor * _error(len(floor), rng))
@@ -211,10 +211,21 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
     return scaled
 
 
-def _features(sound: Float64, extract: Extractor) -> Float32:
-    """Compute the features of a sound as a microphone of 16 bits captures it."""
+def captured(sound: Float64, features: FeatureSet) -> Float32:
+    """Compute the features of a sound as a microphone of 16 bits captures it.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples of whole frames at 16 kHz in full scale; those beyond it are clipped.
+    features : FeatureSet
+
+    Returns
+    -------
+    np.ndarray [shape=(n / FRAME_SAMPLES, d)], float32
+    """
     samples = np.clip(np.rint(sound * 32767.0), -32768, 32767) / 32768.0
-    return extract(samples.astype(np.float32).reshape(-1, FRAME_SAMPLES))
+    return features.extractor()(samples.astype(np.float32).reshape(-1, FRAME_SAMPLES))
 
 
 def _error(bands: int, rng: np.random.Generator) -> Float64:

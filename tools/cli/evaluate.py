@@ -142,10 +142,12 @@ def evaluate_model(
     from hearthlog.analyzer.evaluation import evaluate_model as evaluation
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+    from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
 
     check_output("--plot", plot, ".png", "a picture")
     loaded = load_model(model)
+    seconds = feature_set(loaded.description.feature_set).window_seconds
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)
     clips = read_manifest(manifest_path(data), classes.labels)
@@ -168,7 +170,7 @@ def evaluate_model(
     else:
         print(
             f"model {loaded.name}, scenario {classes.name}: {scores.segments} segments of "
-            f"{loaded.description.window_seconds:g} s from {scores.groups} sources\n"
+            f"{seconds:g} s from {scores.groups} sources\n"
         )
         print_scores(scores, result.detections)
         print_reliability(result.reliability, result.expected_calibration_error)
