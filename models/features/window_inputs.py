@@ -46,7 +46,7 @@ class Inputs(Protocol):
         Number of inputs.
     window_frames : int
     needs_floor : bool
-        Whether they depend on the floor of the room.
+        Whether they depend on the floor of the room; then a window has a second at most.
     """
 
     @property

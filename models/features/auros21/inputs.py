@@ -20,6 +20,7 @@ VALUES = _WIDTH + MEL_BANDS
 _FLOOR = 1e-7
 _OVERSUBTRACTION = 1.5
 _TINY = 1e-12
+_MOST_DB = 300.0  # no frame has so much; powers and their squares stay finite
 LABEL_FRAMES = 8
 # Means over quiet stretches of household recordings, in the order of the features before the
 # cepstra, with the logarithm of the flux; the first is not used.
@@ -63,17 +64,14 @@ def band_powers(features: Float32) -> Float64:
         and the energy; not below 0.
     """
     powers = np.empty((len(features), MEL_BANDS + 1))
-    powers[:, :MEL_BANDS] = 10.0 ** (bands_of(features[:, CEPSTRA]) / 10.0) - _FLOOR
+    level = np.minimum(bands_of(features[:, CEPSTRA]), _MOST_DB)
+    powers[:, :MEL_BANDS] = 10.0 ** (level / 10.0) - _FLOOR
     powers[:, MEL_BANDS] = features[:, ENERGY]
     return np.maximum(powers, 0.0, out=powers)
 
 
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     """Compute the values behind the inputs `above_floor` from the features of each frame.
-
-    The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
-    corrupted by acoustic noise", 1979). The other values cannot be changed so; the less of the
-    energy is above the floor, the nearer they are to those of silence.
 
     Parameters
     ----------
@@ -91,34 +89,47 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     TypeError
         If there are no floors.
     """
+    return above_floor(features, floors)[0]
+
+
+def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Float64]:
+    """Compute what of each frame is above the floor of the room, and how much of its energy.
+
+    The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
+    corrupted by acoustic noise", 1979). The other values cannot be changed so; the less of the
+    energy is above the floor, the nearer they are to those of silence.
+
+    Parameters
+    ----------
+    features : np.ndarray [shape=(n, 21)], float32
+    floors : np.ndarray [shape=(n, 33)], float64
+        In the order of `band_powers`.
+
+    Returns
+    -------
+    values : np.ndarray [shape=(n, 53)], float64
+        As of `values_above_floor`.
+    share : np.ndarray [shape=(n, 1)], float64
+        From 0 to 1.
+
+    Raises
+    ------
+    TypeError
+        If there are no floors.
+    """
     if floors is None:
         raise TypeError("these inputs need the floor of the room")
     powers = band_powers(features)
+    energy, floor = powers[:, MEL_BANDS:], floors[:, MEL_BANDS:]
+    share = np.maximum(energy - floor, 0.0) / np.maximum(energy, _TINY)
     level = 10.0 * np.log10(np.maximum(powers - _OVERSUBTRACTION * floors, 0.0) + _FLOOR)
-    share = share_above_floor(powers, floors)
     scalars = features[:, :_SCALARS].astype(np.float64)
     scalars[:, FLUX] = np.log(np.maximum(scalars[:, FLUX], 0.0) + _FLOOR)
     scalars = _OF_SILENCE + share * (scalars - _OF_SILENCE)
     scalars[:, ENERGY] = level[:, MEL_BANDS]
     bands = level[:, :MEL_BANDS]
-    return np.concatenate([scalars, bands, rowwise_matmul(bands, dct_weights())], axis=1)
-
-
-def share_above_floor(powers: Float64, floors: Float64) -> Float64:
-    """Compute which share of the energy of each frame is above the floor.
-
-    Parameters
-    ----------
-    powers, floors : np.ndarray [shape=(n, 33)], float64
-        In the order of `band_powers`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 1)], float64
-        From 0 to 1.
-    """
-    energy, floor = powers[:, MEL_BANDS:], floors[:, MEL_BANDS:]
-    return np.maximum(energy - floor, 0.0) / np.maximum(energy, _TINY)
+    values = np.concatenate([scalars, bands, rowwise_matmul(bands, dct_weights())], axis=1)
+    return values, share
 
 
 def bands_of(cepstra: Float32) -> Float64:

@@ -48,10 +48,7 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     TypeError
         If there are no floors.
     """
-    paper = features[:, :_WIDTH]
-    values = auros21.values_above_floor(paper, floors)
-    assert floors is not None
-    share = auros21.share_above_floor(auros21.band_powers(paper), floors)
+    values, share = auros21.above_floor(features[:, :_WIDTH], floors)
     shape = _OF_SILENCE + share * (features[:, _WIDTH:] - _OF_SILENCE)
     return np.concatenate([values, shape], axis=1)
 
