@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.report.class_words import in_words, several_in_words
-from hearthlog.analyzer.training.scenario import BUILTIN, LABELS
+from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.transitions import (
     default_transitions,
     expected_durations,
@@ -23,7 +23,7 @@ from hearthlog.models.classes import (
     translation,
 )
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.models.classifiers.description import CLASS_NAME, MOST_CLASSES
 from hearthlog.models.modelfile.modelfile import load_model
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
@@ -152,3 +152,26 @@ def test_labels_are_called_as_others_call_them_unless_these_tell_more_apart():
         "my_dog": "my_dog",
         "speech": "speech",
     }
+
+
+def with_unknown(labels, classes, sources=5, ignored=()):
+    scenario = Scenario("x", {name: (name,) for name in classes}, frozenset(ignored))
+    pairs = [(label, str(number)) for number in range(sources) for label in labels]
+    return scenario.with_unknown(pairs).classes.get("unknown")
+
+
+def test_labels_of_no_class_make_up_unknown_if_five_sources_have_them():
+    assert with_unknown(["speech", "rain", "dog"], ["speech", "music"]) == ("dog", "rain")
+    assert with_unknown(["speech", "rain"], ["speech", "music"], sources=4) is None
+    assert with_unknown(["speech", "Speech"], ["speech", "music"]) is None
+
+
+def test_what_is_left_out_is_not_learned_as_unknown():
+    assert with_unknown(["Cough", "dog"], ["speech", "music"], ignored=["coughing"]) == ("dog",)
+    assert with_unknown(["phone_ring"], ["ringtone", "telephone_bell_ringing"]) is None
+
+
+def test_a_scenario_with_as_many_classes_as_a_model_may_have_has_no_unknown():
+    names = [f"class_{number}" for number in range(MOST_CLASSES)]
+    assert with_unknown(["dog"], names) is None
+    assert with_unknown(["dog"], names[1:]) == ("dog",)

@@ -79,16 +79,16 @@ class Scenario:
         Returns
         -------
         Scenario
-            This one, if fewer than five sources have such labels.
+            This one, if it has such a class or as many as a model may have, or if fewer than five
+            sources have such labels.
         """
-        others = {(label, group) for label, group in sources if self._is_other(label)}
-        if sound.UNKNOWN in self.classes or len({group for _, group in others}) < _FEWEST_UNKNOWN:
+        listed = self.class_of.keys() | self.ignored
+        others = {(label, group) for label, group in sources if not sound.meant_by(label, listed)}
+        full = sound.UNKNOWN in self.classes or len(self.classes) == MOST_CLASSES
+        if full or len({group for _, group in others}) < _FEWEST_UNKNOWN:
             return self
         labels = tuple(sorted({label for label, _ in others}))
         return Scenario(self.name, {**self.classes, sound.UNKNOWN: labels}, self.ignored)
-
-    def _is_other(self, label: str) -> bool:
-        return label not in self.ignored and self.find(label) is None
 
     @property
     def labels(self) -> frozenset[str]:
