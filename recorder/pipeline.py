@@ -1,6 +1,7 @@
 """Frames in, encoded messages out: features, statistics, labels and segments. No I/O."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
@@ -12,7 +13,8 @@ from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder import rosout
-from hearthlog.recorder.events import OK, Event, Frames, Gap, Notice, SourceHealth
+from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
+from hearthlog.recorder.sound_watch import SoundWatch
 from hearthlog.recorder.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -65,6 +67,7 @@ class Pipeline:
         self._floor = None if features.band_powers is None else FloorTracker()
         self._recent_floors: Float64 | None = None  # of the last window
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
+        self._watch = SoundWatch()
         self._end = 0
         self._level = OK
 
@@ -86,6 +89,7 @@ class Pipeline:
             In the order of their log times.
         """
         if isinstance(event, Frames):
+            self._watch.add_samples(event.samples)
             return self.push_features(self._features(event.samples), event.first, event.stamps)
         if isinstance(event, Gap):
             return self._push_gap(event)
@@ -214,6 +218,7 @@ class Pipeline:
         if self._floor is None or self.feature_set.band_powers is None:
             return None
         floors = self._floor(self.feature_set.band_powers(features), first)
+        self._watch.add_floor(floors.powers[:, -1])
         recent = [floors.powers]
         if self._recent_floors is not None:
             recent.insert(0, self._recent_floors)
@@ -282,6 +287,8 @@ class Pipeline:
         return messages
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
+        if health.level == OK and (problem := self._watch.problem()):
+            health = replace(health, level=WARNING, summary=problem)
         name = f"hearthlog: {self.microphone}"
         values = {**health.values, **self._floor_value()}
         messages = [self._diagnostics(health.stamp, health.level, name, health.summary, values)]

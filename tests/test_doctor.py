@@ -89,6 +89,16 @@ def test_a_log_that_was_recorded_is_sound_but_for_its_gap(recorded):
     assert found(recorded) == {("warning", GAP)}
 
 
+def test_what_the_recorder_said_of_itself_is_said_once(hearthlog, tmp_path):
+    rng = np.random.default_rng(0)
+    soundfile.write(tmp_path / "clips.wav", rng.normal(0.0, 1.0, 40 * 16_000).clip(-1, 1), 16_000)
+    recording = hearthlog("record", tmp_path / "clips.wav", "-o", tmp_path / "logs")
+    assert recording.returncode == 0, recording.stderr
+    (findings,) = examine(tmp_path / "logs")
+    assert findings.counts == {("warning", "health"): 1}
+    assert "the microphone clips: turn its volume down [health]" in str(findings.shown[0])
+
+
 def test_a_log_that_was_put_together_again_is_the_same(recorded, log, tmp_path):
     assert log.write(tmp_path / NAME).stat().st_size == recorded.stat().st_size
     assert found(tmp_path / NAME) == {("warning", GAP)}

@@ -212,3 +212,47 @@ def test_diagnostics_say_how_quiet_the_room_is():
     assert float(floor(stamps[200])) == pytest.approx(-50, abs=0.5)
     pipeline.push(Gap(int(stamps[200]), int(stamps[201]), "test", 1))
     assert floor(stamps[201]) is None
+
+
+def health_after(pipeline, stamp, level=0):
+    records = pipeline.push(SourceHealth(int(stamp), level, "listening"))
+    (status,) = decode(records[0].data, DIAGNOSTICS).status
+    return status.level, status.message
+
+
+def test_a_microphone_that_clips_is_said_for_a_minute_and_a_loud_clap_is_not():
+    rng = np.random.default_rng(0)
+    sound = np.clip(rng.normal(0.0, 0.5, (3600, FRAME_SAMPLES)), -1, 1).astype(np.float32)
+    sound[:, :400] *= 0.1  # clipped or not, no frame is as steady as a room
+    sound[0:10] *= 0.01
+    sound[30:] *= 0.01
+    stamps = START + np.arange(3600) * FRAME_NANOSECONDS
+    pipeline, said = Pipeline("mic", DEFAULT), []
+    for first in range(0, 3600, 200):
+        block = slice(first, first + 200)
+        pipeline.push(Frames(first, sound[block], stamps[block]))
+        said.append(health_after(pipeline, stamps[first]))
+    clipping = (1, "the microphone clips: turn its volume down")
+    assert said == [clipping] * 6 + [(0, "listening")] * 12
+    assert health_after(pipeline, stamps[-1], 2) == (2, "listening")
+
+
+def test_full_scale_that_is_not_clipped_is_well():
+    peaks = np.zeros((100, FRAME_SAMPLES), np.float32)
+    peaks[:, ::400] = 1.0
+    pipeline = Pipeline("mic", DEFAULT)
+    pipeline.push(Frames(0, peaks, START + np.arange(100) * FRAME_NANOSECONDS))
+    assert health_after(pipeline, START) == (0, "listening")
+
+
+@pytest.mark.parametrize(("level", "loud"), [(-18, True), (-35, False)])
+def test_a_room_as_loud_as_sounds_are_is_said_after_ten_minutes(level, loud):
+    rng = np.random.default_rng(0)
+    noise = (10 ** (level / 20) * rng.standard_normal((400, FRAME_SAMPLES))).astype(np.float32)
+    features = np.tile(DEFAULT.extractor()(noise), (31, 1))
+    pipeline, said = Pipeline("mic", DEFAULT), []
+    for first in range(0, len(features), 400):
+        stamps = START + np.arange(first, first + 400) * FRAME_NANOSECONDS
+        pipeline.push_features(features[first : first + 400], first, stamps)
+        said.append(health_after(pipeline, stamps[-1])[0])
+    assert said == ([0] * 30 + [1] if loud else [0] * 31)

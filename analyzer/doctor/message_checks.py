@@ -35,6 +35,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.messages.fields import difference
+from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.messages.type_definitions import message_type
 
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
@@ -59,6 +60,7 @@ class MessageChecks:
         self._findings = findings
         self._last: int | None = None
         self._parts: dict[str, list[int]] = {}  # where further ones begin, in a merged log
+        self._troubles: set[str] = set()
         self._named = LOG_NAME.fullmatch(findings.path.name) is not None
 
     def add(self, batch: MessageBatch) -> None:
@@ -157,18 +159,21 @@ class MessageChecks:
     def _check(self, kind: str, columns: Columns) -> None:
         microphone = split_topic(columns.topic)[0]
         column_checks.check_stamps(self._findings, kind, columns, microphone, named=self._named)
+        if kind == DIAGNOSTICS:
+            self._check_health(columns)
         if not microphone:
             return
         if kind == "info":
             self._check_infos(columns, microphone)
         info = self.infos.get(microphone)
         if microphone not in self.frames:
-            every = statistics_every(self._data)
-            labelled = info is not None and len(info["labels"]) > 0
-            timing = _label_timing(self._data, info)
-            self.frames[microphone] = FrameSequence(
-                self._findings, microphone, every, timing, labelled=labelled
-            )
+            self.frames[microphone] = self._frame_sequence(microphone, info)
+        self._check_content(kind, columns, info)
+        rows = _sequence_rows(kind, columns)
+        if rows is not None:
+            self.frames[microphone].add(kind, rows)
+
+    def _check_content(self, kind: str, columns: Columns, info: Mapping[str, Any] | None) -> None:
         if kind in _WIDTHS and info is not None:
             names = info["labels"] if kind == LABEL else info["feature_names"]
             for field in _WIDTHS[kind]:
@@ -180,9 +185,20 @@ class MessageChecks:
             column_checks.check_segments(self._findings, columns, classes)
         if kind == GAP:
             column_checks.check_gaps(self._findings, columns)
-        rows = _sequence_rows(kind, columns)
-        if rows is not None:
-            self.frames[microphone].add(kind, rows)
+
+    def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
+        every, timing = statistics_every(self._data), _label_timing(self._data, info)
+        labelled = info is not None and len(info["labels"]) > 0
+        return FrameSequence(self._findings, microphone, every, timing, labelled=labelled)
+
+    def _check_health(self, columns: Columns) -> None:
+        """Say once what the recorder said of itself that was not well."""
+        for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
+            for status in statuses:
+                said = f"{status['name']}: {status['message']}"
+                if status["level"] and said not in self._troubles:
+                    self._troubles.add(said)
+                    self._findings.warning("health", said, time=time)
 
     def _check_infos(self, columns: Columns, microphone: str) -> None:
         """Keep what a file says of itself; where it says so again another recording begins."""
