@@ -8,7 +8,7 @@ from threading import Event
 import numpy as np
 import pytest
 import soundfile
-from blobs import blobs
+from blobs import blobs, with_arrays
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation_curve
@@ -27,6 +27,7 @@ from hearthlog.analyzer.training.svm_method import BANDS, ROOM
 from hearthlog.analyzer.training.train import adapt_model, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
+from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.auros21.inputs import bands_of
@@ -38,6 +39,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.progress import ignore_progress
@@ -114,6 +116,36 @@ def test_adapting_an_adapted_model_begins_with_what_the_first_one_learned(method
     twice = adapt_model(once, few)
     for name, array in once.arrays.items():
         np.testing.assert_array_equal(array, twice.arrays[name])
+    temperatures = once.description.inverse_temperature, twice.description.inverse_temperature
+    assert temperatures[0] == temperatures[1] != base.description.inverse_temperature
+    assert twice.description.base_inverse_temperature == base.description.inverse_temperature
+
+
+def test_few_marks_bring_back_the_temperature_that_the_model_had_before_more_marks(world):
+    base, few, _ = world
+    adapted = adapt_model(adapt_model(base, few), rows(few, np.arange(len(few)) < 5))
+    assert adapted.description.inverse_temperature == base.description.inverse_temperature
+
+
+def test_an_adapted_model_has_what_the_first_one_learned_and_nothing_twice(world):
+    base, few, _ = world
+    adapted = adapt_model(base, few)
+    for ours, expected in zip(ROOM.remembered(adapted), ROOM.remembered(base), strict=True):
+        np.testing.assert_array_equal(ours, expected)
+    arrays = adapted.arrays
+    assert 0 < len(arrays["base_vectors"]) < 0.3 * len(base.arrays["support_vectors"])
+    assert 0 < (arrays["support_base"] < 0).sum() <= len(arrays["home_vectors"])
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_an_adapted_model_whose_vectors_are_numbered_wrongly_is_refused(world, twice, tmp_path):
+    base, few, _ = world
+    adapted = adapt_model(base, few)
+    numbers = adapted.arrays["support_base"].copy()
+    kept = np.flatnonzero(numbers >= 0)
+    numbers[kept[0]] = numbers[kept[1]] if twice else 1_000_000
+    with pytest.raises(ModelError, match="support_base has numbers that no vector of the base has"):
+        save_model(with_arrays(adapted, support_base=numbers), tmp_path / "x.safetensors")
 
 
 def test_a_class_the_home_has_not_is_not_forgotten(world):
@@ -192,6 +224,32 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     assert found[0].floor.all()
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
     assert data.weight.min() == 5.0
+
+
+def test_marks_that_contradict_the_floor_of_the_room_are_left_out_and_counted(
+    hearthlog, model_file, tmp_path
+):
+    """A fan at a steady level is the room after a minute, whatever a mark says."""
+    rng = np.random.default_rng(0)
+    sound = 0.01 * rng.standard_normal(100 * RATE)
+    sound[90 * RATE : 95 * RATE] *= 10.0
+    soundfile.write(tmp_path / "fan.wav", sound, RATE)
+    logs = tmp_path / "logs"
+    recording = hearthlog("record", tmp_path / "fan.wav", "-o", logs, "--start", "2026-03-01")
+    assert recording.returncode == 0, recording.stderr
+    labels = tmp_path / "labels.txt"
+    marks = ("70 80 speech", "82 88 coughing", "90 95 music", "96 99 silence")
+    labels.write_text("\n".join(mark.replace(" ", "\t") for mark in marks))
+    assert hearthlog("annotate", "import", find_logs(logs)[0], labels).returncode == 0
+    with pytest.warns(HearthlogWarning, match="^2 marks lie where nothing is louder than the"):
+        found = list(home_recordings(logs, gate=2.0))
+    assert [item.label for item in found] == ["music", "silence"]
+    assert [item.label for item in home_recordings(logs)] == [mark.split()[2] for mark in marks]
+    words = ("--base", model_file, "--home", logs, "-o", tmp_path / "home.safetensors")
+    trained = hearthlog("train", *words)
+    assert trained.returncode == 3
+    (line,) = [line for line in trained.stderr.splitlines() if "2 marks lie" in line]
+    assert f"the first is speech in {find_logs(logs)[0].name}: they are left out" in line
 
 
 def test_a_mark_by_another_name_is_learned_as_its_class(recorded):
@@ -431,6 +489,8 @@ def test_an_enrolled_sound_is_learned_from(hearthlog, model_file, tmp_path):
     (found,) = home_recordings(home)
     assert isinstance(found, Recording)
     assert (found.label, len(found.features)) == ("coughing", 60)
+    learned = prepare(ROOM, cut_recordings([found], BUILTIN["general"])).usable
+    assert learned.all()  # however steady it is: it was cut out of its room
     output = tmp_path / "home.safetensors"
     done = hearthlog("train", "--base", model_file, "--home", home, "-o", output)
     assert done.returncode == 0, done.stderr

@@ -57,7 +57,8 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     fitted = make_pipeline(StandardScaler(), machine).fit(
         statistics(data).astype(np.float64), data.target
     )
-    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp))
+    rows, numbers = unseen(classes)[:0], np.empty(0, np.intp)
+    learned = LearnedSvm(fitted, rows, numbers, rows, numbers)
     decision = learned.decide(unseen(classes), classes)
     expected = softmax(model.description.inverse_temperature * decision)
 

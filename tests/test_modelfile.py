@@ -308,6 +308,8 @@ def test_an_array_too_many_is_refused(tmp_path):
         ("gate", 2.0, "gate"),
         ("novelty", "magic", "novelty"),
         ("decision_bias", {"class_0": 1e999}, "decision_bias"),
+        ("decision_bias", {"class_9": 1.0}, "decision_bias has a class that it has not"),
+        ("base_inverse_temperature", 0.0, "base_inverse_temperature"),
         ("elsewhere", {}, "elsewhere"),
         ("window_seconds", 1e999, "window_seconds"),
         ("kind", "pickle", "kind"),
@@ -344,7 +346,9 @@ def test_a_description_that_makes_no_sense_is_refused_by_name(tmp_path, key, val
     assert reason in refusal(tmp_path, content(description() | {key: value}))
 
 
-@pytest.mark.parametrize("key", sorted(description().keys() - {"copies"}))
+@pytest.mark.parametrize(
+    "key", sorted(description().keys() - {"copies", "base_inverse_temperature"})
+)
 def test_nothing_of_the_description_may_be_missing(tmp_path, key):
     about = description()
     del about[key]

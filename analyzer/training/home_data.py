@@ -1,5 +1,6 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,14 +12,15 @@ from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
-from hearthlog.models.classes import translation
+from hearthlog.models.classes import SILENCE, class_name, translation
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.floor import FloorTracker
+from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker, is_quiet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.files import ENROLLED, find_logs
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -26,10 +28,13 @@ HOME_WEIGHT = 5.0  # of a segment of the home; others have 1
 HOME = "this home"
 
 
-def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Recording]:
+def home_recordings(
+    folder: Path, features: FeatureSet = DEFAULT, gate: float = 0.0
+) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
-    A mark shorter than a window is extended to one. All marks of a UTC day are of one group.
+    A mark shorter than a window is extended to one. All marks of a UTC day are of one group. An
+    enrolled sound is without a room, unless it is silence.
 
     Parameters
     ----------
@@ -37,6 +42,9 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
         Folder of logs, with review layers beside them, and of enrolled sounds.
     features : FeatureSet, optional
         Marks in logs of another set give recordings without features.
+    gate : float
+        A mark in which nothing is so many dB above the floor of the room is left out, unless it is
+        silence; a `HearthlogWarning` counts them. 0 for none.
 
     Yields
     ------
@@ -51,7 +59,7 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
         If there are marks, and all of them are in logs of other sets.
     """
     others: Counter[str] = Counter()  # sets of logs that are not of this one
-    usable = False
+    usable, quiet = False, list[str]()
     for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
         if not marks:
@@ -67,7 +75,19 @@ def home_recordings(folder: Path, features: FeatureSet = DEFAULT) -> Iterator[Re
                 usable = True
             else:
                 others[_set_of(log, mark.microphone)] += 1
-            yield from _recordings(columns[name], floors[name], mark, features)
+            silence = class_name(mark.label) == SILENCE
+            floor = floors[name] if silence or ENROLLED not in log.parts else None
+            pieces = list(_recordings(columns[name], floor, mark, features))
+            if gate and not silence and all(_is_quiet(piece, features, gate) for piece in pieces):
+                quiet.append(f"{mark.label} in {log.name}")
+            else:
+                yield from pieces
+    if quiet:
+        text = (
+            f"{len(quiet)} marks lie where nothing is louder than the floor of the room, the first "
+            f"is {quiet[0]}: they are left out; mark what can be heard, or mark it as silence"
+        )
+        warnings.warn(HearthlogWarning(text, folder), stacklevel=2)
     if others and not usable:
         name, _ = others.most_common(1)[0]
         raise DataError(
@@ -135,6 +155,16 @@ def _floors(recorded: Columns, features: FeatureSet) -> Float64 | None:
         tracked = FloorTracker()(powers, int(frames[piece[0]])).powers
         floors[piece[len(piece) - len(tracked) :]] = tracked
     return floors
+
+
+def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
+    """Tell whether no window of 0.4 s is above the floor of the room."""
+    windows = len(recording.features) - BLOCK_FRAMES + 1
+    if recording.floor is None or features.band_powers is None or windows < 1:
+        return recording.floor is not None
+    floors = np.tile(recording.floor, (windows, 1))
+    powers = features.band_powers(recording.features)
+    return bool(is_quiet(powers, floors, BLOCK_FRAMES, gate).all())
 
 
 def _is_of(recorded: Columns, features: FeatureSet) -> bool:

@@ -222,20 +222,23 @@ class Method(ABC):
         del base
         return None
 
-    def memory(self, remembered: tuple[Float32, Indices]) -> dict[str, NDArray[Any]]:
-        """Return arrays by which an adapted model gives `remembered` again.
+    def memory(
+        self, remembered: tuple[Float32, Indices], learned: Learned
+    ) -> dict[str, NDArray[Any]]:
+        """Return arrays by which a model that was learned from `remembered` gives it again.
 
         Parameters
         ----------
         remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
             As of the method.
+        learned : Learned
 
         Returns
         -------
         dict of str to np.ndarray
             By name of the array.
         """
-        del remembered
+        del remembered, learned
         return {}
 
     def as_of(self, description: Description) -> Self:

@@ -13,7 +13,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.method import NO_HOME, Examples, Method
+from hearthlog.analyzer.training.method import NO_HOME, Examples, Learned, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
@@ -68,10 +68,12 @@ class SvmMethod(Method):
             unchanged, they get votes of their own.
         """
         inputs, target, weight = examples.windows(seen)
+        remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
         if len(inputs) > MOST_WINDOWS:
             kept = np.random.default_rng(_SEED).permutation(len(inputs))
             kept = kept[np.argsort(-weight[kept], kind="stable")][:MOST_WINDOWS]
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
+            remembered = remembered[kept]
         machine = SVC(
             C=self.cost,
             gamma=self.gamma / inputs.shape[1],
@@ -81,7 +83,13 @@ class SvmMethod(Method):
         fitted = make_pipeline(StandardScaler(), machine).fit(
             inputs.astype(np.float64), target, svc__sample_weight=weight
         )
-        return LearnedSvm(fitted, *_home_windows(examples, home))
+        support = machine.support_
+        return LearnedSvm(
+            fitted,
+            inputs[support],
+            np.maximum(remembered[support], -1),
+            *_home_windows(examples, home),
+        )
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with another cost or gamma.
@@ -108,14 +116,11 @@ class SvmMethod(Method):
             for cost, gamma in product(_COST_TIMES, _GAMMA_TIMES)
         ]
 
-    def memory(self, remembered: tuple[Float32, Indices]) -> dict[str, NDArray[Any]]:
-        """Return arrays by which an adapted model gives `remembered` again."""
-        return {"base_vectors": remembered[0], "base_target": remembered[1].astype(np.int64)}
-
     def remembered(self, base: Model) -> tuple[Float32, Indices] | None:
         """Return the support vectors, from which the same machine would be learned again.
 
-        Copies in other rooms are among them, which the training windows of a model lack.
+        Those of a model that was adapted are those of its own base. Copies in other rooms are among
+        them, which the training windows of a model lack.
 
         Parameters
         ----------
@@ -128,10 +133,38 @@ class SvmMethod(Method):
         """
         if not self.rooms:
             return None
-        if "base_vectors" in base.arrays:
-            return base.arrays["base_vectors"], base.arrays["base_target"]
-        counts = base.arrays["support_counts"]
-        return base.arrays["support_vectors"], np.repeat(np.arange(len(counts)), counts)
+        arrays, support = base.arrays, base.arrays["support_vectors"]
+        if "base_target" not in arrays:
+            counts = arrays["support_counts"]
+            return support, np.repeat(np.arange(len(counts)), counts)
+        rows, target = arrays["support_base"], arrays["base_target"]
+        inputs = np.empty((len(target), support.shape[1]), np.float32)
+        inputs[rows[rows >= 0]] = support[rows >= 0]
+        inputs[np.setdiff1d(np.arange(len(target)), rows)] = arrays["base_vectors"]
+        return inputs, target
+
+    def memory(
+        self, remembered: tuple[Float32, Indices], learned: Learned
+    ) -> dict[str, NDArray[Any]]:
+        """Return arrays by which a model that was learned from `remembered` gives it again.
+
+        Parameters
+        ----------
+        remembered : (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
+        learned : LearnedSvm
+
+        Returns
+        -------
+        dict of str to np.ndarray
+            By name of the array.
+        """
+        assert isinstance(learned, LearnedSvm)
+        inputs, target = remembered
+        return {
+            "base_target": target.astype(np.int64),
+            "support_base": learned.remembered.astype(np.int64),
+            "base_vectors": inputs[np.setdiff1d(np.arange(len(inputs)), learned.remembered)],
+        }
 
     def as_of(self, description: Description) -> Self:
         """Return this method with cost, gamma and number of copies of a model.
@@ -164,14 +197,27 @@ class LearnedSvm:
     ----------
     machine : sklearn.pipeline.Pipeline
         A scaler and an `SVC`.
+    support : np.ndarray [shape=(n, width)], float32
+        Inputs that became support vectors, in the order of the `SVC`.
+    remembered : np.ndarray [shape=(n,)], intp
+        Their places in `Examples.more_inputs`; -1 for those of segments.
     home : np.ndarray [shape=(h, width)], float32
         Inputs of the home's segments.
     home_target : np.ndarray [shape=(h,)], intp
         Their classes.
     """
 
-    def __init__(self, machine: Pipeline, home: Float32, home_target: Indices) -> None:
+    def __init__(
+        self,
+        machine: Pipeline,
+        support: Float32,
+        remembered: Indices,
+        home: Float32,
+        home_target: Indices,
+    ) -> None:
         self.machine = machine
+        self.remembered = remembered
+        self._support = support
         self._home = home
         self._home_target = home_target
 
@@ -210,12 +256,10 @@ class LearnedSvm:
         scaler, svc = self.machine
         # scikit-learn inverts the sign if there are two classes only; the file does not.
         sign = -1.0 if len(svc.classes_) == 2 else 1.0
-        # The file keeps support vectors as they were before scaling, in float32.
-        support = svc.support_vectors_ * scaler.scale_ + scaler.mean_
         arrays = {
             "scaler_mean": scaler.mean_,
             "scaler_scale": scaler.scale_,
-            "support_vectors": support.astype(np.float32),
+            "support_vectors": self._support,
             "support_counts": svc.n_support_.astype(np.int64),
             "dual_coefficients": sign * svc.dual_coef_,
             "intercepts": sign * svc.intercept_,

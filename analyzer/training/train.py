@@ -6,7 +6,6 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
 from sklearn.model_selection import StratifiedGroupKFold
 
@@ -143,9 +142,10 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     Returns
     -------
     Model
-        With the parameters, transitions and metrics of `base`, which are those of other homes. Its
-        temperature is moved by parts of the home that were left out in turn. It keeps the windows
-        of `base` only, so that it can be adapted again to more of the home.
+        With the parameters, transitions and metrics of `base`, which are those of other homes.
+        Parts of the home that were left out in turn move the temperature that the model had before
+        it was ever adapted. It keeps the windows of `base` only, so that it can be adapted again to
+        more of the home.
 
     Raises
     ------
@@ -163,9 +163,8 @@ def adapt_model(base: Model, home: Dataset) -> Model:
             f"the home has no segments of a class of the model ({reasons or 'nothing is marked'})"
         )
     method = method_named(description.method).as_of(description)
-    memory: dict[str, NDArray[Any]] = {}
-    if (remembered := method.remembered(base)) is not None:
-        memory = method.memory(remembered)
+    remembered = method.remembered(base)
+    if remembered is not None:
         examples, others = prepare(method, home), 0
         examples = examples._replace(more_inputs=remembered[0], more_target=remembered[1])
     else:
@@ -173,7 +172,11 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         examples = prepare(method, joined)
     here = np.arange(others, others + len(home))
     learned = method.fit(examples, home=here)
-    inverse = _temperature_here(method, examples, here, description)
+    arrays = learned.arrays()
+    if remembered is not None:
+        arrays |= method.memory(remembered, learned)
+    before = description.base_inverse_temperature or description.inverse_temperature
+    inverse = _temperature_here(method, examples, here, description, before)
     smoothing = description.smoothing
     weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
     training = description.training_data.model_copy(
@@ -182,11 +185,12 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     update = {
         "training_data": training,
         "inverse_temperature": inverse,
+        "base_inverse_temperature": before,
         "smoothing": smoothing.model_copy(update={"weight": weight}),
     }
     return Model(
         description.model_copy(update=update),
-        learned.arrays() | memory,
+        arrays,
         transitions=base.transitions,
         training_windows=base.training_windows,
         training_floor=base.training_floor,
@@ -196,20 +200,18 @@ def adapt_model(base: Model, home: Dataset) -> Model:
 
 
 def _temperature_here(
-    method: Method, examples: Examples, home: Indices, description: Description
+    method: Method, examples: Examples, home: Indices, description: Description, before: float
 ) -> float:
     """Return the inverse temperature of a model adapted to a home, by parts of it left out."""
     if len(home) < _FEWEST_OF_HOME:
-        return description.inverse_temperature
+        return before
     everything = np.arange(len(examples.target))
     parts = np.array_split(home, MOST_FOLDS)
     folds = [(np.setdiff1d(everything, part), part) for part in parts]
     classes = description.classes
     [decisions] = cross_validate([method], examples, len(classes), folds, ignore_progress, home)
     bias = np.array([description.decision_bias.get(name, 0.0) for name in classes])
-    return home_temperature(
-        decisions[home] + bias, examples.target[home], description.inverse_temperature
-    )
+    return home_temperature(decisions[home] + bias, examples.target[home], before)
 
 
 def _joined(base: Model, home: Dataset) -> Dataset:

@@ -160,6 +160,8 @@ class Description(_Record):
         Number of augmented copies of each segment.
     inverse_temperature : float
         Factor of the decision values before the softmax, from calibration.
+    base_inverse_temperature : float or None
+        The one before the model was adapted to a home; None if it was not.
     decision_bias : dict of str to float
         What is added to the decision values of classes before.
     novelty : str
@@ -187,6 +189,7 @@ class Description(_Record):
     copies: _Count = 0
     calibration: Literal["temperature"]
     inverse_temperature: _Positive
+    base_inverse_temperature: _Positive | None = None
     decision_bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]]
     novelty: Literal["doubt", "machine"]
     elsewhere: Elsewhere | None

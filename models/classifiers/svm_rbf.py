@@ -49,10 +49,13 @@ class SvmKind(ClassifierKind):
         Inputs that a home has corrected, which draw similar inputs to their class.
     home_target : [shape=(h,)], int64, optional
         Classes of the home vectors.
-    base_vectors : [shape=(b, width)], float32, optional
-        Support vectors of the model that was adapted, from which it is adapted again.
     base_target : [shape=(b,)], int64, optional
-        Classes of the base vectors.
+        Classes of the support vectors of the model that was adapted, from which it is adapted
+        again.
+    support_base : [shape=(n,)], int64, optional
+        Which of these each support vector is, from 0 on; -1 for one of the home.
+    base_vectors : [shape=(m, width)], float32, optional
+        Those of them that are support vectors no more, in their order.
     """
 
     name = "svm-rbf"
@@ -68,8 +71,9 @@ class SvmKind(ClassifierKind):
     optional: Mapping[str, np.dtype[Any]] = {
         "home_vectors": np.dtype(np.float32),
         "home_target": np.dtype(np.int64),
-        "base_vectors": np.dtype(np.float32),
         "base_target": np.dtype(np.int64),
+        "support_base": np.dtype(np.int64),
+        "base_vectors": np.dtype(np.float32),
     }
 
     def shapes(
@@ -91,7 +95,7 @@ class SvmKind(ClassifierKind):
         """
         total, home, base = (
             len(arrays[name]) if name in arrays and arrays[name].ndim else 0
-            for name in ("support_vectors", "home_vectors", "base_vectors")
+            for name in ("support_vectors", "home_vectors", "base_target")
         )
         shapes: dict[str, tuple[int, ...]] = {
             "scaler_mean": (width,),
@@ -104,7 +108,9 @@ class SvmKind(ClassifierKind):
         if home:
             shapes["home_vectors"], shapes["home_target"] = (home, width), (home,)
         if base:
-            shapes["base_vectors"], shapes["base_target"] = (base, width), (base,)
+            shapes["base_target"], shapes["support_base"] = (base,), (total,)
+            kept = int(np.count_nonzero(arrays.get("support_base", np.empty(0)) >= 0))
+            shapes["base_vectors"] = (base - kept, width)
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
@@ -131,6 +137,10 @@ class SvmKind(ClassifierKind):
             target = arrays.get(name, counts[:0])
             if ((target < 0) | (target >= classes)).any():
                 return f"{name} has classes that the model has not"
+        rows = arrays.get("support_base", counts[:0])
+        kept = rows[rows >= 0]
+        if (kept >= len(arrays.get("base_target", kept))).any() or len(np.unique(kept)) < len(kept):
+            return "support_base has numbers that no vector of the base has, or one twice"
         return None
 
     def machine(self, model: Model) -> "SvmMachine":
@@ -142,13 +152,13 @@ class SvmKind(ClassifierKind):
         return f"{len(model.arrays['support_vectors'])} support vectors"
 
     def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return the support vectors and the home vectors, which are inputs of windows.
+        """Return the vectors that are inputs of windows: all of them.
 
         Returns
         -------
         sequence of np.ndarray [shape=(n, width)], float32
         """
-        names = ("support_vectors", "home_vectors")
+        names = ("support_vectors", "home_vectors", "base_vectors")
         return [model.arrays[name] for name in names if name in model.arrays]
 
 

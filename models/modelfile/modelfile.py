@@ -200,6 +200,8 @@ def _problem_of_classes(description: Description) -> str | None:
         return "names a class twice"
     if any(table.keys() != classes for table in tables):
         return "its scenario, training data and metrics are not all of its classes"
+    if not description.decision_bias.keys() <= classes:
+        return "its decision_bias has a class that it has not"
     if {len(confusion), *map(len, confusion)} != {len(classes)}:
         return "its confusion matrix does not fit its classes"
     return None

@@ -33,7 +33,8 @@ def measure(work: Workload) -> Table:
     rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
     machine[-1].decision_function_shape = "ovo"
-    learned = LearnedSvm(machine, rows[:0], np.empty(0, np.intp))
+    none = rows[:0], np.empty(0, np.intp)
+    learned = LearnedSvm(machine, *none, *none)
     decision = learned.decide(rows, len(work.model.classes))
     machine[-1].decision_function_shape = "ovr"
     expected = softmax(work.model.description.inverse_temperature * decision)

@@ -109,7 +109,7 @@ def _learned(
             "fewer than 5 sources have a label of no class, such as other_negative: the model will "
             "take every sound for one of its classes; add some to be told what is unknown"
         )
-    recordings = list(_home_recordings(home, method.features))
+    recordings = list(_home_recordings(home, method.features, method.gate))
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         segments = build_dataset(clips, chosen, report, recordings, method.features, method.rooms)
     _warn_of_few(segments)
@@ -127,7 +127,8 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
 
     model = adapted = load_model(base)
     features = feature_set(model.description.feature_set)
-    segments = cut_recordings(_home_recordings(home, features), scenario_of(model), features)
+    recordings = _home_recordings(home, features, model.description.gate)
+    segments = cut_recordings(recordings, scenario_of(model), features)
     what = f"learning from {len(segments)} segments of the home besides"
     if len(segments):
         with share_done(what, announce=True):
@@ -158,11 +159,13 @@ def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
         return adapt_transitions(model, sequences, sound)
 
 
-def _home_recordings(folders: list[Path], features: "FeatureSet") -> Iterator["Recording"]:
+def _home_recordings(
+    folders: list[Path], features: "FeatureSet", gate: float
+) -> Iterator["Recording"]:
     from hearthlog.analyzer.training.home_data import home_recordings
 
     for folder in folders:
-        yield from home_recordings(folder, features)
+        yield from home_recordings(folder, features, gate)
 
 
 def _warn_of_few(segments: "Dataset") -> None:
