@@ -16,7 +16,6 @@ from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.home_sound import read_home_sound
-from hearthlog.analyzer.training.calibration import inverse_temperature
 from hearthlog.analyzer.training.dataset import Recording, build_dataset, cut_recordings
 from hearthlog.analyzer.training.home_data import home_recordings, home_sequences
 from hearthlog.analyzer.training.home_transitions import adapt_transitions
@@ -463,14 +462,6 @@ def test_no_collection_is_like_a_home_if_all_are_small():
     data, _ = blobs(3, 30, features=BANDS.features)
     with pytest.raises(DataError, match="none can stand for a new home"):
         adaptation_curve(data, BANDS, ignore_progress)
-
-
-def test_the_temperature_makes_probabilities_as_sure_as_they_are_right():
-    rng = np.random.default_rng(0)
-    truth = softmax(rng.normal(0.0, 2.0, (20_000, 3)))
-    target = (truth.cumsum(axis=1) < rng.random((len(truth), 1))).sum(axis=1)
-    decisions = np.log(truth) / 3.0
-    assert inverse_temperature(decisions, target) == pytest.approx(3.0, rel=0.05)
 
 
 def test_segments_that_are_all_alike_are_refused():
