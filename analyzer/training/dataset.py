@@ -265,16 +265,9 @@ def cut_recordings(
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
     kept = _thinned(target * len(groups) + group_of, weight)
-    segments = [chosen[place] for place in kept.tolist()]
-    copies = max((len(segment.recording.copies) for segment in segments), default=0)
-    cut = [_versions(segment, features, copies) for segment in segments]
-    shape = (features.window_frames, features.width)
-    windows = np.array([windows for windows, _ in cut], np.float32)
-    floors = np.array([floors for _, floors in cut])
-    windows = windows.reshape(len(kept), 1 + copies, *shape).swapaxes(0, 1)
-    floors = floors.reshape(len(kept), 1 + copies, features.bands).swapaxes(0, 1)
+    windows, floors = _cut([chosen[place] for place in kept.tolist()], features)
     return Dataset(
-        windows=np.ascontiguousarray(windows[0]),
+        windows=windows[0],
         target=target[kept],
         group=group_of[kept],
         collection=collection_of[kept],
@@ -297,19 +290,24 @@ class _Chosen(NamedTuple):
     start: int
 
 
-def _versions(
-    segment: _Chosen, features: FeatureSet, copies: int
-) -> tuple[list[Float32], list[Float64]]:
-    """Return a segment, then in other rooms, and the floors; NaN for what it has not."""
-    recording, start = segment
-    absent = np.full((features.window_frames, features.width), np.nan, np.float32)
-    floors = [np.zeros(features.bands) if recording.floor is None else recording.floor]
-    windows = [recording.features[start : start + features.window_frames]]
-    for copy in recording.copies:
-        windows.append(copy.features[start : start + features.window_frames])
-        floors.append(copy.floor)
-    lacking = copies - len(recording.copies)
-    return windows + [absent] * lacking, floors + [np.zeros(features.bands)] * lacking
+def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Float64]:
+    """Return the features of segments, as they are and in other rooms, and the floors.
+
+    Their shapes are (1 + k, n, window_frames, d) and (1 + k, n, b); NaN for a copy that a segment
+    has not.
+    """
+    count = 1 + max((len(segment.recording.copies) for segment in segments), default=0)
+    shape = (count, len(segments), features.window_frames, features.width)
+    windows = np.full(shape, np.nan, np.float32)
+    floors = np.zeros((count, len(segments), features.bands))
+    for number, (recording, start) in enumerate(segments):
+        frames = slice(start, start + features.window_frames)
+        windows[0, number] = recording.features[frames]
+        if recording.floor is not None:
+            floors[0, number] = recording.floor
+        for place, copy in enumerate(recording.copies, 1):
+            windows[place, number], floors[place, number] = copy.features[frames], copy.floor
+    return windows, floors
 
 
 def clip_frames(clip: LabelledClip) -> Float32:
