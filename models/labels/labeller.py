@@ -150,8 +150,7 @@ class Labeller:
                 self._floors_converged = True
                 self.segmenter.forget()
         inputs, window = self._advance(features, powers, stamps)
-        probabilities, novelty = self._classifier.classify(inputs)
-        self._silence_quiet(probabilities, novelty, window, powers)
+        probabilities, novelty = self._classify(inputs, window, powers)
         count, spoken = len(inputs), self.timing.label_frame
         first = first + len(features) - count - self.timing.delay
         labelled = LabelledFrames(
@@ -211,18 +210,20 @@ class Labeller:
         )
         return self._inputs(features, floors), frames
 
-    def _silence_quiet(
-        self, probabilities: Float32, novelty: Float32, window: "_Frames", floors: Float64 | None
-    ) -> None:
-        """Make windows silent that are not above the floor by the gate of the model."""
+    def _classify(
+        self, inputs: Float32, window: "_Frames", floors: Float64 | None
+    ) -> tuple[Float32, Float32]:
+        """Classify windows; those that are not above the floor by the gate are silence."""
         gate, powers = self._classifier.gate, self._classifier.feature_set.band_powers
-        if not gate or floors is None or powers is None or not len(probabilities):
-            return
-        silence = self.classes.index(SILENCE)
-        floors = floors[len(floors) - len(probabilities) :]
+        if not gate or floors is None or powers is None or not len(inputs):
+            return self._classifier.classify(inputs)
+        floors = floors[len(floors) - len(inputs) :]
         quiet = is_quiet(powers(window.features), floors, self.timing.window_frames, gate)
-        probabilities[quiet] = novelty[quiet] = 0.0
-        probabilities[quiet, silence] = 1.0
+        probabilities = np.zeros((len(inputs), len(self.classes)), np.float32)
+        novelty = np.zeros(len(inputs), np.float32)
+        probabilities[quiet, self.classes.index(SILENCE)] = 1.0
+        probabilities[~quiet], novelty[~quiet] = self._classifier.classify(inputs[~quiet])
+        return probabilities, novelty
 
 
 class _Frames(NamedTuple):
