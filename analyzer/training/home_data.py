@@ -1,7 +1,6 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
 import warnings
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -58,7 +57,7 @@ def home_recordings(
     DataError
         If there are marks, and all of them are in logs of other sets.
     """
-    others: Counter[str] = Counter()  # sets of logs that are not of this one
+    other: tuple[Path, str] | None = None  # log and microphone of another set
     usable, quiet = False, list[str]()
     for log in find_logs(folder, enrolled=True):
         marks = read_marks(log)
@@ -74,7 +73,7 @@ def home_recordings(
             if _is_of(columns[name], features):
                 usable = True
             else:
-                others[_set_of(log, mark.microphone)] += 1
+                other = log, mark.microphone
             silence = class_name(mark.label) == SILENCE
             floor = floors[name] if silence or ENROLLED not in log.parts else None
             pieces = list(_recordings(columns[name], floor, mark, features))
@@ -88,8 +87,8 @@ def home_recordings(
             f"is {quiet[0]}: they are left out; mark what can be heard, or mark it as silence"
         )
         warnings.warn(HearthlogWarning(text, folder), stacklevel=2)
-    if others and not usable:
-        name, _ = others.most_common(1)[0]
+    if other is not None and not usable:
+        name = _set_of(*other)
         raise DataError(
             f"{folder}: what is marked there has features of set {name}, and {features.name} is "
             f"needed: {models_for(name)}"
