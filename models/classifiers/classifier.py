@@ -35,6 +35,8 @@ class Classifier:
     smoothing : Smoothing
     transitions : np.ndarray [shape=(C, C)], float64
         Those of the model.
+    calibrated_elsewhere : bool
+        Whether probabilities hold in homes of which nothing was learned.
 
     Raises
     ------
@@ -51,6 +53,8 @@ class Classifier:
         self.gate = description.gate
         self.smoothing = description.smoothing
         self.transitions = model.transitions
+        of_home = any(one.segments for one in description.training_data.home.values())
+        self.calibrated_elsewhere = description.elsewhere is not None and not of_home
         self._inverse_temperature = description.inverse_temperature
         self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
         self._doubts = description.novelty == "doubt"

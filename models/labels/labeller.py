@@ -30,6 +30,8 @@ class FrameLabels(NamedTuple):
     probabilities : np.ndarray [shape=(n, C)], float32
     novelty : np.ndarray [shape=(n,)], float32
         From 0 to 1; NaN where the classifier has none.
+    calibrated_elsewhere : bool
+        As of the classifier.
     """
 
     classes: tuple[str, ...]
@@ -38,6 +40,7 @@ class FrameLabels(NamedTuple):
     known_at: Int64
     probabilities: Float32
     novelty: Float32
+    calibrated_elsewhere: bool
 
     def columns(self, microphone: str) -> dict[str, Column]:
         """Return the fields of one `AudioLabel` for each frame.
@@ -167,6 +170,7 @@ class Labeller:
             labelled.known_at[again:],
             probabilities[again:],
             novelty[again:],
+            self._classifier.calibrated_elsewhere,
         )
         labelled = labelled.part(slice(max(self._first_segment - first, 0), None))
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []

@@ -14,10 +14,11 @@ from hearthlog.schemas.arrays import Bool, Float32, Int16, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 
-# Probability of speech in a second of sound: measured, see docs/recorder.md.
-PRIVATE_LIMIT = 0.02
-UNSURE_CONFIDENCE = 0.5
-UNSURE_NOVELTY = 0.7
+# Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
+# probabilities hold for people whom they were not learned from.
+PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.1
+_UNSURE_CONFIDENCE = 0.5
+_UNSURE_NOVELTY = 0.7
 _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 _BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
 
@@ -76,7 +77,7 @@ class ClipFinder:
         self._next = -1
         self._samples: Int16 = np.empty((0, FRAME_SAMPLES), np.int16)
         self._stamps: Int64 = np.empty(0, np.int64)
-        self._private: Float32 = self._unlabelled(_AFTER_FRAMES)
+        self._private: Bool = self._unlabelled(_AFTER_FRAMES)
         self._worth: Bool = np.zeros(_AFTER_FRAMES, bool)
 
     def push(self, frames: Frames, labels: FrameLabels | None) -> list[KeptSound]:
@@ -126,20 +127,23 @@ class ClipFinder:
         self._private = np.append(self._private, private)
         self._worth = np.append(self._worth, worth)
 
-    def _judge(self, labels: FrameLabels) -> tuple[Float32, Bool]:
-        """Return how likely each window is private, and whether it is worth keeping."""
-        probabilities = labels.probabilities
+    def _judge(self, labels: FrameLabels) -> tuple[Bool, Bool]:
+        """Return whether each window may be private, and whether it is worth keeping."""
+        probabilities, elsewhere = labels.probabilities, labels.calibrated_elsewhere
         never = [labels.classes.index(name) for name in self._never]
-        private = probabilities[:, never].max(axis=1, initial=0.0)
+        limit = PRIVATE_LIMIT_ELSEWHERE if elsewhere else PRIVATE_LIMIT
+        private = np.any(~(probabilities[:, never] < limit), axis=1)  # as NaN is
         if self._keep == "unsure":
-            sure = probabilities.max(axis=1) >= UNSURE_CONFIDENCE
-            return private, ~sure | (labels.novelty > UNSURE_NOVELTY)
+            unsure = labels.novelty > _UNSURE_NOVELTY
+            if not elsewhere:
+                unsure |= probabilities.max(axis=1) < _UNSURE_CONFIDENCE
+            return private, unsure
         loud = np.array([class_name(name) != SILENCE for name in labels.classes])
         return private, loud[probabilities.argmax(axis=1)]
 
-    def _unlabelled(self, count: int) -> Float32:
-        """Return how private frames without a label are: entirely, unless nothing is private."""
-        return np.full(count, np.inf if self._never else 0.0, np.float32)
+    def _unlabelled(self, count: int) -> Bool:
+        """Return whether frames without a label may be private: unless nothing is."""
+        return np.full(count, bool(self._never))
 
     def _decide(self, count: int) -> list[KeptSound]:
         """Decide on the first frames that are held."""
@@ -147,7 +151,7 @@ class ClipFinder:
             return []
         span = _BEHIND_FRAMES + self._window
         private = self._private[_AFTER_FRAMES - _BEHIND_FRAMES :][: count + span - 1]
-        kept = sliding_window_view(private, span).max(axis=1) < PRIVATE_LIMIT
+        kept = ~sliding_window_view(private, span).any(axis=1)
         if self._keep != "always":
             around = self._worth[: _AFTER_FRAMES + count + self._before]
             kept &= sliding_window_view(around, _AFTER_FRAMES + self._before + 1).any(axis=1)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, time, timedelta
 from pathlib import Path
 
-from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, KeptSound
+from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE, KeptSound
 from hearthlog.recorder.clips.clip_retention import find_clips
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, WARNING, Notice
@@ -178,6 +178,7 @@ class ClipWriter:
             keep_audio=self._settings.keep_audio,
             never_keep=json.dumps(self._settings.never_keep),
             limit=str(PRIVATE_LIMIT),
+            limit_elsewhere=str(PRIVATE_LIMIT_ELSEWHERE),
         )
 
     def _full(self, stamp: int, frames: int) -> str:
