@@ -12,7 +12,7 @@ LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real cli
 REACH_SECONDS = 0.3
 SHORTEST_SECONDS = 0.25
 
-_SOUND_AFTER_SOUND = 0.02  # times as likely as it were if all classes were equally likely
+_SOUND_AFTER_SOUND = 0.007  # times as likely as it were if all classes were equally likely
 _SECONDS = 10.0  # expected duration of a class that is not in the table of classes
 
 
