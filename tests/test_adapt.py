@@ -218,8 +218,8 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     assert found[0].group == found[1].group
     floors = FloorTracker()(DEFAULT.band_powers(heard["values"]), int(heard["frame"][0])).powers
     behind = len(floors) - len(stamps)  # from the end of the mark on, as the recorder tracked it
-    np.testing.assert_array_equal(found[0].floor, floors[behind + 159])
-    np.testing.assert_array_equal(found[1].floor, floors[behind + 312])
+    np.testing.assert_array_equal(found[0].floor, floors[behind + 100 : behind + 160])
+    np.testing.assert_array_equal(found[1].floor, floors[behind + 293 : behind + 313])
     assert found[0].floor.all()
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
     assert data.weight.min() == 5.0
@@ -249,6 +249,24 @@ def test_marks_that_contradict_the_floor_of_the_room_are_left_out_and_counted(
     assert trained.returncode == 3
     (line,) = [line for line in trained.stderr.splitlines() if "2 marks lie" in line]
     assert f"the first is speech in {find_logs(logs)[0].name}: they are left out" in line
+
+
+def test_the_floor_at_a_mark_is_that_of_a_recorder_that_did_not_begin_with_its_log(day, tmp_path):
+    settings = Settings(output=tmp_path, max_bag_duration=60)
+    record(settings, settings.microphone[0], FileSource([day], 1_772_348_400 * 10**9), Event())
+    logs = find_logs(tmp_path)
+    whole = read_columns(logs, ["/mic/features"])["/mic/features"]
+    stamps = whole["header.stamp"]
+    floors = FloorTracker()(DEFAULT.band_powers(whole["values"]), 0).powers
+    second = int(np.searchsorted(stamps, 1_772_348_460 * 10**9))
+    begin, end = int(stamps[second + 10]), int(stamps[second + 50])
+    layer = write_marks(logs[1], [Mark("mic", begin, end, "silence")])
+    try:
+        (found,) = home_recordings(tmp_path)
+    finally:
+        layer.unlink()
+    behind = len(floors) - len(stamps) + second
+    np.testing.assert_array_equal(found.floor, floors[behind + 10 : behind + 50])
 
 
 def test_a_mark_by_another_name_is_learned_as_its_class(recorded):

@@ -14,6 +14,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
+from hearthlog.analyzer.training.svm_method import ROOM
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
@@ -210,7 +211,9 @@ def test_metrics_agree_with_each_other_and_with_the_data():
 def test_labels_without_meaning_are_recognised_at_chance():
     data, scenario = blobs(2, 60)
     noise = np.random.default_rng(2).random(data.windows.shape, np.float32)
-    model = train_model(dataclasses.replace(data, windows=noise), scenario, ignore_progress)
+    noise = dataclasses.replace(data, windows=noise)
+    costly = ROOM.with_parameters({"cost": 4.0})
+    model = train_model(noise, scenario, ignore_progress, costly)
     assert model.description.metrics.macro_f1 < 0.62
     assert model.description.smoothing.weight == 10.0  # so unsure that it is bounded
 

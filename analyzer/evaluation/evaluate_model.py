@@ -198,7 +198,7 @@ class _Listener:
         features = self._classifier.feature_set
         if not features.bands:
             return None
-        floor = np.zeros(features.bands) if recording.floor is None else recording.floor
+        floor = np.zeros(features.bands) if recording.floor is None else recording.floor[-1]
         return Floors(np.tile(floor, (frames, 1)), converged=True)
 
     def detections(self) -> Detections:

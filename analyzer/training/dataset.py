@@ -41,8 +41,8 @@ class Recording(NamedTuple):
         Features of successive frames.
     weight : float
         Weight of its segments.
-    floor : np.ndarray [shape=(b,)], float64, or None
-        Floor of the room; None for none, as in a clip that was cut out of it.
+    floor : np.ndarray [shape=(n, b)], float64, or None
+        Floor of the room at each frame; None for none, as in a clip that was cut out of it.
     copies : sequence of RoomCopy
         The same sound in other rooms.
     """
@@ -304,7 +304,7 @@ def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Fl
         frames = slice(start, start + features.window_frames)
         windows[0, number] = recording.features[frames]
         if recording.floor is not None:
-            floors[0, number] = recording.floor
+            floors[0, number] = recording.floor[frames][-1]
         for place, copy in enumerate(recording.copies, 1):
             windows[place, number], floors[place, number] = copy.features[frames], copy.floor
     return windows, floors
@@ -344,7 +344,8 @@ def _recording(
     silence = class_name(clip.label) == SILENCE
     if len(values) >= features.window_frames and features.band_powers is not None:
         copies = [in_room(frames, features, rng, silence=silence) for _ in range(rooms)]
-        floor = low_power(features.band_powers(values)) if silence else None
+        if silence:
+            floor = np.tile(low_power(features.band_powers(values)), (len(values), 1))
     return Recording(
         clip.label,
         clip.source_group,

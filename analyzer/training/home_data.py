@@ -1,13 +1,15 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
@@ -16,13 +18,14 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker, is_quiet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import ENROLLED, find_logs
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.times import NANOSECONDS
 
+_FIELDS = ("header.stamp", "frame", "values")
 HOME_WEIGHT = 5.0  # of a segment of the home; others have 1
 HOME = "this home"
 
@@ -64,8 +67,12 @@ def home_recordings(
         if not marks:
             continue
         topics = {topic(mark.microphone, "features") for mark in marks}
-        columns = read_columns([log], topics, fields={"header.stamp", "frame", "values"})
-        floors = {name: _floors(recorded, features) for name, recorded in columns.items()}
+        columns = read_columns([log], topics, fields=_FIELDS)
+        earlier = _columns_before(log, topics)
+        floors = {
+            name: _floors(recorded, earlier.get(name), features)
+            for name, recorded in columns.items()
+        }
         for mark in marks:
             name = topic(mark.microphone, "features")
             if name not in columns or not len(columns[name]):
@@ -142,18 +149,32 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
     return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
-def _floors(recorded: Columns, features: FeatureSet) -> Float64 | None:
-    """Return the floor of the room at each frame of a log, as a recorder tracks it."""
+def _columns_before(log: Path, topics: Collection[str]) -> dict[str, Columns]:
+    """Read the log before another one, if there is one and it can be read."""
+    with suppress(LogError):
+        for chain in find_chains([log]):
+            for place in chain.asked:
+                return read_columns(chain.logs[max(place - 1, 0) : place], topics, fields=_FIELDS)
+    return {}
+
+
+def _floors(recorded: Columns, earlier: Columns | None, features: FeatureSet) -> Float64 | None:
+    """Return the floor of the room at each frame of a log, as a recorder tracks it.
+
+    What was recorded earlier is tracked before it, as far as it leads up to the log.
+    """
     if features.band_powers is None or not _is_of(recorded, features) or not len(recorded):
         return None
-    frames = recorded["frame"].astype(np.int64)
+    frames, values = recorded["frame"].astype(np.int64), recorded["values"]
+    if earlier is not None and len(earlier) and _is_of(earlier, features):
+        frames = np.concatenate([earlier["frame"].astype(np.int64), frames])
+        values = np.concatenate([earlier["values"], values])
     floors = np.zeros((len(frames), features.bands))
     breaks = np.flatnonzero(np.diff(frames) != 1) + 1
     for piece in np.split(np.arange(len(frames)), breaks):
-        powers = features.band_powers(recorded["values"][piece])
-        tracked = FloorTracker()(powers, int(frames[piece[0]])).powers
+        tracked = FloorTracker()(features.band_powers(values[piece]), int(frames[piece[0]])).powers
         floors[piece[len(piece) - len(tracked) :]] = tracked
-    return floors
+    return floors[-len(recorded) :]
 
 
 def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
@@ -161,9 +182,8 @@ def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
     windows = len(recording.features) - BLOCK_FRAMES + 1
     if recording.floor is None or features.band_powers is None or windows < 1:
         return recording.floor is not None
-    floors = np.tile(recording.floor, (windows, 1))
     powers = features.band_powers(recording.features)
-    return bool(is_quiet(powers, floors, BLOCK_FRAMES, gate).all())
+    return bool(is_quiet(powers, recording.floor[-windows:], BLOCK_FRAMES, gate).all())
 
 
 def _is_of(recorded: Columns, features: FeatureSet) -> bool:
@@ -193,5 +213,5 @@ def _recordings(
     day = np.datetime64(mark.start // NANOSECONDS, "s").astype("datetime64[D]")
     breaks = np.flatnonzero(np.diff(frames[first:last]) != 1) + 1
     for piece in np.split(np.arange(first, last), breaks):
-        floor = None if floors is None or not len(piece) else floors[piece[-1]]
+        floor = None if floors is None else floors[piece]
         yield Recording(mark.label, f"{HOME} {day}", HOME, "", values[piece], HOME_WEIGHT, floor)
