@@ -1,7 +1,8 @@
 """What some corrected seconds of a new home are worth.
 
 A collection that the machine has never heard stands for the home: it is adapted to segments from
-half of the collection's groups, and tried on those of the other half.
+half of the collection's groups, and tried on those of the other half. Only classes count of which
+the home has ten segments from two groups.
 """
 
 from typing import Any, NamedTuple
@@ -15,13 +16,13 @@ from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.home_data import HOME_WEIGHT
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
+from hearthlog.models.classes import UNKNOWN
 from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.progress import Progress
 
 CORRECTED = (0, 10, 30, 60)  # segments
-_FEWEST_GROUPS = 8
 _FEWEST_CLASSES = 2
-_FEWEST_SEGMENTS = max(CORRECTED)  # to correct, and as many to be tried on
+_FEWEST_SEGMENTS = 10  # of a class
 _SHUFFLES = 3
 
 
@@ -29,7 +30,7 @@ class AdaptationCurve(NamedTuple):
     """Macro F1 against the number of corrected segments."""
 
     corrected: tuple[int, ...]
-    # of each collection that was left out, over the classes that it has
+    # of each collection that was left out, over the classes that count
     collections: dict[str, list[float]]
     mean: list[float]
 
@@ -57,14 +58,23 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
         augmented copies and its feature set has none.
     """
     names = data.collection_names
-    chosen = [number for number in range(len(names)) if _is_like_a_home(data, number)]
-    if not chosen:
+    homes = {number: _segments_of_home(data, number) for number in range(len(names))}
+    chosen = [
+        number
+        for number, rows in homes.items()
+        if len(np.unique(data.target[rows])) >= _FEWEST_CLASSES
+    ]
+    if not chosen or len(names) < 2:
         raise DataError(
-            f"no collection has {_FEWEST_CLASSES} classes, {_FEWEST_GROUPS} source groups and "
-            f"{2 * _FEWEST_SEGMENTS} segments: none can stand for a new home"
+            f"no collection beside another has {_FEWEST_CLASSES} classes with {_FEWEST_SEGMENTS} "
+            "segments from two source groups each: none can stand for a new home"
         )
     examples = prepare(method, data)
-    splits = [_split(data, number, shuffle) for number in chosen for shuffle in range(_SHUFFLES)]
+    splits = [
+        _split(data, number, homes[number], shuffle)
+        for number in chosen
+        for shuffle in range(_SHUFFLES)
+    ]
     calls = (delayed(_scores)(method, len(data.classes), split, *examples) for split in splits)
     scores = np.empty((len(splits), len(CORRECTED)))
     for place, row in enumerate(in_parallel(calls)):
@@ -75,13 +85,15 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
     return AdaptationCurve(CORRECTED, curves, each.mean(axis=0).tolist())
 
 
-def _is_like_a_home(data: Dataset, number: int) -> bool:
+def _segments_of_home(data: Dataset, number: int) -> Indices:
+    """Return the segments of a collection whose classes count; `unknown` is no class to correct."""
     inside = data.collection == number
-    return (
-        len(np.unique(data.target[inside])) >= _FEWEST_CLASSES
-        and len(np.unique(data.group[inside])) >= _FEWEST_GROUPS
-        and inside.sum() >= 2 * _FEWEST_SEGMENTS
-    )
+    counts = np.bincount(data.target[inside], minlength=len(data.classes))
+    pairs = np.unique(np.stack([data.target[inside], data.group[inside]]), axis=1)
+    groups = np.bincount(pairs[0], minlength=len(data.classes))
+    known = np.array([name != UNKNOWN for name in data.classes])
+    counted = known & (counts >= _FEWEST_SEGMENTS) & (groups >= 2)
+    return np.flatnonzero(inside & counted[data.target])
 
 
 class _Split(NamedTuple):
@@ -92,14 +104,14 @@ class _Split(NamedTuple):
     test: Indices
 
 
-def _split(data: Dataset, number: int, shuffle: int) -> _Split:
+def _split(data: Dataset, number: int, rows: Indices, shuffle: int) -> _Split:
     rng = np.random.default_rng(shuffle)
     inside = data.collection == number
-    groups = rng.permutation(np.unique(data.group[inside]))
-    mine = np.isin(data.group, groups[: len(groups) // 2])
-    pool = _turn_about(np.flatnonzero(inside & mine), data.target, rng)
-    others = np.flatnonzero(~inside & ~np.isin(data.group, groups))
-    return _Split(others, pool, np.flatnonzero(inside & ~mine))
+    groups = rng.permutation(np.unique(data.group[rows]))
+    mine = np.isin(data.group[rows], groups[: len(groups) // 2])
+    pool = _turn_about(rows[mine], data.target, rng)
+    others = np.flatnonzero(~inside & ~np.isin(data.group, data.group[inside]))
+    return _Split(others, pool, rows[~mine])
 
 
 def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[float]:
