@@ -285,8 +285,8 @@ ROOM = SvmMethod(
     copies=0,
     rooms=3,
     gate=2.0,
-    observation_weight=0.5,
-    cost=0.5,  # with 4 sounds of few sources, a shower, are hardly ever recognised
+    observation_weight=0.45,
+    cost=1.0,  # with 4 sounds of few sources, a shower, are hardly ever recognised
     gamma=0.5,
 )
 ROOM21 = replace(ROOM, name="room21", feature_set="auros21")
