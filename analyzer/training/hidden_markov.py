@@ -3,6 +3,7 @@
 hmmlearn has no wheel for Python 3.14 yet; nothing but this module needs it.
 """
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -76,7 +77,9 @@ def learn_transitions(sound: Sequence[Float32], counts: Float64, weight: float) 
     model.startprob_prior = 1.0
     model.transmat_ = transitions
     model.transmat_prior = 1.0 + counts
-    model.fit(np.concatenate(sound), [len(part) for part in sound])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # hmmlearn 0.3.3 with NumPy 2.5
+        model.fit(np.concatenate(sound), [len(part) for part in sound])
     return model.transmat_
 
 
