@@ -104,3 +104,15 @@ def test_a_class_that_other_collections_hardly_have_is_left_out():
     _, elsewhere = calibrate_elsewhere(decisions, data, collection_folds(data))
     assert elsewhere.segments == (~rare).sum()
     assert elsewhere.collections == 3
+
+
+def test_sounds_of_no_class_do_not_tell_how_sure_the_classes_are():
+    data = of_collections(60, [60, 60, 60])
+    data = replace(data, classes=("speech", "music", "unknown"))
+    decisions, target = decided(len(data), 2.0, classes=3)
+    data = replace(data, target=target)
+    unknown = target == 2
+    wrong = np.where(unknown[:, np.newaxis], [[9.0, 0.0, 0.0]], decisions)
+    expected = calibrate_elsewhere(decisions, data, collection_folds(data))
+    assert calibrate_elsewhere(wrong, data, collection_folds(data)) == expected
+    assert expected[1].segments == (~unknown).sum()
