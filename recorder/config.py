@@ -23,6 +23,7 @@ from hearthlog.schemas.messages.topics import check_microphone_name
 from hearthlog.schemas.storage.small_file import read_toml
 
 Keep = Literal["off", "events", "unsure", "always"]  # which sound is kept as clips
+NO_MODEL = Path("none")  # in place of a model file: there are no labels
 _PREFIX = "HEARTHLOG_"
 
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+from hearthlog.models.starter import GENERAL
 
 _LOOK_SECONDS = 1.0
 
@@ -31,7 +33,8 @@ class ModelWatch:
     Parameters
     ----------
     path : Path
-        A model file, or a symbolic link to one.
+        A model file, a symbolic link to one, or the name of a starter model. As long as there is no
+        file `DEFAULT_MODEL`, the starter model `general` labels in its place.
     requests : SimpleQueue
         An item makes the watch check at once, and report again what it has refused. Unlike an
         event, a queue can be used from a signal handler at any moment.
@@ -53,7 +56,8 @@ class ModelWatch:
         self._path = path
         self._requests = requests
         self._seen = _identity(path)  # before it is loaded: a later file is another one
-        self.first = _load(path)
+        self._starts_with_starter = path == DEFAULT_MODEL and self._seen is None
+        self.first = _load(Path(GENERAL) if self._starts_with_starter else path)
         self.ready: Loaded | None = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
@@ -88,7 +92,8 @@ class ModelWatch:
         while not self._closed.is_set():
             requested = self._wait()
             now = _identity(self._path)
-            if (now != self._seen or requested) and not self._closed.is_set():
+            nothing_yet = self._starts_with_starter and now is None and self._seen is None
+            if (now != self._seen or requested) and not (nothing_yet or self._closed.is_set()):
                 self._seen = now
                 self._look()
 

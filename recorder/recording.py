@@ -15,7 +15,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile.card import model_attachments
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
-from hearthlog.recorder.config import MicrophoneSettings, Settings
+from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
 from hearthlog.recorder.log import LogDescription, RollingLog
@@ -161,7 +161,7 @@ def record(
     """
     with ExitStack() as stack:
         watch = None
-        if settings.model is not None:
+        if settings.model is not None and settings.model != NO_MODEL:
             watch = ModelWatch(settings.model, reload_requests or SimpleQueue())
             stack.enter_context(closing(watch))
         recording = RecordingSession(settings, microphone.name, source.device, watch)

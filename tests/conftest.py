@@ -44,6 +44,7 @@ __all__ = [
 
 _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 _CLIPS = Path(__file__).parent / "data" / "household"
+os.environ["HEARTHLOG_MODEL"] = "none"  # unless a test names one
 HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
 
 

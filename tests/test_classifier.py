@@ -13,7 +13,7 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.training.method import softmax
-from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
+from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm, rounded
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
@@ -55,7 +55,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
         decision_function_shape="ovo",
     )
     fitted = make_pipeline(StandardScaler(), machine).fit(
-        statistics(data).astype(np.float64), data.target
+        rounded(statistics(data)).astype(np.float64), data.target
     )
     rows, numbers = unseen(classes)[:0], np.empty(0, np.intp)
     learned = LearnedSvm(fitted, rows, numbers, rows, numbers)

@@ -242,7 +242,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, name, change):
     elif change == "another shape":
         arrays[name] = np.concatenate([arrays[name], arrays[name]])
     elif change == "another type":
-        arrays[name] = arrays[name].astype(np.float16)
+        arrays[name] = arrays[name].astype(np.int8)
     else:
         arrays[name] = np.zeros((), arrays[name].dtype)
     refusal(tmp_path, content(arrays=arrays))
@@ -290,6 +290,19 @@ def test_a_description_beyond_reason_is_not_parsed(tmp_path):
     assert "header" in refusal(tmp_path, save(load(model_bytes()), {"hearthlog": text}))
 
 
+def test_an_array_that_half_precision_can_hold_takes_half_the_room(tmp_path):
+    arrays = load(model_bytes())
+    exact = arrays["support_vectors"].astype(np.float16)
+    path = tmp_path / "half.safetensors"
+    path.write_bytes(content(arrays=arrays | {"support_vectors": exact}))
+    model = load_model(path)
+    np.testing.assert_array_equal(model.arrays["support_vectors"], exact.astype(np.float32))
+    assert model.arrays["support_vectors"].dtype == np.float32
+    again = tmp_path / "again.safetensors"
+    save_model(model, again)
+    assert load(again.read_bytes())["support_vectors"].dtype == np.float16
+
+
 def test_an_array_too_many_is_refused(tmp_path):
     arrays = load(model_bytes())
     refusal(tmp_path, content(arrays=arrays | {"extra\n\x1b[2J": np.zeros(1)}))
@@ -299,7 +312,7 @@ def test_an_array_too_many_is_refused(tmp_path):
     ("key", "value", "reason"),
     [
         ("format", 1, "format"),
-        ("format", 5, "format 5, newer"),
+        ("format", 6, "format 6, newer"),
         ("format", "1", "format"),
         ("format", [3], "format"),
         ("label_frame", 8, "label_frame"),
@@ -374,7 +387,7 @@ def older(number, **changed):
 @pytest.mark.parametrize("seconds", [1.0, 1])
 def test_a_label_of_an_older_model_speaks_of_the_last_frame_of_its_second(number, seconds):
     about = read_description(older(number, window_seconds=seconds))
-    assert (about.format, about.label_frame, about.gate) == (4, 19, 0.0)
+    assert (about.format, about.label_frame, about.gate) == (5, 19, 0.0)
     assert label_timing(about) == LabelTiming(20, 19, needs_floor=False)
     assert label_timing(about).delay == 0
     assert (about.novelty, about.decision_bias, about.elsewhere) == ("machine", {}, None)

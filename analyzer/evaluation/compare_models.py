@@ -4,11 +4,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.evaluate_model import check_classes, segment_probabilities
-from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
+from hearthlog.analyzer.training.dataset import Recording, cut_recordings
+from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import (
     F1Difference,
@@ -18,7 +18,6 @@ from hearthlog.analyzer.training.scores import (
     score,
 )
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64
@@ -101,7 +100,7 @@ def compare_models(
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
         raise DataError(f"there is no segment to compare on ({reasons[:300] or 'no marks'})")
     inputs = [of_segments(one.inputs, data.windows, data.floor) for one in (first, second)]
-    sources = [_learned_sources(m, i, data) for m, i in zip((a, b), inputs, strict=True)]
+    sources = [learned_groups(model, data) for model in (a, b)]
     learned = np.isin(data.group, np.concatenate(sources))
     kept = np.ones(len(data), bool) if learned.all() else ~learned
     target, group = data.target[kept], data.group[kept]
@@ -132,22 +131,3 @@ def compare_models(
 def _probabilities(classifier: Classifier, inputs: Float32, classes: Sequence[str]) -> Float64:
     order = [classifier.classes.index(name) for name in classes]
     return segment_probabilities(classifier, inputs)[:, order]
-
-
-def _learned_sources(model: Model, inputs: Float32, data: Dataset) -> NDArray[np.intp]:
-    """Return the groups that a model has learned from: of which it has kept a segment."""
-    kept_inputs = classifier_kind(model.description.kind).kept_inputs(model)
-    learned = np.zeros(len(data), bool)
-    for kept in kept_inputs:
-        for place in range(inputs.shape[1] if len(kept) else 0):
-            learned |= np.isin(_as_bytes(inputs[:, place]), _as_bytes(kept))
-    if len(model.training_windows):
-        learned |= np.isin(_as_bytes(data.windows), _as_bytes(model.training_windows))
-    learned &= (data.windows != data.windows[:, :1]).any(axis=(1, 2))  # digital silence is alike
-    return np.unique(data.group[learned])
-
-
-def _as_bytes(rows: Float32) -> NDArray[np.void]:
-    """Make one value of each row, shape (n,)."""
-    rows = np.ascontiguousarray(rows).reshape(len(rows), -1)
-    return rows.view(np.dtype((np.void, rows.shape[1] * rows.itemsize)))[:, 0]

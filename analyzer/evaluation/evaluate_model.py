@@ -8,6 +8,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
+from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.method import softmax
 from hearthlog.analyzer.training.rooms import captured, steady_noise
@@ -40,7 +41,7 @@ class ModelEvaluation:
     detections: Detections  # of clips in a quiet room
     evaluated_seconds: float  # of what the detections are about
     skipped: Mapping[str, int]  # why clips gave no segment, and how many
-    learned_from: bool  # whether the model learned from just these segments
+    sources_learned: int  # sources of which the model has learned from a segment
 
 
 def evaluate_model(
@@ -87,7 +88,7 @@ def evaluate_model(
         detections=listener.detections(),
         evaluated_seconds=listener.duration / NANOSECONDS,
         skipped=data.skipped,
-        learned_from=data.digest == model.description.training_data.sha256,
+        sources_learned=len(learned_groups(model, data)),
     )
 
 

@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Fold, softmax
-from hearthlog.analyzer.training.scores import calibration_error
+from hearthlog.analyzer.training.scores import calibration_error, score
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.description import Elsewhere
 from hearthlog.schemas.arrays import Bool, Float64, Indices
@@ -75,12 +75,16 @@ def calibrate_elsewhere(
     if not taught.any():
         taught[:] = True
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
-    right = probabilities.argmax(axis=1) == data.target
+    predicted = probabilities.argmax(axis=1)[taught]
+    scores = score(data.target[taught], predicted, data.group[taught], data.classes)
     elsewhere = Elsewhere(
         collections=len(np.unique(data.collection)),
         segments=int(taught.sum()),
-        right=float(right[taught].mean()),
+        right=float((predicted == data.target[taught]).mean()),
         expected_calibration_error=calibration_error(probabilities[taught], data.target[taught]),
+        macro_f1=scores.macro_f1,
+        macro_f1_interval=scores.macro_f1_interval and list(scores.macro_f1_interval),
+        classes={name: one.f1 for name, one in scores.per_class.items() if one.f1 is not None},
     )
     return inverse_temperature(decisions[taught], data.target[taught]), elsewhere
 

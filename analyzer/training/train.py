@@ -19,6 +19,7 @@ from hearthlog.analyzer.training.calibration import (
 )
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.installed import DEFAULT, method_named
+from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
 from hearthlog.analyzer.training.method import (
     Examples,
     Fold,
@@ -106,7 +107,7 @@ def train_model(
         inverse, elsewhere = calibrate_elsewhere(others, data, collections)
     learned = method.fit(examples)
     progress(1.0)
-    return Model(
+    model = Model(
         Description(
             **_method_fields(method, learned, data.classes),
             **_scenario_fields(scenario, data),
@@ -122,6 +123,12 @@ def train_model(
         ),
         learned.arrays(),
         transitions=(default_transitions(data.classes) if smoothing == "hmm" else np.empty((0, 0))),
+        training_digests=segment_digests(data.windows),
+    )
+    if method.remembered(model) is not None:
+        return model
+    return replace(
+        model,
         training_windows=data.windows,
         training_floor=data.floor,
         training_target=data.target.astype(np.int64),
@@ -135,7 +142,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     Parameters
     ----------
     base : Model
-        A model with its training windows.
+        A model whose arrays stand for what it learned, or that has kept its training windows.
     home : Dataset
         Of the same classes, some of which may have no segments.
 
@@ -144,15 +151,14 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     Model
         With the parameters, transitions and metrics of `base`, which are those of other homes.
         Parts of the home that were left out in turn move the temperature that the model had before
-        it was ever adapted. It keeps the windows of `base` only, so that it can be adapted again to
-        more of the home.
+        it was ever adapted. It can be adapted again to more of the home.
 
     Raises
     ------
     DataError
-        If the base model has no training windows, the home has no segments, the method of the
-        base model is not installed, or that method wants augmented copies and its feature set has
-        none.
+        If the base model has not kept what it learned from, the home has no segments, the method of
+        the base model is not installed, or that method wants augmented copies and its feature set
+        has none.
     ModelError
         If the method cannot be imported, or its feature set is not installed.
     """
@@ -192,6 +198,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         description.model_copy(update=update),
         arrays,
         transitions=base.transitions,
+        training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
         training_windows=base.training_windows,
         training_floor=base.training_floor,
         training_target=base.training_target,

@@ -1,7 +1,7 @@
 """A kind of classifier: the arrays it consists of, their checks, and how it decides."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -97,14 +97,3 @@ class ClassifierKind(ABC):
     @abstractmethod
     def summary(self, model: Model) -> str:
         """Return the size of a model in a few words."""
-
-    def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return the inputs of training windows that are among the arrays of a model.
-
-        Returns
-        -------
-        sequence of np.ndarray [shape=(n, width)], float32
-            Empty if the arrays hold none.
-        """
-        del model
-        return ()

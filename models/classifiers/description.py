@@ -13,7 +13,7 @@ from hearthlog.schemas.text import printable
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
-FORMAT: Final = 4
+FORMAT: Final = 5
 MOST_WEIGHT: Final = 10.0
 SIMULATED = "hearthlog simulated home"  # the collection of the sounds of `hearthlog.tools.home`
 _OLD_METHODS = {"statistics": "paper", "bands": "bands"}  # of format 2, by inputs
@@ -106,12 +106,21 @@ class Elsewhere(_Record):
         Share of them that were recognised.
     expected_calibration_error : float
         With the temperature from the other collections.
+    macro_f1 : float or None
+        Over the classes of these segments; None of models that were not told.
+    macro_f1_interval : list of float, or None
+        95 %, bootstrap over source groups.
+    classes : dict of str to float
+        F1 of each of the classes.
     """
 
     collections: _Count
     segments: _Count
     right: _Share
     expected_calibration_error: _Share
+    macro_f1: _Share | None = None
+    macro_f1_interval: Annotated[list[_Share], Field(min_length=2, max_length=2)] | None = None
+    classes: dict[_ClassName, _Share] = {}
 
 
 class Smoothing(_Record):
@@ -172,7 +181,7 @@ class Description(_Record):
         left out, for want of collections.
     """
 
-    format: Literal[4]
+    format: Literal[5]
     kind: _Text
     parameters: dict[_Text, Any]
     method: _Text
@@ -262,14 +271,14 @@ def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
             "inputs": inputs,
             "method": _OLD_METHODS.get(inputs, "") if isinstance(inputs, str) else "",
         }
-    if isinstance(number, int) and 2 <= number < FORMAT:
+    if number in (2, 3):
         # A label spoke of the second that ended with its frame.
         seconds, frames = content.get("window_seconds"), 1
         if isinstance(seconds, int | float) and 0 < seconds <= _LONGEST_SECONDS:
             frames = max(round(seconds / FRAME_SECONDS), 1)
-        content = {**content, "format": FORMAT, "label_frame": frames - 1, "gate": 0.0}
+        content = {**content, "label_frame": frames - 1, "gate": 0.0}
         content |= {"decision_bias": {}, "novelty": "machine", "elsewhere": None}
-    return content
+    return {**content, "format": FORMAT} if number in (2, 3, 4) else content
 
 
 def first_problem(error: ValidationError) -> str:

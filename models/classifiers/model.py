@@ -25,8 +25,10 @@ class Model:
     transitions : np.ndarray [shape=(C, C)], float64
         Probability that a frame of the row's class is followed by one of the column's class; empty
         where segments are merged.
+    training_digests : np.ndarray [shape=(k,)], int64
+        Digests of the segments that it was learned from.
     training_windows : np.ndarray [shape=(m, window_frames, d)], float32
-        Features that it was learned from, kept for adaptation; empty if they are not kept.
+        Features that it was learned from, where its method needs them to adapt it; else empty.
     training_floor : np.ndarray [shape=(m, b)], float64
         Floor of the room in each training window; empty for a feature set without bands.
     training_target, training_group : np.ndarray [shape=(m,)], int64
@@ -40,6 +42,7 @@ class Model:
     description: Description
     arrays: Mapping[str, Array]
     transitions: Float64 = field(default_factory=lambda: np.empty((0, 0)))
+    training_digests: Int64 = field(default_factory=lambda: np.empty(0, np.int64))
     training_windows: Float32 = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
     training_floor: Float64 = field(default_factory=lambda: np.empty((0, 0)))
     training_target: Int64 = field(default_factory=lambda: np.empty(0, np.int64))

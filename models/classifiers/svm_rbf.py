@@ -1,6 +1,6 @@
 """Support vector machines with RBF kernel, one against one, with numpy alone."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import combinations, pairwise
 from typing import Annotated, Any
 
@@ -150,16 +150,6 @@ class SvmKind(ClassifierKind):
     def summary(self, model: Model) -> str:
         """Return the number of support vectors, in words."""
         return f"{len(model.arrays['support_vectors'])} support vectors"
-
-    def kept_inputs(self, model: Model) -> Sequence[Float32]:
-        """Return the vectors that are inputs of windows: all of them.
-
-        Returns
-        -------
-        sequence of np.ndarray [shape=(n, width)], float32
-        """
-        names = ("support_vectors", "home_vectors", "base_vectors")
-        return [model.arrays[name] for name in names if name in model.arrays]
 
 
 SVM_RBF = SvmKind()

@@ -2,8 +2,11 @@
 
 import json
 
+from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.installed import classifier_kind
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.licences import may_be_shipped
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.log_stream import Attachment
 
@@ -78,9 +81,42 @@ def model_card(model: Model) -> str:
         lines += ["", f"What follows what is from {minutes:.0f} minutes of a home without marks."]
     if description.training_data.simulated:
         lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
-    lines += ["", "Learned from recordings of:", ""]
+    lines += [*_elsewhere(description), "", "Learned from recordings of:", ""]
     lines += [
         f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
         for item in description.training_data.collections
     ]
+    kept_back = [
+        f"{item.name or 'unnamed'} ({item.licence or 'unstated'})"
+        for item in description.training_data.collections
+        if not may_be_shipped(item.licence)
+    ]
+    if kept_back:
+        lines += ["", "Not to be passed on without asking, for what it learned from:", ""]
+        lines += [f"- {text}" for text in kept_back]
     return "\n".join(lines) + "\n"
+
+
+def _elsewhere(description: Description) -> list[str]:
+    """Describe the scores in collections of which nothing was learned."""
+    elsewhere = description.elsewhere
+    if elsewhere is None:
+        return []
+    amount = f"{elsewhere.collections} left out in turn, {elsewhere.segments} segments of a second"
+    lines = [
+        "",
+        f"In collections of which nothing was learned, as in a new home ({amount}):",
+        "",
+        f"- right: {elsewhere.right:.0%}",
+        f"- expected calibration error: {elsewhere.expected_calibration_error:.3f}",
+    ]
+    if elsewhere.macro_f1 is None:
+        return lines
+    interval = elsewhere.macro_f1_interval
+    between = f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""
+    lines += [f"- macro F1: {elsewhere.macro_f1:.3f}{between}"]
+    lines += [f"- F1 of {name}: {f1:.3f}" for name, f1 in elsewhere.classes.items()]
+    untried = [name for name in description.classes if name not in {*elsewhere.classes, UNKNOWN}]
+    if untried:
+        lines += [f"- not tried, for the other collections have too little: {', '.join(untried)}"]
+    return lines

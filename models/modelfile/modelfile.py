@@ -25,6 +25,7 @@ from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
+from hearthlog.models.starter import STARTERS, starter_file
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
 from hearthlog.schemas.storage.small_file import read_whole
@@ -37,6 +38,7 @@ _LARGEST = 1e9  # no product of finite inputs overflows
 _ROUNDING = 1e-9
 _COMMON: dict[str, np.dtype[Any]] = {  # to all kinds of classifiers; all are optional
     "transitions": np.dtype(np.float64),
+    "training_digests": np.dtype(np.int64),
     "training_windows": np.dtype(np.float32),
     "training_floor": np.dtype(np.float64),
     "training_target": np.dtype(np.int64),
@@ -88,7 +90,7 @@ def save_model(model: Model, path: Path) -> None:
     arrays = {name: np.ascontiguousarray(a) for name, a in {**model.arrays, **common}.items()}
     _check(path, model.description, arrays)
     text = json.dumps(model.description.model_dump(), ensure_ascii=False)
-    data = save(arrays, {_KEY: text})
+    data = save({name: _halved(array) for name, array in arrays.items()}, {_KEY: text})
     _check_header(path, data)
     try:
         with new_file(path) as temporary:
@@ -103,7 +105,8 @@ def load_model(path: Path) -> Model:
     Parameters
     ----------
     path : Path
-        The file, or a symbolic link to it: the model has the name of the file.
+        The file, or a symbolic link to it: the model has the name of the file. Where there is none,
+        the name of a starter model (`hearthlog.models.starter`) means that.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def load_model(path: Path) -> Model:
         printed, or if it is made for another feature set, or for a feature set or kind of
         classifier that is not installed.
     """
-    path = _pointed_to(path)
+    path = _starter(path) or _pointed_to(path)
     if not path.stem.isprintable():
         raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
     data = read_whole(path, "model file", _SIZE_LIMIT, ModelError)
@@ -122,12 +125,50 @@ def load_model(path: Path) -> Model:
     except (safetensors.SafetensorError, KeyError) as error:  # KeyError: a type numpy has not
         raise ModelError(f"{path}: is no model file ({one_line(error)})") from error
     description = _description(path, data)
+    arrays = _widened(description, arrays)
     _check(path, description, arrays)
     for array in arrays.values():
         array.flags.writeable = False
     common = {name: arrays.pop(name) for name in _COMMON if name in arrays}
     name, digest = path.stem, hashlib.sha256(data).hexdigest()
     return Model(description, arrays, **common, name=name, sha256=digest)
+
+
+def _halved(array: Array) -> Array:
+    """Return an array in half precision if nothing is lost, else as it is."""
+    if array.dtype != np.float32:
+        return array
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    return half if np.array_equal(half, array) else array
+
+
+def _widened(description: Description, arrays: dict[str, Array]) -> dict[str, Array]:
+    """Return arrays that were halved as they were before."""
+    try:
+        kind = classifier_kind(description.kind)
+    except ModelError:
+        return arrays  # the check says what is not installed
+    dtypes = {**kind.arrays, **kind.optional, **_COMMON}
+    halved = {
+        name: array.astype(np.float32)
+        for name, array in arrays.items()
+        if array.dtype == np.float16 and dtypes.get(name) == np.float32
+    }
+    return arrays | halved
+
+
+def _starter(path: Path) -> Path | None:
+    """Return the file of the starter model that is meant; None if none is."""
+    if str(path) not in STARTERS or os.path.lexists(path):
+        return None
+    file = starter_file(str(path))
+    if not file.exists():
+        raise ModelError(
+            f"{path}: this installation of hearthlog lacks its starter models ({file} is missing); "
+            "install it again, or name a model file"
+        )
+    return file
 
 
 def _pointed_to(path: Path) -> Path:
@@ -250,6 +291,9 @@ def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, 
     shapes = classifier_kind(description.kind).shapes(classes, width, arrays)
     if description.smoothing.method == "hmm":
         shapes["transitions"] = (classes, classes)
+    digests = arrays.get("training_digests", np.empty(0))
+    if digests.ndim and len(digests):
+        shapes["training_digests"] = (len(digests),)
     kept = arrays.get("training_windows", np.empty(0))
     if kept.ndim and len(kept):
         shapes["training_windows"] = (len(kept), features.window_frames, features.width)

@@ -18,6 +18,8 @@ from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
+DEFAULT_FOLDER = Path("models")
+DEFAULT_MODEL = DEFAULT_FOLDER / (CHAMPION + SUFFIX)
 _HISTORY = "history"
 _KEPT = 100  # earlier champions
 

@@ -27,7 +27,7 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines, wrong_use
+from hearthlog.tools.cli.text import end_with_warnings, number, unfinished_lines, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
@@ -163,7 +163,7 @@ def evaluate_model(
             | {
                 "evaluated_seconds": result.evaluated_seconds,
                 "skipped": dict(result.skipped),
-                "learned_from": result.learned_from,
+                "sources_learned": result.sources_learned,
             }
             | asdict(result.detections)
         )
@@ -175,11 +175,10 @@ def evaluate_model(
         print_scores(scores, result.detections)
         print_reliability(result.reliability, result.expected_calibration_error)
         print_skipped(result.skipped, "clips")
-    if result.learned_from:
-        tell(
-            "the model learned from these very segments: this says nothing of how good it is on "
-            "others"
-        )
+    if result.sources_learned:
+        count = f"{result.sources_learned:,} of the {number(scores.groups, 'source')}"
+        warning = f"the model has learned from {count}: the figures flatter it; leave these out"
+        end_with_warnings([warning])
 
 
 @evaluate.command("method")

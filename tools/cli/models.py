@@ -151,12 +151,17 @@ def _recordings(
 
 
 def _folder(given: Path | None) -> Path:
-    from hearthlog.recorder.config import load_settings
+    from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+    from hearthlog.models.starter import STARTERS
+    from hearthlog.recorder.config import NO_MODEL, load_settings
 
     if given is not None:
         return given
     configured = load_settings(None, {}, {}).model
-    return Path("models") if configured is None else configured.parent
+    if configured in {None, NO_MODEL, *map(Path, STARTERS)}:
+        return DEFAULT_FOLDER
+    assert configured is not None
+    return configured.parent
 
 
 def _after(before: str | None) -> str:

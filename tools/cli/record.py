@@ -13,6 +13,7 @@ from hearthlog.tools.cli.options import parse_time
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
+    from hearthlog.recorder.config import Settings
     from hearthlog.recorder.recording import RecordingSummary
 
 
@@ -27,8 +28,10 @@ def record(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Model file, or a link to one; without it there are no labels. Another file that "
-            "takes its place speaks within about a second, or at SIGHUP."
+            help="Model file, or a link to one; general or bathroom, which come with hearthlog; "
+            "none: no labels. Another file that takes its place speaks within about a second, or "
+            "at SIGHUP.",
+            show_default="models/champion.safetensors if there is one, else general",
         ),
     ] = None,
     device: Annotated[
@@ -83,6 +86,7 @@ def record(
         "keep_audio": keep_audio,
     }
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
+    settings = _with_model(settings)
     (microphone,) = settings.microphone
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
@@ -100,6 +104,18 @@ def record(
             tell("listening; Ctrl-C completes the log")
         recording = record_microphone(settings, microphone, stop, reload_requests)
     _say(recording)
+
+
+def _with_model(settings: "Settings") -> "Settings":
+    """Choose the model where none is configured, and say so where it has not heard the home."""
+    from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+    from hearthlog.models.starter import GENERAL, STARTERS
+
+    model = DEFAULT_MODEL if settings.model is None else settings.model
+    starter = GENERAL if model == DEFAULT_MODEL and not model.exists() else str(model)
+    if starter in STARTERS and not Path(starter).exists():
+        tell(f"the labels are by the starter model {starter}, which has never heard this home")
+    return settings.model_copy(update={"model": model})
 
 
 def _say(recording: "RecordingSummary") -> None:
