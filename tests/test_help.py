@@ -16,6 +16,7 @@ from hearthlog.tools.cli.main import app
 
 _WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
 _TRAIN = ("train", "--data", "none", "--scenario", "general", "-o", "made.safetensors")
+_WAYS = ("log", "model", "scenes", "robustness", "method", "search", "adaptation")
 _HEAVY = {"numpy", "rosbags", "mcap", "soundfile", "sounddevice"}
 
 
@@ -111,7 +112,7 @@ def completed(*words):
     [
         (("hearthlog", "re"), ["record", "recover", "review", "report", "replay", "relabel"]),
         (("hearthlog", "models", "pro"), ["promote"]),
-        (("hearthlog", "evaluate", ""), ["log", "model", "method", "search", "adaptation"]),
+        (("hearthlog", "evaluate", ""), [*_WAYS]),
         (("hearthlog", "evaluate", "--model", "m", "--he"), ["--help"]),
         (("hearthlog", "evaluate", "search", "--fo"), ["--folds"]),
         (("hearthlog", "record", "--max"), ["--max-bag-duration"]),

@@ -65,11 +65,7 @@ def evaluate_model(
     SourceError
         If a clip cannot be read.
     """
-    check_classes(model, scenario)
-    # In the order of the model's probabilities.
-    labels = {**scenario_of(model).classes, **scenario.classes}
-    classes = {name: labels[name] for name in model.classes}
-    scenario = Scenario(scenario.name, classes, scenario.ignored)
+    scenario = fitted(scenario, model)
     classifier = Classifier(model)
     features, listener = classifier.feature_set, _Listener(classifier)
     recordings = clip_recordings(clips, scenario, progress, features)
@@ -90,6 +86,26 @@ def evaluate_model(
         skipped=data.skipped,
         sources_learned=len(learned_groups(model, data)),
     )
+
+
+def fitted(scenario: Scenario, model: Model) -> Scenario:
+    """Return a scenario with the classes in the order of a model's probabilities.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    model : Model
+        Its class `unknown` is added where the scenario has none.
+
+    Raises
+    ------
+    DataError
+        As `check_classes`.
+    """
+    check_classes(model, scenario)
+    labels = {**scenario_of(model).classes, **scenario.classes}
+    classes = {name: labels[name] for name in model.classes}
+    return Scenario(scenario.name, classes, scenario.ignored)
 
 
 def check_classes(model: Model, scenario: Scenario) -> None:

@@ -33,19 +33,41 @@ def save_plot(path: Path, title: str, scores: Scores, bins: Sequence[Bin] = ()) 
         If the file exists, or cannot be written.
     """
     count = len(scores.classes)
-    names = [shortened(name, _NAME_WIDTH).replace("$", r"\$") for name in scores.classes]
-    figure = Figure(figsize=(9 + 0.45 * count, 3.5 + 0.45 * count), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
+    names = plot_names(scores.classes)
+    figure = new_figure((9 + 0.45 * count, 3.5 + 0.45 * count), title)
     if bins:
         axes = figure.subplot_mosaic([["matrix", "f1"], ["matrix", "sure"]], width_ratios=(3, 2))
         _reliability(axes["sure"], bins)
     else:
         axes = figure.subplot_mosaic([["matrix", "f1"]], width_ratios=(3, 2))
     _matrix(axes["matrix"], scores, names)
-    _f1(axes["f1"], scores, names)
+    draw_f1(axes["f1"], scores, names)
+    save_figure(figure, path)
+
+
+def new_figure(inches: tuple[float, float], title: str) -> Figure:
+    """Make an empty figure of a width and a height."""
+    figure = Figure(figsize=inches, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, parse_math=False)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure to a new PNG file.
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
     with new_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
+
+
+def plot_names(classes: Sequence[str]) -> list[str]:
+    """Return the names of classes as they stand in figures."""
+    return [shortened(name, _NAME_WIDTH).replace("$", r"\$") for name in classes]
 
 
 def _matrix(axes: Any, scores: Scores, names: Sequence[str]) -> None:
@@ -69,7 +91,8 @@ def _matrix(axes: Any, scores: Scores, names: Sequence[str]) -> None:
     axes.set(title="confusion, % of the true class", xlabel="predicted", ylabel="true (support)")
 
 
-def _f1(axes: Any, scores: Scores, names: Sequence[str]) -> None:
+def draw_f1(axes: Any, scores: Scores, names: Sequence[str]) -> None:
+    """Draw a bar of F1 for each class, with its interval."""
     for place, one in enumerate(scores.per_class.values()):
         if one.f1 is None:
             continue

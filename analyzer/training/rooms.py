@@ -66,14 +66,36 @@ def in_room(
     """
     sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
     if rng.random() < _SHARE:
-        sound = reverberated(sound, rng)
+        seconds, direct = rng.uniform(*_REVERBERATION_SECONDS), rng.uniform(*_DIRECT_DB)
+        sound = reverberated(sound, seconds, direct, rng)
     if rng.random() < _SHARE:
         sound = filtered(sound, _microphone(rng))
-    level = 10.0 * np.log10(np.mean(np.square(sound, dtype=np.float64)) + 1e-12)
-    noise_level = level - rng.uniform(*_SIGNAL_TO_NOISE_DB)
+    noise_level = level_of(sound) - rng.uniform(*_SIGNAL_TO_NOISE_DB)
     if silence:
         noise_level = rng.uniform(*_SILENCE_DBFS)
-    noise = steady_noise(len(sound), float(np.clip(noise_level, *_NOISE_DBFS)), rng)
+    return in_noise(
+        sound, float(np.clip(noise_level, *_NOISE_DBFS)), features, rng, silence=silence
+    )
+
+
+def in_noise(
+    sound: Float64, level: float, features: FeatureSet, rng: np.random.Generator, *, silence: bool
+) -> RoomCopy:
+    """Compute the features of a sound in steady noise.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+        Samples of whole frames at 16 kHz, at least one frame.
+    level : float
+        Of the noise, in dBFS.
+    features : FeatureSet
+        A set with bands.
+    rng : np.random.Generator
+    silence : bool
+        Whether nothing happens in the sound: then it belongs to the floor.
+    """
+    noise = steady_noise(len(sound), level, rng)
     copy = captured(sound + noise, features)
     assert features.band_powers is not None
     if silence:
@@ -81,6 +103,16 @@ def in_room(
     else:
         floor = features.band_powers(captured(noise, features)).mean(axis=0)
     return RoomCopy(copy, floor * _error(len(floor), rng))
+
+
+def level_of(sound: Float64) -> float:
+    """Return the mean level of a sound in dBFS, not below -120.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n,)], float64
+    """
+    return float(10.0 * np.log10(np.mean(np.square(sound, dtype=np.float64)) + 1e-12))
 
 
 def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
@@ -100,13 +132,19 @@ def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
     return RoomCopy(copy, floor * _error(len(floor), rng))
 
 
-def reverberated(sound: Float64, rng: np.random.Generator) -> Float64:
+def reverberated(
+    sound: Float64, seconds: float, direct: float, rng: np.random.Generator
+) -> Float64:
     """Put a sound into a reverberant room.
 
     Parameters
     ----------
     sound : np.ndarray [shape=(n,)], float64
         Samples at 16 kHz.
+    seconds : float
+        Until the reverberation has fallen by 60 dB (RT60).
+    direct : float
+        Direct sound above the reverberation, in dB.
     rng : np.random.Generator
 
     Returns
@@ -114,7 +152,6 @@ def reverberated(sound: Float64, rng: np.random.Generator) -> Float64:
     np.ndarray [shape=(n,)], float64
         Of the same power.
     """
-    seconds, direct = rng.uniform(*_REVERBERATION_SECONDS), rng.uniform(*_DIRECT_DB)
     time = np.arange(int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
     response = rng.standard_normal(len(time)) * 10.0 ** (-3.0 * time / seconds)
     response[:_DIRECT_SAMPLES] = 0.0
@@ -161,6 +198,18 @@ def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
     return limits
 
 
+def octaves_of(frequencies: Float64) -> Float64:
+    """Return how many octaves frequencies are above 1 kHz.
+
+    Parameters
+    ----------
+    frequencies : np.ndarray [shape=(n,)], float64
+        In hertz; those below 30 count as 30.
+    """
+    octaves: Float64 = np.log2(np.maximum(frequencies, 30.0) / 1000.0)
+    return octaves
+
+
 def _microphone(rng: np.random.Generator) -> Callable[[Float64], Float64]:
     """Draw the response of a microphone."""
     tilt = rng.uniform(*_TILT) * (rng.random() < _TILT_SHARE)
@@ -174,7 +223,7 @@ def _microphone(rng: np.random.Generator) -> Callable[[Float64], Float64]:
     high = rng.uniform(*_HIGH_HERTZ)
 
     def response(frequencies: Float64) -> Float64:
-        octaves = np.log2(np.maximum(frequencies, 30.0) / 1000.0)
+        octaves = octaves_of(frequencies)
         decibels = tilt * octaves
         for height, place, width in bumps:
             decibels = decibels + height * np.exp(-0.5 * ((octaves - place) / width) ** 2)

@@ -1,6 +1,5 @@
 """`hearthlog evaluate`: how good a model is, the labels of a log, or a way to learn."""
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -11,6 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
+from hearthlog.tools.cli.evaluate_sounds import robustness, scenes
 from hearthlog.tools.cli.options import (
     METHOD,
     METHODS,
@@ -19,6 +19,7 @@ from hearthlog.tools.cli.options import (
     Json,
     LocalLog,
     OwnScenario,
+    Plot,
     Scheduler,
     check_output,
     chosen_method,
@@ -27,7 +28,13 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_reliability, print_scores, print_search, print_skipped
 from hearthlog.tools.cli.table import NAME_WIDTH, print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, unfinished_lines, wrong_use
+from hearthlog.tools.cli.text import (
+    end_with_warnings,
+    number,
+    print_json,
+    unfinished_lines,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.evaluate_method import CrossValidation
@@ -67,7 +74,6 @@ _Scenario = Annotated[str, typer.Option(help=SCENARIO)]
 _Folds = Annotated[
     Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
 ]
-_Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
 
 
 @evaluate.command("log")
@@ -81,7 +87,7 @@ def evaluate_log(
         str | None,
         typer.Option(help="Segments to compare; by default what the recorder labelled."),
     ] = None,
-    plot: _Plot = None,
+    plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Compare the labels of a log with those of a reviewer.
@@ -102,7 +108,7 @@ def evaluate_log(
     if as_json:
         scores = asdict(result.scores)
         frames = scores.pop("segments")
-        _print_json(
+        print_json(
             {"log": str(log), "topic": labelled.topic, "reference": reference, "frames": frames}
             | scores
             | asdict(result.detections)
@@ -135,7 +141,7 @@ def evaluate_model(
     *,
     data: Clips,
     scenario: OwnScenario = None,
-    plot: _Plot = None,
+    plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Score a model on labelled clips."""
@@ -156,7 +162,7 @@ def evaluate_model(
     scores = result.scores
     _save_plot(plot, f"{loaded.name} on {data} ({classes.name})", scores, result.reliability)
     if as_json:
-        _print_json(
+        print_json(
             {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
             | asdict(scores)
             | _calibration(result)
@@ -181,6 +187,10 @@ def evaluate_model(
         end_with_warnings([warning])
 
 
+evaluate.command()(scenes)
+evaluate.command()(robustness)
+
+
 @evaluate.command("method")
 def evaluate_method(
     method: _Method = METHOD,
@@ -189,7 +199,7 @@ def evaluate_method(
     scenario: _Scenario,
     folds: _Folds = "source",
     scheduler: Scheduler = None,
-    plot: _Plot = None,
+    plot: Plot = None,
     as_json: Json = False,
 ) -> None:
     """Cross-validate a way to learn: learn from a part of the clips, and try it on the rest."""
@@ -201,7 +211,7 @@ def evaluate_method(
     title = f"{method} on {data} ({scenario}), by {folds}"
     _save_plot(plot, title, result.scores, result.reliability)
     if as_json:
-        _print_json(
+        print_json(
             {"scenario": scenario, "method": method, "by": folds, "folds": result.folds}
             | asdict(result.scores)
             | _calibration(result)
@@ -234,7 +244,7 @@ def search(
         tried = grid_search.search(segments, chosen.variations(), folds, progress)
     if as_json:
         rows = [one.method.parameters | asdict(one.scores) for one in tried]
-        _print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
+        print_json({"scenario": scenario, "method": method, "by": folds, "tried": rows})
         return
     print(
         f"method {method}, scenario {scenario}: {len(segments)} segments of "
@@ -264,7 +274,7 @@ def adaptation(
     with _learning(method, data, scenario, scheduler) as (chosen, segments, progress):
         curve = adaptation_curve(segments, chosen, progress)
     if as_json:
-        _print_json({"scenario": scenario, "method": method} | curve._asdict())
+        print_json({"scenario": scenario, "method": method} | curve._asdict())
         return
     window = f"{chosen.features.window_seconds:g} s"
     print(f"macro F1 after so many corrected segments of {window}\n")
@@ -311,10 +321,6 @@ def _unknown_text(seconds_of: Any) -> str:
     names = ", ".join(f"{shortened(name, NAME_WIDTH)} ({seconds:.1f} s)" for name, seconds in most)
     more = f" and {len(seconds_of) - len(most)} more" if len(seconds_of) > len(most) else ""
     return f"the log does not know these labels of the reference: {names}{more}"
-
-
-def _print_json(result: dict[str, Any]) -> None:
-    print(json.dumps(result, allow_nan=False))
 
 
 def _save_plot(path: Path | None, title: str, scores: "Scores", bins: "Sequence[Bin]" = ()) -> None:

@@ -67,6 +67,7 @@ OwnScenario = Annotated[
 Scheduler = Annotated[
     str | None, typer.Option(help="Work on this Dask cluster, as tcp://host:port.")
 ]
+Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 

@@ -1,9 +1,10 @@
 """How results, numbers, times and lists are printed, and what goes to standard error."""
 
+import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import typer
 
@@ -17,6 +18,11 @@ def print_lines(lines: Iterable[str]) -> None:
     """Print lines whose texts may come from any file."""
     for line in lines:
         print(printable(line))
+
+
+def print_json(result: dict[str, Any]) -> None:
+    """Print a result for a program."""
+    print(json.dumps(result, allow_nan=False))
 
 
 def tell(text: str) -> None:

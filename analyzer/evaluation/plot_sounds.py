@@ -1,0 +1,116 @@
+"""Scores of scenes and of changed clips as pictures."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.patches import Patch
+
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.evaluation.evaluate_scenes import ScenesEvaluation
+from hearthlog.analyzer.evaluation.plot import draw_f1, new_figure, plot_names, save_figure
+from hearthlog.analyzer.evaluation.robustness import Robustness
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.times import NANOSECONDS
+
+_ROW_MINUTES = 10
+_MOST_ROWS = 3
+
+
+def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
+    """Draw F1 and false alarms by class, and the first scene: the truth above its labels.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file, which must not exist.
+    title : str
+    found : ScenesEvaluation
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
+    names = plot_names(found.scores.classes)
+    minutes = found.truth.ends.max() / NANOSECONDS / 60
+    rows = int(min(np.ceil(minutes / _ROW_MINUTES), _MOST_ROWS))
+    lanes = [f"lane {row}" for row in range(rows)]
+    height = 1.5 + 0.32 * len(names)
+    figure = new_figure((13, height + 0.9 * rows + 0.8), title)
+    places: list[Any] = [["f1", "alarms"], *[[lane, lane] for lane in lanes]]
+    axes = figure.subplot_mosaic(places, height_ratios=(height, *[0.9] * rows))
+    draw_f1(axes["f1"], found.scores, names)
+    alarms = [count / 24 for count in found.detections.false_alarms_per_day.values()]
+    axes["alarms"].barh(range(len(names)), alarms, color="tab:red", alpha=0.6)
+    axes["alarms"].set_yticks(range(len(names)), names)
+    axes["alarms"].set(
+        title=f"false alarms an hour; {sum(alarms):.0f} in all", ylim=(len(names) - 0.5, -0.5)
+    )
+    for row, lane in enumerate(lanes):
+        _lane(axes[lane], found, row)
+    axes[lanes[-1]].set_xlabel("minutes of the first scene")
+    shown = [name for name in found.scores.classes if name != SILENCE]
+    patches = [Patch(facecolor=_rgb(name), edgecolor="grey") for name in shown]
+    figure.legend(
+        patches, plot_names(shown), loc="outside lower center", ncols=min(len(shown), 9), fontsize=8
+    )
+    save_figure(figure, path)
+
+
+def save_robustness(path: Path, title: str, found: Robustness) -> None:
+    """Draw a map of F1 by class and condition.
+
+    Parameters
+    ----------
+    path : Path
+        Of a PNG file, which must not exist.
+    title : str
+    found : Robustness
+
+    Raises
+    ------
+    LogError
+        If the file exists, or cannot be written.
+    """
+    every = {"unchanged": found.unchanged} | {k: v.scores for k, v in found.changed.items()}
+    classes = [name for name, one in found.unchanged.per_class.items() if one.support]
+    f1 = np.array([[one.macro_f1 for one in every.values()]])
+    rows = [[one.per_class[name].f1 or 0.0 for one in every.values()] for name in classes]
+    f1 = np.concatenate([np.array(rows), f1])
+    figure = new_figure((2.5 + 0.62 * len(every), 2.5 + 0.4 * len(f1)), title)
+    axes = figure.subplots()
+    axes.imshow(f1, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for (row, column), value in np.ndenumerate(f1):
+        shade = "white" if value > 0.5 else "black"
+        axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", color=shade)
+    axes.axhline(len(classes) - 0.5, color="black", linewidth=1)
+    axes.set_xticks(range(len(every)), every, rotation=45, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(f1)), [*plot_names(classes), "macro"])
+    axes.set_title("F1 of segments of a second, %", fontsize=10)
+    save_figure(figure, path)
+
+
+def _lane(axes: Any, found: ScenesEvaluation, row: int) -> None:
+    """Draw ten minutes of a scene."""
+    for base, labelling in ((1, found.truth), (0, found.found)):
+        for name in set(labelling.labels) - {SILENCE}:
+            spans = _minutes(labelling, name)
+            axes.broken_barh(spans, (base + 0.06, 0.88), facecolor=_rgb(name), linewidth=0)
+    axes.set_yticks((1.5, 0.5), ("truth", "labels"))
+    axes.set(xlim=(row * _ROW_MINUTES, (row + 1) * _ROW_MINUTES), ylim=(0, 2))
+    axes.axhline(1, color="black", linewidth=0.5)
+    axes.set_facecolor("#e3e7ec")  # `unknown` is white
+
+
+def _minutes(labelling: Labelling, name: str) -> list[tuple[float, float]]:
+    """Return start and length of each span of a label."""
+    rows = labelling.labels == name
+    starts, ends = (times[rows] / NANOSECONDS / 60 for times in (labelling.starts, labelling.ends))
+    return list(zip(starts.tolist(), (ends - starts).tolist(), strict=True))
+
+
+def _rgb(name: str) -> tuple[float, float, float]:
+    red, green, blue = colour(name)
+    return red / 255, green / 255, blue / 255

@@ -1,0 +1,151 @@
+"""`hearthlog evaluate scenes` and `robustness`: a model on sounds as homes and rooms have them."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from hearthlog.tools.cli.options import Clips, Json, OwnScenario, Plot, check_output, manifest_path
+from hearthlog.tools.cli.progress import share_done
+from hearthlog.tools.cli.scores import (
+    print_coughs,
+    print_robustness,
+    print_scenes,
+    print_scores,
+    print_skipped,
+)
+from hearthlog.tools.cli.text import end_with_warnings, number, print_json
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.training.manifest import LabelledClip
+    from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.models.classifiers.model import Model
+
+_Model = Annotated[Path, typer.Argument(help="Model file.")]
+
+
+def scenes(
+    model: _Model,
+    *,
+    data: Clips,
+    scenes: Annotated[int, typer.Option(min=1, max=100, help="How many to compose.")] = 3,
+    minutes: Annotated[float, typer.Option(min=0.25, max=60, help="Length of each.")] = 30.0,
+    floor: Annotated[
+        float, typer.Option(min=-120, max=0, help="Level of the noise in dBFS.")
+    ] = -70.0,
+    colour: Annotated[
+        Literal["white", "pink", "brown"], typer.Option(help="Of the noise.")
+    ] = "white",
+    gain: Annotated[float, typer.Option(min=-60, max=60, help="Of the clips, in dB.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Another one composes other scenes.")] = 10,
+    scenario: OwnScenario = None,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Compose scenes of labelled clips, record them with a model, and score its labels.
+
+    Exit status 3: a class has no clip.
+    """
+    from hearthlog.analyzer.evaluation.evaluate_scenes import (
+        SceneOptions,
+        alarms_per_hour,
+        evaluate_scenes,
+    )
+
+    check_output("--plot", plot, ".png", "a picture")
+    loaded, clips, classes = _read(model, data, scenario)
+    options = SceneOptions(scenes, 60.0 * minutes, floor, colour, gain, seed)
+    with share_done(f"recording {number(scenes, 'scene')}", announce=True) as report:
+        found = evaluate_scenes(model, loaded, clips, classes, options, report)
+    where = f"{colour} noise at {floor:g} dBFS"
+    if plot is not None:
+        from hearthlog.analyzer.evaluation.plot_sounds import save_scenes
+
+        save_scenes(plot, f"{loaded.name} on scenes of {data} over {where}", found)
+    if as_json:
+        scores = asdict(found.scores)
+        frames = scores.pop("segments")
+        print_json(
+            {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
+            | {"options": asdict(options), "frames": frames}
+            | scores
+            | asdict(found.detections)
+            | {
+                "false_alarms_per_hour": alarms_per_hour(found.detections),
+                "scenes": [asdict(one) for one in found.scenes],
+                "coughs": None if found.coughs is None else asdict(found.coughs),
+                "evaluated_seconds": found.evaluated_seconds,
+                "sounds": found.sounds,
+                "clips": found.clips,
+                "skipped": dict(found.skipped),
+            }
+        )
+    else:
+        print(
+            f"model {loaded.name}, scenario {classes.name}: {number(scenes, 'scene')} of "
+            f"{minutes:g} min over {where}\n{number(found.sounds, 'sound')}, drawn from "
+            f"{number(found.clips, 'clip')}; frames of 50 ms\n"
+        )
+        print_scores(found.scores, found.detections, hours=1)
+        print()
+        print_scenes(found.scenes)
+        if found.coughs is not None:
+            print_coughs(found.coughs)
+        print_skipped(found.skipped, "clips")
+    if found.lacking:
+        names = ", ".join(found.lacking)
+        end_with_warnings([f"{data}: has no clip of {names}: what is labelled so is a false alarm"])
+
+
+def robustness(
+    model: _Model,
+    *,
+    data: Clips,
+    scenario: OwnScenario = None,
+    plot: Plot = None,
+    as_json: Json = False,
+) -> None:
+    """Score a model on labelled clips in noise, in other rooms and by other microphones."""
+    from hearthlog.analyzer.evaluation import robustness as evaluation
+
+    check_output("--plot", plot, ".png", "a picture")
+    loaded, clips, classes = _read(model, data, scenario)
+    with share_done(f"listening to {number(len(clips), 'clip')}", announce=True) as report:
+        found = evaluation.robustness(loaded, clips, classes, report)
+    if plot is not None:
+        from hearthlog.analyzer.evaluation.plot_sounds import save_robustness
+
+        save_robustness(plot, f"{loaded.name} on changed clips of {data}", found)
+    if as_json:
+        print_json(
+            {"model": str(model), "sha256": loaded.sha256, "scenario": classes.name}
+            | {"unchanged": asdict(found.unchanged)}
+            | {
+                "changed": {
+                    name: asdict(one.scores) | {"difference": asdict(one.difference)}
+                    for name, one in found.changed.items()
+                },
+                "skipped": dict(found.skipped),
+            }
+        )
+        return
+    print(
+        f"model {loaded.name}, scenario {classes.name}: {found.unchanged.segments} segments of 1 s "
+        f"from {found.unchanged.groups} sources\n"
+    )
+    print_robustness(found)
+    print_skipped(found.skipped, "clips")
+
+
+def _read(
+    model: Path, data: Path, scenario: str | None
+) -> "tuple[Model, list[LabelledClip], Scenario]":
+    """Read a model, its scenario unless another one is named, and clips."""
+    from hearthlog.analyzer.training.manifest import read_manifest
+    from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
+    from hearthlog.models.modelfile.modelfile import load_model
+
+    loaded = load_model(model)
+    classes = load_scenario(scenario) if scenario else scenario_of(loaded)
+    return loaded, read_manifest(manifest_path(data), classes.labels), classes
