@@ -1,3 +1,5 @@
+from math import inf
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,6 +44,22 @@ def test_the_names_that_audioset_has_for_our_labels_are_labels(tmp_path):
     assert [BUILTIN["bathroom"].find(clip.label) for clip in clips] == ["other", "tap_water"]
     assert [BUILTIN["general"].find(clip.label) for clip in clips] == ["crying", None]
     assert "'water_tap_faucet'" in refusal(path, ["crying", "speech"])
+
+
+def test_a_label_may_be_about_parts_of_a_file(tmp_path):
+    header = "path,label,source_group,start,end\n"
+    rows = "a.wav,speech,anna,1.5,3\na.wav,music,anna,4,\na.wav,speech,anna,,1.5\n"
+    clips = read_manifest(manifest(tmp_path, header + rows), LABELS)
+    assert [(clip.start, clip.end) for clip in clips] == [(1.5, 3.0), (4.0, inf), (0.0, 1.5)]
+    again = manifest(tmp_path, header + "a.wav,speech,anna,1,2\na.wav,music,anna,1.0,2.0\n")
+    assert refusal(again) == f"{again}:3: 'a.wav' is listed in line 2 too"
+
+
+@pytest.mark.parametrize("span", ["2,1", "1,1", "-1,1", "nan,1", "0,nan", "inf,", "1 s,2", "1,2e"])
+def test_what_is_no_part_of_a_file_is_named_with_its_line(tmp_path, span):
+    path = manifest(tmp_path, f"path,label,source_group,start,end\na.wav,speech,anna,{span}\n")
+    assert refusal(path).startswith(f"{path}:2: start '")
+    assert refusal(path).endswith("are no part of a file; give seconds, the start before the end")
 
 
 def test_columns_may_be_in_any_order_and_others_are_ignored(tmp_path):

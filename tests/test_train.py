@@ -11,7 +11,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
+from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset, clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.svm_method import ROOM
@@ -155,6 +155,39 @@ def test_a_clip_that_is_no_audio_is_named(tmp_path):
     (tmp_path / "x.wav").write_text("no sound")
     with pytest.raises(SourceError, match=r"x\.wav"):
         dataset(LabelledClip(tmp_path / "x.wav", "speech", "g", "", ""))
+
+
+@pytest.mark.parametrize("rate", [RATE, 44_100])
+@pytest.mark.parametrize("suffix", ["wav", "ogg"])
+def test_a_part_of_a_long_file_is_heard_alone(tmp_path, rate, suffix):
+    silent, loud = np.zeros(25 * rate), np.full(3 * rate, 0.5)
+    path = tmp_path / f"long.{suffix}"
+    with soundfile.SoundFile(path, "w", rate, 1) as file:
+        for second in np.concatenate([silent, loud, silent]).reshape(-1, rate):
+            file.write(second)
+    part = LabelledClip(path, "speech", "g", "", "", 24.0, 29.0)
+    frames = clip_frames(part)
+    level = np.abs(frames).mean(axis=1)
+    assert len(frames) == 100
+    assert (level[[2, 17, 82, 97]] < 0.1).all()
+    assert (level[22:78] > 0.4).all()
+    assert len(clip_frames(dataclasses.replace(part, end=np.inf))) == 29 * 20
+    assert len(clip_frames(dataclasses.replace(part, start=53.0, end=60.0))) == 0
+
+
+def test_parts_of_one_file_have_classes_of_their_own(tmp_path):
+    path = write(tmp_path, "day.wav", np.concatenate([sound("speech", 3), sound("silence", 2)]))
+    about = {"source_group": "g", "source": "", "licence": ""}
+    data = dataset(
+        LabelledClip(path, "speech", **about, end=3.0),
+        LabelledClip(path, "silence", **about, start=3.0),
+        LabelledClip(path, "speech", **about, start=9.0),
+    )
+    assert {name: amount.seconds for name, amount in data.amounts.items()} == {
+        "silence": 2.0,
+        "speech": 3.0,
+    }
+    assert data.skipped == {"shorter than 1 s": 1}
 
 
 def test_folds_never_split_a_source_and_test_every_segment_once():

@@ -320,7 +320,7 @@ def clip_frames(clip: LabelledClip) -> Float32:
     Returns
     -------
     np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Whole frames at 16 kHz.
+        Whole frames at 16 kHz; none of a part behind the end of the file.
 
     Raises
     ------
@@ -328,7 +328,7 @@ def clip_frames(clip: LabelledClip) -> Float32:
         If the clip cannot be read.
     """
     cutter = FrameCutter()
-    blocks = [cutter.push(block) for block in read_audio(clip.path)]
+    blocks = [cutter.push(block) for block in read_audio(clip.path, clip.start, clip.end)]
     return np.concatenate([np.empty((0, FRAME_SAMPLES), np.float32), *blocks])
 
 

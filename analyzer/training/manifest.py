@@ -1,5 +1,6 @@
 """The manifest of labelled clips: a CSV file beside the audio."""
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,8 @@ from hearthlog.models.classes import meant_by
 from hearthlog.models.classifiers.description import TEXT
 
 REQUIRED = ("path", "label", "source_group")
-OPTIONAL = ("source", "licence")
-_SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
+OPTIONAL = ("source", "licence", "start", "end")
+SIZE_LIMIT = 64 << 20  # half a million clips; what is larger is something else
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class LabelledClip:
         The original recording or speaker; folds never split a group.
     source, licence : str
         Its collection and licence; empty where the manifest does not say.
+    start, end : float
+        The part of the file that the label is about, in seconds; `end` is infinite for the rest.
     """
 
     path: Path
@@ -34,15 +37,18 @@ class LabelledClip:
     source_group: str
     source: str
     licence: str
+    start: float = 0.0
+    end: float = math.inf
 
 
 def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
-    """Read a manifest with the columns path, label, source_group and, optionally, source, licence.
+    """Read a manifest with the columns path, label, source_group.
 
     Parameters
     ----------
     path : Path
-        CSV, UTF-8; the paths in it are relative to its folder. Other columns are ignored.
+        CSV, UTF-8; the paths in it are relative to its folder. It may have the columns source,
+        licence, start and end, too; others are ignored.
     labels : collection of str
         Allowed labels; other names of the same sounds (`hearthlog.models.classes`) are allowed too.
 
@@ -55,10 +61,11 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     ------
     DataError
         With file and line, if a column, a value or an audio file is missing, a label is unknown,
-        or a clip is listed twice; if the file lists no clip, or is no CSV in UTF-8; if it cannot
-        be read, or is larger than 64 MiB.
+        a start and an end are no part of a file, or the same clip, or part of it, is listed twice;
+        if the file lists no clip, or is no CSV in UTF-8; if it cannot be read, or is larger than
+        64 MiB.
     """
-    lines = csv_records(path, read_text(path, "manifest", _SIZE_LIMIT))
+    lines = csv_records(path, read_text(path, "manifest", SIZE_LIMIT))
     first = next(lines, None)
     if first is None:
         raise DataError(f"{path}: is empty; it needs a first line that names the columns")
@@ -68,13 +75,14 @@ def read_manifest(path: Path, labels: Collection[str]) -> list[LabelledClip]:
     if missing:
         raise DataError(f"{path}:{number}: no column {', '.join(missing)} in the first line")
     clips: list[LabelledClip] = []
-    seen: dict[Path, int] = {}
+    seen: dict[tuple[Path, float, float], int] = {}
     for number, record in lines:
         where = f"{path}:{number}"
         clip = _clip(where, path.parent, column, record, labels)
-        if clip.path in seen:
-            raise DataError(f"{where}: {clip.path.name!r} is listed in line {seen[clip.path]} too")
-        seen[clip.path] = number
+        span = clip.path, clip.start, clip.end
+        if span in seen:
+            raise DataError(f"{where}: {clip.path.name!r} is listed in line {seen[span]} too")
+        seen[span] = number
         clips.append(clip)
     if not clips:
         raise DataError(f"{path}: lists no clips")
@@ -93,7 +101,7 @@ def _clip(
     for name in REQUIRED:
         if not value[name]:
             raise DataError(f"{where}: {name} is empty")
-    for name in OPTIONAL:
+    for name in ("source", "licence"):
         if not TEXT.fullmatch(value[name]):
             raise DataError(f"{where}: {name} must be one line of at most 300 characters")
     if not meant_by(value["label"], labels):
@@ -103,8 +111,26 @@ def _clip(
     if not _is_file(audio):
         raise DataError(f"{where}: no such file: {value['path'][:256]!r}")
     return LabelledClip(
-        audio, value["label"], value["source_group"], value["source"], value["licence"]
+        audio,
+        value["label"],
+        value["source_group"],
+        value["source"],
+        value["licence"],
+        *_span(where, value["start"], value["end"]),
     )
+
+
+def _span(where: str, start: str, end: str) -> tuple[float, float]:
+    try:
+        span = float(start or 0), float(end or math.inf)
+    except ValueError:
+        span = math.nan, math.nan
+    if not 0 <= span[0] < span[1]:
+        raise DataError(
+            f"{where}: start {start[:32]!r} and end {end[:32]!r} are no part of a file; give "
+            "seconds, the start before the end"
+        )
+    return span
 
 
 def _is_file(path: Path) -> bool:

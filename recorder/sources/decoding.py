@@ -1,5 +1,6 @@
 """Audio files as one stream of samples at 16 kHz, mono."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ _BLOCK_SECONDS = 10.0
 _RATES = range(1_000, 768_001)  # Hz: all that recordings have, and soxr converts in bounded memory
 
 
-def read_audio(path: Path) -> Iterator[Float32]:
+def read_audio(path: Path, start: float = 0.0, end: float = math.inf) -> Iterator[Float32]:
     """Read an audio file of any rate and channel count, block by block.
 
     Channels are averaged, other rates resampled; samples that are not finite become 0.
@@ -26,6 +27,8 @@ def read_audio(path: Path) -> Iterator[Float32]:
     Parameters
     ----------
     path : Path
+    start, end : float
+        The part to read, in seconds, as far as the file goes.
 
     Yields
     ------
@@ -39,7 +42,10 @@ def read_audio(path: Path) -> Iterator[Float32]:
         768 kHz.
     """
     with _opened(path) as audio:
-        yield from _resampled(_mono_blocks(audio), audio.samplerate)
+        first, last = (round(min(time * audio.samplerate, audio.frames)) for time in (start, end))
+        if first:
+            audio.seek(first)
+        yield from _resampled(_mono_blocks(audio, last - first), audio.samplerate)
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
@@ -107,9 +113,10 @@ def _opened(path: Path) -> Iterator[soundfile.SoundFile]:
         raise SourceError(f"{path}: cannot be read as audio ({reason})") from error
 
 
-def _mono_blocks(audio: soundfile.SoundFile) -> Iterator[Float32]:
+def _mono_blocks(audio: soundfile.SoundFile, frames: int) -> Iterator[Float32]:
     size = int(audio.samplerate * _BLOCK_SECONDS)
-    while len(block := audio.read(size, dtype="float32", always_2d=True)):
+    while len(block := audio.read(min(size, frames), dtype="float32", always_2d=True)):
+        frames -= len(block)
         yield _mono(block)
 
 
