@@ -31,6 +31,7 @@ def test_unchanged_clips_are_scored_as_by_evaluate_model(heard):
     plain = evaluate_model(*heard, ignore_progress)
     assert found.unchanged == plain.scores
     assert found.skipped == plain.skipped
+    assert found.sources_learned == plain.sources_learned > 0
     assert found.changed == {}
 
 
@@ -160,7 +161,8 @@ def some(training_set, tmp_path):
 def test_the_command_prints_a_table_and_makes_a_picture(model_file, some, tmp_path, capfd):
     words, picture = ("evaluate", "robustness", model_file, "--data", some), tmp_path / "map.png"
     table = run(capfd, *words, "--plot", picture)
-    assert table.returncode == 0, table.stderr
+    assert table.returncode == 3
+    assert "the model has learned from 1" in table.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, table.stdout.splitlines())) <= 100
     result = run(capfd, *words, "--json")

@@ -18,6 +18,7 @@ from hearthlog.analyzer.training.scenario import scenario_of
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.home.simulate import write_training_set
 
 SECONDS = 60
 OPTIONS = SceneOptions(scenes=2, seconds=120.0)
@@ -190,16 +191,21 @@ def test_late_labels_and_wrong_ones_are_not(monkeypatch, heard):
     assert (found.coughs.found, found.coughs.others) == (0.0, 1.0)
 
 
+@pytest.fixture(scope="module")
+def new_clips(tmp_path_factory):
+    """Clips that the model has not learned from."""
+    return write_training_set(tmp_path_factory.mktemp("new"), clips_per_class=2, seed=12)
+
+
 def words_of(model, data, *more):
     return "evaluate", "scenes", model, "--data", data, "--scenes", 1, "--minutes", 1, *more
 
 
 def test_the_same_seed_gives_the_same_scores_and_another_one_others(
-    model_file, training_set, tmp_path, capfd
+    model_file, new_clips, tmp_path, capfd
 ):
     first, again, other = (
-        run(capfd, *words_of(model_file, training_set, "--json", "--seed", seed))
-        for seed in (4, 4, 5)
+        run(capfd, *words_of(model_file, new_clips, "--json", "--seed", seed)) for seed in (4, 4, 5)
     )
     assert first.returncode == 0, first.stderr
     assert first.stdout == again.stdout != other.stdout
@@ -210,13 +216,37 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others(
     assert [one["seed"] for one in found["scenes"]] == [4]
     picture = tmp_path / "scenes.png"
     options = ("--plot", picture, "--seed", 4, "--colour", "pink", "--floor", -60, "--gain", -6)
-    table = run(capfd, *words_of(model_file, training_set, *options))
+    table = run(capfd, *words_of(model_file, new_clips, *options))
     assert table.returncode == 0, table.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, table.stdout.splitlines())) <= 100
     assert "1 scene of 1 min over pink noise at -60 dBFS" in table.stdout
     assert "false alarms/h" in table.stdout
     assert "single coughs of 0.3 s" in table.stdout
+
+
+def test_what_the_model_has_learned_from_is_counted(heard, training_set, new_clips, capfd):
+    model_file, model, _, scenario = heard
+    known = evaluate_scenes(*heard, replace(OPTIONS, scenes=1), ignore_progress)
+    assert known.sources_learned == known.sources == known.clips == 8 * 5
+    others = read_manifest(new_clips, scenario.labels)
+    new = evaluate_scenes(model_file, model, others, scenario, OPTIONS, ignore_progress)
+    assert new.sources_learned == 0
+    result = run(capfd, *words_of(model_file, training_set))
+    assert result.returncode == 3
+    assert f"has learned from {known.sources} of the {known.sources} sources" in result.stderr
+
+
+def test_a_clip_may_be_a_part_of_a_file(model_file, tmp_path, capfd):
+    data = manifest_of(tmp_path / "parts", ("speech", 9.0))
+    (data / "manifest.csv").write_text(
+        "path,label,source_group,start,end\n0.wav,speech,a,1,1.5\n0.wav,music,a,3,3.01\n"
+    )
+    result = run(capfd, *words_of(model_file, data, "--json"))
+    found = json.loads(result.stdout)
+    assert (found["clips"], found["skipped"]) == (1, {"shorter than a frame of 50 ms": 1})
+    seconds = found["per_class"]["speech"]["support"] / 20
+    assert seconds == pytest.approx(0.5 * found["sounds"], abs=0.05 * found["sounds"])
 
 
 def manifest_of(folder, *rows):

@@ -5,6 +5,7 @@ import wave
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 
@@ -23,18 +24,21 @@ from hearthlog.analyzer.evaluation.scenes import (
     compose_single,
 )
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
+from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.scenario import Scenario
 from hearthlog.analyzer.training.scores import Scores
 from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 _START = 1_772_323_200 * NANOSECONDS  # of every scene; any full hour does
@@ -120,6 +124,8 @@ class ScenesEvaluation:
     evaluated_seconds : float
     sounds, clips : int
         How many sounds were laid, and of how many clips they were chosen.
+    sources, sources_learned : int
+        Of how many source groups these clips are, and of how many of them the model has learned.
     lacking : tuple of str
         Classes without a clip.
     skipped : dict of str to int
@@ -135,6 +141,8 @@ class ScenesEvaluation:
     evaluated_seconds: float
     sounds: int
     clips: int
+    sources: int
+    sources_learned: int
     lacking: tuple[str, ...]
     skipped: Mapping[str, int]
     truth: Labelling
@@ -175,7 +183,7 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     """
     check_classes(model, scenario)
     by_label, skipped = _usable(clips, scenario)
-    used = {scenario.find(clip.label) for same in by_label.values() for clip in same}
+    used = {scenario.find(label) for label in by_label}
     wanted = [name for name in scenario.classes if name not in {UNKNOWN, scenario.find(SILENCE)}]
     if not by_label:
         reasons = "; ".join(f"{count}: {reason}" for reason, count in sorted(skipped.items()))
@@ -183,27 +191,26 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
             f"no clip can be laid into a scene ({reasons[:300]}); give clips of "
             f"{', '.join(wanted)[:300]}"
         )
+    laid = [clip for same in by_label.values() for clip in same]
     silence = scenario.find(SILENCE) or SILENCE
-    coughs = [clip for same in by_label.values() for clip in same]
-    coughs = [clip for clip in coughs if scenario.find(clip.label) == COUGHING]
+    coughs = [clip for clip in laid if scenario.find(clip.label) == COUGHING]
     recorder = _Recorder(path, progress, options.scenes * (2 if coughs else 1))
     scenes: list[tuple[Labelling, Labelling]] = []
     singles: list[tuple[list[Span], Labelling]] = []
     sounds = 0
     for seed in range(options.seed, options.seed + options.scenes):
-        # Only one scene is held at a time.
-        spans, found = recorder.record(
-            compose(by_label, _read, _noise(options, seed), seed, options.gain)
-        )
-        sounds += sum(span.label != SILENCE for span in spans)
+        noise = partial(background, options.seconds, options.floor, options.colour, seed)
+        # Made in the call, so that one scene is held at a time.
+        spans, found = recorder.record(compose(by_label, _read, noise(), seed, options.gain))
+        sounds += len(_without_silence(spans))
         truth = [span._replace(label=scenario.find(span.label) or silence) for span in spans]
         scenes.append((_labelling(truth), found))
         if coughs:
-            noise = _noise(options, seed)
             singles.append(
-                recorder.record(compose_single(COUGHING, coughs, _read, noise, seed, options.gain))
+                recorder.record(
+                    compose_single(COUGHING, coughs, _read, noise(), seed, options.gain)
+                )
             )
-            del noise
     each = [evaluate_labelling(truth, found, model.classes) for truth, found in scenes]
     true, said = (_apart(same) for same in zip(*scenes, strict=True))
     whole = evaluate_labelling(true, said, model.classes)
@@ -222,7 +229,9 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
         coughs=_single_coughs(singles, silence) if singles else None,
         evaluated_seconds=whole.evaluated_seconds,
         sounds=sounds,
-        clips=sum(map(len, by_label.values())),
+        clips=len(laid),
+        sources=len({clip.source_group for clip in laid}),
+        sources_learned=_sources_learned(model, laid, scenario),
         lacking=tuple(name for name in wanted if name not in used),
         skipped=skipped,
         truth=scenes[0][0],
@@ -246,25 +255,28 @@ def _usable(clips: Sequence[LabelledClip], scenario: Scenario) -> tuple[Clips, d
             skipped[f"label {clip.label} is not in the scenario"] += 1
         elif name in {UNKNOWN, silence}:
             skipped[f"class {name} is not laid"] += 1
-        elif audio_seconds(clip.path) < FRAME_SECONDS:
+        elif min(audio_seconds(clip.path), clip.end) - clip.start < FRAME_SECONDS:
             skipped[f"shorter than a frame of {1000 * FRAME_SECONDS:g} ms"] += 1
         else:
             chosen.setdefault(clip.label, []).append(clip)
     return chosen, dict(sorted(skipped.items()))
 
 
-def _noise(options: SceneOptions, seed: int) -> Float32:
-    return background(options.seconds, options.floor, options.colour, seed)
-
-
 def _read(clip: LabelledClip) -> Float32:
     blocks, length = [], 0
-    for block in read_audio(clip.path):
+    for block in read_audio(clip.path, clip.start, clip.end):
         blocks.append(block)
         length += len(block)
         if length >= _MOST_SECONDS * SAMPLE_RATE:
             break
     return np.concatenate(blocks)
+
+
+def _sources_learned(model: Model, clips: Sequence[LabelledClip], scenario: Scenario) -> int:
+    """Count the source groups of which a model has learned from a segment."""
+    features = feature_set(model.description.feature_set)
+    recordings = clip_recordings(clips, scenario, ignore_progress, features)
+    return len(learned_groups(model, cut_recordings(recordings, scenario, features)))
 
 
 class _Recorder:
@@ -302,6 +314,10 @@ def _write(path: Path, samples: Float32) -> None:
             file.writeframes(np.rint(part * np.float32(32767)).astype("<i2").tobytes())
 
 
+def _without_silence(spans: Sequence[Span]) -> list[Span]:
+    return [span for span in spans if span.label != SILENCE]
+
+
 def _labelling(spans: Sequence[Span]) -> Labelling:
     times = np.array([(start, end) for start, end, _ in spans])
     starts, ends = np.rint(times * NANOSECONDS).astype(np.int64).T
@@ -326,7 +342,7 @@ def _single_coughs(scenes: Sequence[tuple[list[Span], Labelling]], silence: str)
     """Look for single coughs in what was labelled."""
     count, others, lengths = 0, 0, []
     for spans, found in scenes:
-        coughs = [span for span in spans if span.label != SILENCE]
+        coughs = _without_silence(spans)
         same = found.labels == COUGHING
         starts, ends = found.starts[same] / NANOSECONDS, found.ends[same] / NANOSECONDS
         for begin, end, _ in coughs:

@@ -16,6 +16,7 @@ from hearthlog.analyzer.training.dataset import (
     clip_recordings,
     cut_recordings,
 )
+from hearthlog.analyzer.training.learned_segments import learned_groups
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.analyzer.training.rooms import (
     RoomCopy,
@@ -126,11 +127,14 @@ class Robustness:
         By the name of the condition.
     skipped : mapping of str to int
         Why clips gave no segment, and how many.
+    sources_learned : int
+        Sources of which the model has learned from a segment.
     """
 
     unchanged: Scores
     changed: Mapping[str, Changed]
     skipped: Mapping[str, int]
+    sources_learned: int
 
 
 def robustness(
@@ -161,19 +165,20 @@ def robustness(
         If a clip cannot be read.
     """
     scenario = fitted(scenario, model)
-    classifier, done, groups = Classifier(model), 0, 0
+    done = groups = learned = 0
     targets: list[Indices] = []
     group_numbers: list[Indices] = []
     predictions: list[Indices] = []
     skipped: Counter[str] = Counter()
     batches = list(_batches(clips))
-    results = in_parallel(delayed(_judge)(one, classifier, scenario, conditions) for one in batches)
+    results = in_parallel(delayed(_judge)(one, model, scenario, conditions) for one in batches)
     for batch, judged in zip(batches, results, strict=True):
         targets.append(judged.target)
         predictions.append(judged.predicted)
         group_numbers.append(judged.group + groups)
         groups += len(batch)
         skipped.update(judged.skipped)
+        learned += judged.sources_learned
         done += len(batch)
         progress(done / len(clips))
     target, group = np.concatenate(targets), np.concatenate(group_numbers)
@@ -193,6 +198,7 @@ def robustness(
             for condition, predicted in zip(conditions, others, strict=True)
         },
         skipped=dict(sorted(skipped.items())),
+        sources_learned=learned,
     )
 
 
@@ -203,6 +209,7 @@ class _Judged(NamedTuple):
     group: Indices
     predicted: Indices  # shape (1 + conditions, n)
     skipped: Mapping[str, int]
+    sources_learned: int
 
 
 def _batches(clips: Sequence[LabelledClip]) -> Iterator[list[tuple[int, LabelledClip]]]:
@@ -222,11 +229,12 @@ def _batches(clips: Sequence[LabelledClip]) -> Iterator[list[tuple[int, Labelled
 
 def _judge(
     numbered: Sequence[tuple[int, LabelledClip]],
-    classifier: Classifier,
+    model: Model,
     scenario: Scenario,
     conditions: Sequence[Condition],
 ) -> _Judged:
     """Cut clips into segments, and run a model on them in all conditions."""
+    classifier = Classifier(model)
     features = classifier.feature_set
     clips = [clip for _, clip in numbered]
     recordings = clip_recordings(clips, scenario, ignore_progress, features)
@@ -241,7 +249,8 @@ def _judge(
     for place, (windows, floor) in enumerate(versions):
         inputs = of_segments(classifier.inputs, windows, floor)
         predicted[place] = segment_probabilities(classifier, inputs).argmax(axis=1)
-    return _Judged(data.target, data.group, predicted, data.skipped)
+    learned = len(learned_groups(model, data))
+    return _Judged(data.target, data.group, predicted, data.skipped, learned)
 
 
 def _changed(

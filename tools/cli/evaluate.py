@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from hearthlog.schemas.text import shortened
-from hearthlog.tools.cli.evaluate_sounds import robustness, scenes
+from hearthlog.tools.cli.evaluate_sounds import learned_lines, robustness, scenes
 from hearthlog.tools.cli.options import (
     METHOD,
     METHODS,
@@ -181,10 +181,7 @@ def evaluate_model(
         print_scores(scores, result.detections)
         print_reliability(result.reliability, result.expected_calibration_error)
         print_skipped(result.skipped, "clips")
-    if result.sources_learned:
-        count = f"{result.sources_learned:,} of the {number(scores.groups, 'source')}"
-        warning = f"the model has learned from {count}: the figures flatter it; leave these out"
-        end_with_warnings([warning])
+    end_with_warnings(learned_lines(result.sources_learned, scores.groups))
 
 
 evaluate.command()(scenes)

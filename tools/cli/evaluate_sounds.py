@@ -45,7 +45,7 @@ def scenes(
 ) -> None:
     """Compose scenes of labelled clips, record them with a model, and score its labels.
 
-    Exit status 3: a class has no clip.
+    Exit status 3: a class has no clip, or the model has learned from some of the clips.
     """
     from hearthlog.analyzer.evaluation.evaluate_scenes import (
         SceneOptions,
@@ -78,6 +78,8 @@ def scenes(
                 "evaluated_seconds": found.evaluated_seconds,
                 "sounds": found.sounds,
                 "clips": found.clips,
+                "sources": found.sources,
+                "sources_learned": found.sources_learned,
                 "skipped": dict(found.skipped),
             }
         )
@@ -93,9 +95,11 @@ def scenes(
         if found.coughs is not None:
             print_coughs(found.coughs)
         print_skipped(found.skipped, "clips")
+    warnings = learned_lines(found.sources_learned, found.sources)
     if found.lacking:
         names = ", ".join(found.lacking)
-        end_with_warnings([f"{data}: has no clip of {names}: what is labelled so is a false alarm"])
+        warnings.append(f"{data}: has no clip of {names}: what is labelled so is a false alarm")
+    end_with_warnings(warnings)
 
 
 def robustness(
@@ -106,7 +110,10 @@ def robustness(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Score a model on labelled clips in noise, in other rooms and by other microphones."""
+    """Score a model on labelled clips in noise, in other rooms and by other microphones.
+
+    Exit status 3: the model has learned from some of the clips.
+    """
     from hearthlog.analyzer.evaluation import robustness as evaluation
 
     check_output("--plot", plot, ".png", "a picture")
@@ -127,15 +134,25 @@ def robustness(
                     for name, one in found.changed.items()
                 },
                 "skipped": dict(found.skipped),
+                "sources_learned": found.sources_learned,
             }
         )
-        return
-    print(
-        f"model {loaded.name}, scenario {classes.name}: {found.unchanged.segments} segments of 1 s "
-        f"from {found.unchanged.groups} sources\n"
-    )
-    print_robustness(found)
-    print_skipped(found.skipped, "clips")
+    else:
+        print(
+            f"model {loaded.name}, scenario {classes.name}: {found.unchanged.segments} segments of "
+            f"1 s from {found.unchanged.groups} sources\n"
+        )
+        print_robustness(found)
+        print_skipped(found.skipped, "clips")
+    end_with_warnings(learned_lines(found.sources_learned, found.unchanged.groups))
+
+
+def learned_lines(learned: int, sources: int) -> list[str]:
+    """Say in a line of how many sources a model has learned, if of any."""
+    if not learned:
+        return []
+    count = f"{learned:,} of the {number(sources, 'source')}"
+    return [f"the model has learned from {count}: the figures flatter it; leave these out"]
 
 
 def _read(
