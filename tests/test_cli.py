@@ -1,6 +1,7 @@
 """The command line tells what is in a log, stays light where it must, and shows the whole way."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -53,6 +54,41 @@ def test_info_for_people_has_the_same_figures(logs, hearthlog):
     assert "hearthlog_msgs/msg/AudioFeatures" in text
 
 
+def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(logs, hearthlog):
+    figures = json.loads(hearthlog("info", logs, "--json").stdout)
+    heard, unsure, *_, last = hearthlog("info", logs).stdout.splitlines()
+    minutes = sorted(figures["labels"]["hall"].values(), reverse=True)
+    assert re.findall(r"([\d.]+) min", heard) == [f"{each:.1f}" for each in minutes]
+    rattles = figures["segments"]["hall"]["objects_activity"]
+    assert re.search(rf"household sounds [\d.]+ min \({rattles}\)", heard)
+    amounts = figures["unsure"]["hall"]
+    doubt = f"{amounts['minutes']:.1f} min ({amounts['segments']})"
+    assert unsure.startswith(f"hall is unsure of: {doubt} of these, and 0.0 min (0) of no class")
+    assert last == f"next: {figures['next']}"
+    assert last == f"next: ten spans to judge: hearthlog review {logs} --queue"
+    assert figures["streams"][0]["starter"] is False
+
+
+def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
+    day, hearthlog, tmp_path
+):
+    logs, labels = tmp_path / "logs", tmp_path / "day.txt"
+    hearthlog("record", day, "--model", "general", "-o", logs)
+    found = hearthlog("info", logs).stdout
+    assert re.search(r"model general \(\w{12}\), a starter, which has never heard this home", found)
+    assert found.splitlines()[-1].endswith(f"hearthlog review {logs} --queue")
+    hearthlog("export", logs, "-o", labels, "--topics", "/mic/segment")
+    hearthlog("annotate", "import", logs, labels)
+    assert hearthlog("info", logs).stdout.splitlines()[-1] == (
+        f"next: a model of this home, from what is marked: hearthlog train --home {logs}"
+    )
+    (bare := tmp_path / "bare").mkdir()
+    hearthlog("record", day, "--model", "none", "-o", bare)
+    assert hearthlog("info", bare).stdout.splitlines()[-1] == (
+        f"next: nothing is labelled: hearthlog relabel {bare} --model general"
+    )
+
+
 def test_info_says_in_json_what_the_files_are_and_carry(logs, hearthlog):
     found = json.loads(hearthlog("info", logs, "--json").stdout)
     assert found["profiles"] == ["ros2"]
@@ -88,8 +124,9 @@ def test_info_lists_the_first_gaps_and_json_all_of_them_with_status_3(hearthlog,
     log = gaps(tmp_path / "a.mcap", 15)
     text = hearthlog("info", log)
     assert text.returncode == 3
-    total, first, *_, more = text.stdout.splitlines()[-12:]
-    assert total == "15 gaps, together 3.750 s"
+    total, *_ = text.stdout.splitlines()
+    assert total == "not heard: 15 gaps, together 3.750 s"
+    first, *_, more = text.stdout.splitlines()[-11:]
     assert first == "gap: hall 2026-03-01T07:00:00.000Z 0.250 s, 5 frames: overrun"
     assert more == "gap: and 5 more (--json lists all)"
     result = hearthlog("info", log, "--json")

@@ -414,6 +414,23 @@ def test_a_queue_is_of_many_days_and_classes(tmp_path):
     assert queue.labels.count("coughing") == queue.labels.count("speech") == 4
 
 
+def test_what_is_mostly_silence_is_not_uncertain(tmp_path):
+    """Silence to the gate that smoothing calls speech, silence in doubt, and two doubtful words."""
+
+    def probabilities(second, _):
+        if second < 20:
+            return [1.0, 0.0, 0.0] if second < 10 else [0.6, 0.4, 0.0]
+        return [0.4, 0.3, 0.3]
+
+    rows = [(0, 10, "speech"), (10, 20, "silence"), (20, 24, "speech"), (24, 28, "silence")]
+    sources = find_labellings(write_home(tmp_path / "home.mcap", rows, probabilities))
+    live = sources.read("mic", "live")
+    options = {"other": None, "marks": None, "count": 9, "ranking": "uncertain"}
+    queue = make_queue(sources, "mic", live, **options)
+    assert sorted(queue.labels) == ["silence", "speech"]
+    assert ((queue.spans.starts - MIDNIGHT) / NANOSECONDS).min() == 20.0
+
+
 def test_of_a_long_segment_the_ten_worst_seconds_are_in_the_queue(tmp_path):
     def probabilities(second, _):
         return [0.0, 0.2, 0.8] if 30 <= second < 40 else [0.0, 1.0, 0.0]

@@ -562,6 +562,30 @@ def no_display(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_display")
+@pytest.mark.parametrize("words", [("--queue",), ("--queue", "uncertain", "--spans", "10")])
+def test_without_a_display_a_queue_is_a_label_file_to_correct(home, tmp_path, capfd, words):
+    path = tmp_path / "ten.txt"
+    done = run(capfd, "review", home, *words, "--save", path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.endswith(f"as marks: hearthlog annotate import {home} {path}\n")
+    items = queue_items("uncertain", find_labellings(home), ("mic", "live"), (None, None), None)
+    lines = path.read_text().splitlines()
+    assert len(lines) == len(done.stdout.splitlines()) - 1 == len(items) > 3
+    path.write_text("".join(f"{line.rpartition(chr(9))[0]}\tyelling\n" for line in lines))
+    assert run(capfd, "annotate", "import", home, path).returncode == 0
+    marks = layers(home)  # one that reaches into the next log is two
+    assert sum(m.end - m.start for m in marks) == sum(item.end - item.start for item in items)
+    assert {m.label for m in marks} == {"yelling"}
+
+
+@pytest.mark.usefixtures("no_display")
+def test_a_queue_without_a_value_is_one_of_uncertain_spans(home, capfd):
+    for words in (("--queue", home), (home, "--queue"), (home, "--queue", "--spans", "3")):
+        done = run(capfd, "review", *words)
+        assert (done.returncode, "no display" in done.stderr) == (1, True)
+
+
+@pytest.mark.usefixtures("no_display")
 def test_without_a_display_it_says_what_else_there_is(recorded_home, capfd):
     done = run(capfd, "review", recorded_home)
     assert done.returncode == 1
@@ -584,7 +608,7 @@ def test_a_port_that_is_in_use_is_said(recorded_home, capfd):
     ("options", "expected"),
     [
         (["--save", "a.rrd", "--web"], (2, "--save makes a file")),
-        (["--save", "a.rrd", "--queue", "novel"], (2, "--save makes a file")),
+        (["--save", "a.rrd", "--queue", "novel"], (2, "of a queue it is a label file")),
         (["--day", "2026-03-01", "--start", "2026-03-01T07:00"], (2, "--day is a span of its own")),
         (["--day", "someday", "--save", "a.rrd"], (2, "not a day such as 2026-03-01")),
         (["--day", "2020-01-01", "--save", "a.rrd"], (1, "in this span of time")),

@@ -152,6 +152,17 @@ def test_labels_segments_and_gaps_are_those_of_the_messages(logs, model_file):
     assert seconds == pytest.approx({label: count * 0.05 for label, count in frames.items()})
     segments = Counter(m.label for path in logs for m in read(path, "segment"))
     assert summary.segments == {"hall": segments}
+    doubtful = [
+        m
+        for path in logs
+        for m in read(path, "segment")
+        if m.confidence < 0.5 and m.label not in {"silence", "unknown"}
+    ]
+    assert len(doubtful) > 3
+    assert summary.unsure["hall"]["segments"] == len(doubtful)
+    assert summary.unsure["hall"]["seconds"] == pytest.approx(
+        sum(nanoseconds(m.duration) for m in doubtful) / SECOND
+    )
     assert summary.gaps == [
         GapSummary(
             "hall",

@@ -53,6 +53,21 @@ class HomeLogs:
         """
         return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
 
+    def latest_models(self) -> list[tuple[str, str]]:
+        """List the models that labelled the latest log of each recorder, each of them once.
+
+        Returns
+        -------
+        list of (str, str)
+            Names and SHA-256, empty for a recorder without a model.
+        """
+        by_node: dict[str, list[Path]] = {}
+        for entry in self.between(0, _NEVER):
+            by_node.setdefault(entry.node, []).append(entry.path)
+        records = (next(latest_records(logs), {}) for logs in by_node.values())
+        named = ((one.get("model", ""), one.get("model_sha256", "")) for one in records)
+        return list(dict.fromkeys(named))
+
     @property
     def layers(self) -> list[str]:
         """Names of the models that have relabelled logs."""

@@ -11,6 +11,7 @@ from mcap.records import Channel, Schema
 from hearthlog.analyzer.logs.health import statuses_of
 from hearthlog.analyzer.logs.summary import GapSummary, Summary, TopicSummary, worse
 from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -35,10 +36,11 @@ _STREAM = {
 _FIELDS = {
     message_types.STREAM_INFO: _STREAM.values(),
     message_types.LABEL: ("label",),
-    message_types.SEGMENT: ("label", "duration"),
+    message_types.SEGMENT: ("label", "duration", "confidence"),
     message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
     message_types.DIAGNOSTICS: ("status",),
 }
+_UNSURE = 0.5  # of a segment with a lower confidence another label is likelier than its own
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
 _TIMES = 16  # bytes of an attachment before its name
@@ -169,6 +171,8 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
         summary.segments.setdefault(microphone, Counter()).update(columns["label"].tolist())
         if microphone.endswith(f"/{REVIEW}"):  # which has no labels frame by frame
             _note_marks(summary.label_seconds.setdefault(microphone, Counter()), columns)
+        else:
+            _note_unsure(summary.unsure.setdefault(microphone, Counter()), columns)
     elif columns.type == message_types.GAP:
         starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
         fields = starts, seconds, columns["reason"], columns["frames_lost"]
@@ -182,6 +186,17 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
     else:
         for status in statuses_of(columns):
             summary.health = worse(summary.health, status)
+
+
+def _note_unsure(unsure: Counter[str], columns: Columns) -> None:
+    doubtful = columns["confidence"] < _UNSURE
+    for label, duration in zip(
+        columns["label"][doubtful].tolist(),
+        (columns["duration"][doubtful] / NANOSECONDS).tolist(),
+        strict=True,
+    ):
+        if class_name(label) not in {SILENCE, UNKNOWN}:
+            unsure.update({"segments": 1, "seconds": duration})
 
 
 def _note_marks(seconds: Counter[str], columns: Columns) -> None:

@@ -79,6 +79,8 @@ class Summary:
     # by microphone and label; those of a layer are under the name of its topic
     label_seconds: dict[str, Counter[str]] = field(default_factory=dict)
     segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number, likewise
+    # `segments` and `seconds` of them whose labels are likelier wrong than right, likewise
+    unsure: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[GapSummary] = field(default_factory=list)
     # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
@@ -136,6 +138,8 @@ class Summary:
             self.label_seconds.setdefault(microphone, Counter()).update(seconds)
         for microphone, counts in other.segments.items():
             self.segments.setdefault(microphone, Counter()).update(counts)
+        for microphone, amounts in other.unsure.items():
+            self.unsure.setdefault(microphone, Counter()).update(amounts)
         self.gaps += other.gaps
         self.streams += [stream for stream in other.streams if stream not in self.streams]
         self.health = worse(self.health, other.health)

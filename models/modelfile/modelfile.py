@@ -118,6 +118,10 @@ def load_model(path: Path) -> Model:
     path = _starter(path) or _pointed_to(path)
     if not path.stem.isprintable():
         raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+    if path.suffix != SUFFIX and not os.path.lexists(path):
+        raise ModelError(
+            f"{path}: there is no such model file; the starter models are {' and '.join(STARTERS)}"
+        )
     data = read_whole(path, "model file", _SIZE_LIMIT, ModelError)
     _check_header(path, data)
     try:

@@ -6,6 +6,7 @@ champions, the last one at the end. It is written before the link: if a command 
 the two, it ends with the current champion, which is skipped.
 """
 
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,7 @@ from pathlib import Path
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+from hearthlog.models.starter import STARTERS, starter_file
 from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
 
 CHAMPION, CANDIDATE = ALIASES = ("champion", "candidate")
@@ -141,6 +143,41 @@ def load(folder: Path, name: str) -> Model:
     return load_model(_path(folder, resolve(folder, name)))
 
 
+def find_model(folder: Path, sha256: str) -> Path | None:
+    """Find a model by its content, in a folder or among the starter models.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files; need not exist.
+    sha256 : str
+        Of the file.
+
+    Returns
+    -------
+    Path or None
+        The file; None if there is none.
+    """
+    for path in [*sorted(folder.glob("[!.]*" + SUFFIX)), *map(starter_file, STARTERS)]:
+        if path.is_file() and not path.is_symlink() and _digest(path) == sha256:
+            return path
+    return None
+
+
+def is_starter(name: str, sha256: str) -> bool:
+    """Tell whether a model is a starter model of this version.
+
+    Parameters
+    ----------
+    name : str
+        Of the model.
+    sha256 : str
+        Of its file.
+    """
+    file = starter_file(name)
+    return name in STARTERS and file.is_file() and _digest(file) == sha256
+
+
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
     """Point an alias to a model, if that model can be used.
 
@@ -220,6 +257,11 @@ def _entry(folder: Path, name: str, aliases: tuple[str, ...]) -> ModelEntry:
 
 def _path(folder: Path, name: str) -> Path:
     return folder / (name + SUFFIX)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _check_folder(folder: Path) -> None:

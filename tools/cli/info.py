@@ -1,6 +1,7 @@
 """`hearthlog info`: what is in a log, or in a folder of logs."""
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -9,7 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.starter import GENERAL
+from hearthlog.schemas.messages.message_types import RAW_AUDIO
+from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.progress import Progress
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.options import Json, Log
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
@@ -34,6 +40,7 @@ def info(
     if catalog:
         wrong_use("say `hearthlog catalog FOLDER`")
     from hearthlog.analyzer.logs.summarise import summarise
+    from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
 
     with share_done("reading logs") as progress:
@@ -42,10 +49,15 @@ def info(
         tell(error)
     if not summary.files:
         raise typer.Exit(1)
+    for stream in summary.streams:
+        stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
+    following = _next(summary, path)
     if as_json:
-        print(json.dumps(_as_json(summary), indent=2))
+        print(json.dumps(_as_json(summary) | {"next": following}, indent=2))
     else:
         _print(summary)
+        if following is not None:
+            print(printable(f"next: {following}"))
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
 
@@ -90,6 +102,10 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
             microphone: dict(labels.most_common())
             for microphone, labels in summary.segments.items()
         },
+        "unsure": {
+            microphone: {"minutes": amounts["seconds"] / 60, "segments": int(amounts["segments"])}
+            for microphone, amounts in summary.unsure.items()
+        },
         "gaps": [asdict(gap) | {"start": moment(gap.start)} for gap in summary.gaps],
         "gap_seconds": summary.gap_seconds,
         "health": _health(summary),
@@ -113,6 +129,7 @@ def _health(summary: "Summary") -> dict[str, str] | None:
 
 
 def _print(summary: "Summary") -> None:
+    print_lines(_gist(summary))
     print_lines(_lines(summary))
     topics = [
         (
@@ -127,6 +144,49 @@ def _print(summary: "Summary") -> None:
     print_table(("topic", "type", "messages", "per second", "MB raw"), topics, words=2)
     print_table(("microphone", "label", "minutes", "segments"), _label_rows(summary), words=2)
     print_lines(_gap_lines(summary))
+
+
+def _gist(summary: "Summary") -> Iterator[str]:
+    """Say in words what was heard, how much of it is in doubt, and what was not heard."""
+    from hearthlog.analyzer.report.class_words import in_words
+
+    for microphone, seconds in summary.label_seconds.items():
+        if "/" in microphone:  # of a layer
+            continue
+        segments = summary.segments.get(microphone, Counter())
+        unsure = summary.unsure.get(microphone, Counter())
+        known = [label for label, _ in seconds.most_common() if class_name(label) != UNKNOWN]
+        amounts = (
+            f"{in_words(label).lower()} {seconds[label] / 60:.1f} min"
+            f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
+            for label in known
+        )
+        yield f"{microphone} heard: {', '.join(amounts)}"
+        other = seconds.keys() - set(known)
+        yield (
+            f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
+            f"of these, and {sum(seconds[label] for label in other) / 60:.1f} min "
+            f"({sum(segments[label] for label in other)}) of no class that it knows"
+        )
+    if summary.gaps:
+        yield (
+            f"not heard: {number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
+        )
+
+
+def _next(summary: "Summary", path: Path) -> str | None:
+    """Say what to do for better labels; None if these are no logs of a recorder."""
+    if not summary.streams:
+        return None
+    place, latest = shlex.quote(str(path)), summary.streams[-1]
+    if not latest["model"]:
+        return f"nothing is labelled: hearthlog relabel {place} --model {GENERAL}"
+    marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
+    if marked and latest["starter"]:
+        return f"a model of this home, from what is marked: hearthlog train --home {place}"
+    kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
+    what = "listen to" if kept else "judge"
+    return f"ten spans to {what}: hearthlog review {place} --queue"
 
 
 def _lines(summary: "Summary") -> Iterator[str]:
@@ -156,7 +216,7 @@ def _lines(summary: "Summary") -> Iterator[str]:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
         yield (
             f"{stream['microphone']}: {stream['device']}, features {stream['feature_set']}, "
-            f"model {model}"
+            f"model {model}{', a starter, which has never heard this home' * stream['starter']}"
         )
     health = _health(summary)
     if health is not None:
@@ -164,8 +224,6 @@ def _lines(summary: "Summary") -> Iterator[str]:
 
 
 def _gap_lines(summary: "Summary") -> Iterator[str]:
-    if summary.gaps:
-        yield f"{number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
     lines = [
         f"{gap.microphone} {moment(gap.start)} {gap.seconds:.3f} s, "
         f"{number(gap.frames_lost, 'frame')}: {gap.reason}"

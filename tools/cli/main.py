@@ -34,7 +34,7 @@ from hearthlog.tools.cli.recover import recover
 from hearthlog.tools.cli.relabel import relabel
 from hearthlog.tools.cli.replay import replay
 from hearthlog.tools.cli.report import report
-from hearthlog.tools.cli.review import review
+from hearthlog.tools.cli.review import ReviewCommand, review
 from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.train import train
 from hearthlog.tools.cli.watch import watch
@@ -46,7 +46,7 @@ app = typer.Typer(
 )
 _ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover)
 for verb in (*_ON_LOGS, train, enrol, diff, review, watch, report, replay, relabel, demo):
-    app.command()(verb)
+    app.command(cls=ReviewCommand if verb is review else None)(verb)
 app.add_typer(annotate, name="annotate")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(models, name="models")

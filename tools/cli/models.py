@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, manifest_path
+from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, manifest_path, models_folder
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
@@ -40,7 +40,7 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
     """List the models; exit status 3: one of them cannot be used."""
     from hearthlog.models.modelfile.registry import list_models
 
-    entries = list_models(_folder(folder))
+    entries = list_models(models_folder(folder))
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
@@ -58,7 +58,7 @@ def show(
     from hearthlog.models.modelfile.card import model_card
     from hearthlog.models.modelfile.registry import load
 
-    model = load(_folder(folder), name)
+    model = load(models_folder(folder), name)
     if as_json:
         result = {"name": model.name, "sha256": model.sha256} | model.description.model_dump()
         print(json.dumps(result, indent=2))
@@ -89,7 +89,7 @@ def compare(
 
     if (data is None) == (logs is None):
         wrong_use("give either --data or --logs")
-    place = _folder(folder)
+    place = models_folder(folder)
     first, second = load(place, a), load(place, b)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     features = feature_set(first.description.feature_set)
@@ -117,7 +117,7 @@ def promote(
     """Check a model, and make it the champion in one step; a recorder that runs takes it over."""
     from hearthlog.models.modelfile.registry import promote as promote_model
 
-    place = _folder(folder)
+    place = models_folder(folder)
     model, before = promote_model(place, name, to)
     if model.name == before:
         print(f"{model.name} is the {to} already")
@@ -130,7 +130,7 @@ def rollback(folder: _Folder = None) -> None:
     """Make the champion before the champion again."""
     from hearthlog.models.modelfile.registry import rollback as roll_back
 
-    model, before = roll_back(_folder(folder))
+    model, before = roll_back(models_folder(folder))
     print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
 
 
@@ -148,20 +148,6 @@ def _recordings(
     clips = read_manifest(manifest_path(data), scenario.labels)
     with share_done(f"listening to {len(clips)} clips") as report:
         return list(clip_recordings(clips, scenario, report, features))
-
-
-def _folder(given: Path | None) -> Path:
-    from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
-    from hearthlog.models.starter import STARTERS
-    from hearthlog.recorder.config import NO_MODEL, load_settings
-
-    if given is not None:
-        return given
-    configured = load_settings(None, {}, {}).model
-    if configured in {None, NO_MODEL, *map(Path, STARTERS)}:
-        return DEFAULT_FOLDER
-    assert configured is not None
-    return configured.parent
 
 
 def _after(before: str | None) -> str:

@@ -76,6 +76,21 @@ def manifest_path(path: Path) -> Path:
     return path / "manifest.csv" if path.is_dir() else path
 
 
+def models_folder(given: Path | None = None) -> Path:
+    """Return the folder of models: the given one, that of the configured model, or `models`."""
+    from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+    from hearthlog.models.starter import STARTERS
+    from hearthlog.recorder.config import NO_MODEL, load_settings
+
+    if given is not None:
+        return given
+    configured = load_settings(None, {}, {}).model
+    if configured in {None, NO_MODEL, *map(Path, STARTERS)}:
+        return DEFAULT_FOLDER
+    assert configured is not None
+    return configured.parent
+
+
 def check_output(option: str, path: Path | None, suffix: str, what: str) -> None:
     """End with the exit status of wrong use unless a new file may have this name.
 

@@ -8,14 +8,17 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
+from typer.core import TyperCommand
 
+from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
 from hearthlog.schemas.text import printable
-from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS, time_text
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
 from hearthlog.tools.cli.options import End, Microphone, Start, Timezone, parse_span, reviewer_name
 from hearthlog.tools.cli.progress import share_done
-from hearthlog.tools.cli.text import end_with_warnings, wrong_use
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.review.session.marking import Marking
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.timeline.model import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
+_QUEUE = "--queue"
 _ALL_FRAMES = 3 * 3600 * NANOSECONDS  # of more, the viewer would take a gigabyte
 
 
@@ -36,17 +40,25 @@ def review(
     *,
     save: Annotated[
         Path | None,
-        typer.Option("--save", "--output", "-o", help="Make a Rerun recording, *.rrd, instead."),
+        typer.Option(
+            "--save",
+            "--output",
+            "-o",
+            help="Make a Rerun recording, *.rrd, instead; with --queue a label file of its spans.",
+        ),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
     queue: Annotated[
         str | None,
         typer.Option(
-            help="Go through spans that are uncertain, novel, disagreeing or random, or through "
-            "a list of `hearthlog diff --list`."
+            help="Go through spans that are uncertain (as without a value), novel, disagreeing or "
+            "random, or through a list of `hearthlog diff --list`."
         ),
     ] = None,
-    spans: Annotated[int, typer.Option(min=1, help="How many to go through.")] = 60,
+    spans: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many to go through.", show_default="10; all of a list"),
+    ] = None,
     labels: Annotated[
         str, typer.Option(help="Labelling to correct: live, or the model of a relabel layer.")
     ] = "live",
@@ -62,8 +74,8 @@ def review(
     Drag a span on the time ruler and press a key in the terminal. Every mark is in the review
     layer at once. Exit status 3: some logs could not be read, or not all of them could be shown.
     """
-    if save is not None and (web or queue or port):
-        wrong_use("--save makes a file: --web, --queue and --port go without it")
+    if save is not None and (web or port):
+        wrong_use("--save makes a file: --web and --port go without it")
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
@@ -75,6 +87,10 @@ def review(
         with share_done("reading logs") as progress:
             return read_timeline(logs, *limits, zone=timezone, progress=progress)
 
+    chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
+    if save is not None and queue is not None:
+        _save_queue(save, logs, chosen)
+        return
     if save is not None:
         check_output(save)
         timeline = read()
@@ -85,9 +101,29 @@ def review(
             signal.signal(number, _end)  # or the viewer would stay, and listen
         with _open(web=web, port=port) as viewer:
             timeline = read()
-            chosen = _Choice(labels, microphone, reviewer_name(reviewer), queue, spans, limits)
             _show(viewer, timeline, logs, chosen)
     end_with_warnings(timeline.losses)
+
+
+class ReviewCommand(TyperCommand):
+    """The command, whose option --queue may be without a value."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Parse arguments, with the ranking named where none is.
+
+        Parameters
+        ----------
+        ctx : typer.Context
+        args : list of str
+        """
+        from hearthlog.analyzer.review.queue.ranking import UNCERTAIN
+
+        if _QUEUE in args:
+            following = args.index(_QUEUE) + 1
+            value = args[following] if following < len(args) else "-"
+            if value.startswith("-") or Path(value).is_dir() or value.endswith(".mcap"):
+                args = [*args[:following], UNCERTAIN, *args[following:]]
+        return super().parse_args(ctx, args)
 
 
 def _end(number: int, _frame: object) -> None:
@@ -126,7 +162,7 @@ class _Choice(NamedTuple):
     microphone: str | None
     reviewer: str
     queue: str | None
-    spans: int
+    spans: int | None
     limits: tuple[int | None, int | None]
 
 
@@ -204,6 +240,39 @@ def _work(
         segments.get(labelling, no_spans()),
     )
     return items, marking
+
+
+def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
+    """Write the spans of a queue as labels that a person corrects where there is no viewer."""
+    from hearthlog.analyzer.logs.coverage import find_coverage
+    from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.marks.formats.label_files import write_labels
+    from hearthlog.analyzer.marks.marks import Mark
+    from hearthlog.analyzer.review.session.queue_items import queue_items
+
+    if find_format(path) is None:
+        wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")
+    if len(logs) > 1:
+        wrong_use("--save --queue: name one log or folder, as `hearthlog annotate import` takes it")
+    sources = find_labellings(*logs)
+    microphone = sources.microphone(choice.microphone)
+    labelling = sources.find(microphone, choice.labels)
+    assert choice.queue is not None
+    items = queue_items(choice.queue, sources, (microphone, labelling), choice.limits, choice.spans)
+    marks = sorted(Mark(microphone, item.start, item.end, item.label) for item in items)
+    write_labels(path, marks, find_coverage(logs[0]))
+    print_table(
+        ("from (UTC)", "seconds", "label"),
+        [
+            (time_text(one.start)[:19], f"{(one.end - one.start) / NANOSECONDS:.1f}", one.label)
+            for one in marks
+        ],
+    )
+    tell(
+        f"{path}: correct the labels, delete the lines that you cannot judge, and take the rest as "
+        f"marks: hearthlog annotate import {logs[0]} {path}"
+    )
+    end_with_warnings(sources.losses)
 
 
 def _microphone(timeline: "Timeline", name: str | None) -> str:

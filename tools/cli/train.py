@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.options import (
     CLIPS,
     METHOD,
@@ -17,6 +18,7 @@ from hearthlog.tools.cli.options import (
     Scheduler,
     chosen_method,
     manifest_path,
+    models_folder,
 )
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
@@ -36,8 +38,14 @@ _FEW_SECONDS = 30.0
 
 def train(
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Model file to make, *.safetensors.")
-    ],
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Model file to make, *.safetensors.",
+            show_default="of a home the next of models/home-1.safetensors …",
+        ),
+    ] = None,
     data: Annotated[list[Path] | None, typer.Option(help=CLIPS)] = None,
     scenario: Annotated[str | None, typer.Option(help=SCENARIO)] = None,
     home: Annotated[
@@ -47,7 +55,11 @@ def train(
         ),
     ] = None,
     base: Annotated[
-        Path | None, typer.Option(help="Model to adapt to the home, instead of --data.")
+        Path | None,
+        typer.Option(
+            help="Model to adapt to the home, instead of --data.",
+            show_default="the one that labelled the latest log",
+        ),
     ] = None,
     method: Annotated[str, typer.Option(help=METHODS)] = METHOD,
     cost: Annotated[
@@ -67,14 +79,20 @@ def train(
     """Learn a model from labelled sound, and measure it on sources it has not heard."""
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
 
+    if not data:
+        if scenario or not home or scheduler or (cost, gamma) != (None, None):
+            wrong_use("give --data and --scenario, or --home without what is about --data")
+        base = base or _model_of(home)
+        output = output or _next_of_home()
+    elif output is None or scenario is None or base is not None:
+        wrong_use("--data goes with --scenario and --output, and without --base")
     check_output(output)
-    if base is not None:
-        if data or scenario or not home or scheduler or (cost, gamma) != (None, None):
-            wrong_use("--base goes with --home, and with nothing that is about --data")
+    if not data:
+        assert base is not None
+        assert home is not None
         model, segments = _adapted(base, home)
     else:
-        if not data or not scenario:
-            wrong_use("give --data and --scenario, or --base and --home")
+        assert scenario is not None
         from hearthlog.analyzer.workers.parallel import joblib_on
 
         chosen = chosen_method(method, cost=cost, gamma=gamma)
@@ -88,6 +106,42 @@ def train(
     else:
         _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
+        if output.parent == models_folder():
+            print(
+                f"`hearthlog models promote {output.stem}` lets it label: a recorder without "
+                "--model takes it over within about a second"
+            )
+
+
+def _next_of_home() -> Path:
+    """Name the next model of the home, in the folder of models, which is made."""
+    folder = models_folder()
+    numbers = (path.stem.removeprefix("home-") for path in folder.glob("home-*.safetensors"))
+    number = max((int(text) for text in numbers if text.isdecimal()), default=0) + 1
+    folder.mkdir(exist_ok=True)
+    return folder / f"home-{number}.safetensors"
+
+
+def _model_of(home: list[Path]) -> Path:
+    """Find the model that labelled the latest log, and name it."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.models.modelfile.registry import find_model
+
+    (name, sha256), *others = find_home_logs(home).latest_models()
+    if others:
+        names = listed([name, *(other for other, _ in others)], "and")
+        wrong_use(f"the latest logs are labelled by {names}: choose one with --base")
+    if not name:
+        wrong_use("the latest log has no labels: name a model with --base, such as --base general")
+    folder = models_folder()
+    path = find_model(folder, sha256)
+    if path is None:
+        wrong_use(
+            f"the latest log is labelled by {name} ({sha256[:12]}), which is neither in "
+            f"{folder} nor a starter model of this version: name its file with --base"
+        )
+    tell(f"adapting {name}, which labelled the latest log")
+    return path
 
 
 def _learned(

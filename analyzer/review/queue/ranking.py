@@ -24,8 +24,9 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])
-RANDOM = "random"
-_ALONE = {"uncertain": 0, "disagreeing": 1, "novel": 2}  # rows of what is weighed
+_MOSTLY = 0.5
+UNCERTAIN, RANDOM = "uncertain", "random"
+_ALONE = {UNCERTAIN: 0, "disagreeing": 1, "novel": 2}  # rows of what is weighed
 RANKINGS = (*_ALONE, RANDOM)
 
 
@@ -93,7 +94,8 @@ def make_queue(  # noqa: PLR0913
     count : int
         Number of spans, at most.
     ranking : str, optional
-        One of `RANKINGS`, to rank by it alone; by default all but chance are weighed.
+        One of `RANKINGS`, to rank by it alone; by default all but chance are weighed. What is
+        mostly silence is not `uncertain`, for there is nothing to judge.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
 
@@ -128,6 +130,8 @@ def make_queue(  # noqa: PLR0913
         labels, differing = other_labels(spans, events_of(other.labelling, classes))
     parts = means.uncertainty.values(), differing, means.novelty.values()
     scores = _scores(np.stack(parts), ranking)
+    if ranking == UNCERTAIN:
+        scores[means.silence.values() >= _MOSTLY] = 0.0
     if not scores.any():
         raise DataError(f"{side.name}: no span is {ranking}")
     rows = _best_of_each(scores, spans.sources)

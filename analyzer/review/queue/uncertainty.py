@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.logs.columns import Columns
 
 
 class ModelUncertainty:
-    """Mean uncertainty and novelty of spans, of labels that come batch by batch.
+    """Mean uncertainty, novelty and silence of spans, of labels that come batch by batch.
 
     Parameters
     ----------
@@ -25,11 +26,13 @@ class ModelUncertainty:
     ----------
     uncertainty, novelty : SpanMeans
         0 to 1.
+    silence : SpanMeans
+        The probability of silence, which is 1 where nothing is above the floor of the room.
     """
 
     def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
         self._spans, self._classes = spans, classes
-        self.uncertainty, self.novelty = SpanMeans(len(spans)), SpanMeans(len(spans))
+        self.uncertainty, self.novelty, self.silence = (SpanMeans(len(spans)) for _ in range(3))
 
     def add(self, frames: Columns) -> None:
         """Add the labels of frames; probabilities without names are left out.
@@ -50,6 +53,8 @@ class ModelUncertainty:
             columns = np.array([place.get(name, -1) for name in self._classes])
             labelled = columns[self._spans.labels[row]]
             self.uncertainty.add(row, uncertainty(probabilities[inside], labelled))
+            silent = [class_name(name) == SILENCE for name in names]
+            self.silence.add(row, probabilities[inside][:, silent].sum(axis=1, dtype=np.float64))
 
 
 def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64:

@@ -10,11 +10,12 @@ from hearthlog.analyzer.review.queue.review_list import ReviewSpan, queued, read
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.schemas.messages.topics import REVIEW
 
+_TEN = 10  # which takes a person a few minutes
 Limits = tuple[int | None, int | None]
 
 
 def queue_items(
-    queue: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int
+    queue: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int | None
 ) -> list[ReviewItem]:
     """Choose spans of a labelling for a review.
 
@@ -27,8 +28,8 @@ def queue_items(
         The microphone, and the labelling: `live`, or `relabel/` and a model.
     limits : (int or None, int or None)
         Start and end in nanoseconds of UTC; None for all that there is.
-    count : int
-        How many, at most.
+    count : int or None
+        How many, at most; None for ten of a ranking, all of a list.
 
     Returns
     -------
@@ -60,7 +61,7 @@ def queue_items(
         side,
         other=other,
         marks=sources.marks(microphone, *limits),
-        count=count,
+        count=count or _TEN,
         ranking=queue,
     )
     return _items(queued(chosen, microphone, labelling, "" if other is None else other.name))

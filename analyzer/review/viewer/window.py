@@ -101,7 +101,8 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
         If there is no display, the viewer is not installed, or the port is in use.
     """
     check_display(
-        "--save FILE.rrd to make a file that Rerun opens elsewhere"
+        "--save FILE.rrd to make a file that Rerun opens elsewhere, with --queue FILE.txt to "
+        "correct it by hand"
         if data is None
         else "--serve to look from another machine"
     )
