@@ -156,7 +156,7 @@ def hmm_file(tmp_path_factory, model_file) -> Path:
 def day(tmp_path_factory) -> Path:
     """Three minutes of a simulated home, as FLAC."""
     path = tmp_path_factory.mktemp("day") / "day.flac"
-    write_day(path, minutes=3, seed=12)
+    write_day(path, 3, seed=12, manifest=None)
     os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
     return path
 

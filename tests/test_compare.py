@@ -46,13 +46,13 @@ def days(tmp_path_factory):
     folder = tmp_path_factory.mktemp("days")
     for number in range(3):
         sound = folder / f"{number}.flac"
-        spans = write_day(sound, minutes=1.5, seed=20 + number)
+        truth = write_day(sound, 1.5, seed=20 + number, manifest=None)
         start = START + number * DAY
         settings = Settings(output=folder / "logs")
         (log,) = record(settings, settings.microphone[0], FileSource([sound], start), Flag()).logs
         marks = [
             Mark("mic", *(start + round(time * SECOND) for time in span[:2]), span[2])
-            for span in spans
+            for span in truth.spans
         ]
         write_marks(log, marks)
     return folder / "logs"

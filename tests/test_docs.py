@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import app
+from hearthlog.tools.home.__main__ import home as simulate_home
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 ROOT = Path(__file__).parents[1]
@@ -59,7 +60,13 @@ def options_of(verb):
     return names - {"--help"}
 
 
-OPTIONS = {name for verb in VERBS.values() for name in options_of(verb)} | {"--help"}
+DEVELOPERS = typer.Typer()  # what is no verb
+DEVELOPERS.command()(simulate_home)
+OPTIONS = {
+    name
+    for verb in (*VERBS.values(), typer.main.get_command(DEVELOPERS))
+    for name in options_of(verb)
+} | {"--help"}
 
 
 def snippets(text):
@@ -257,7 +264,7 @@ def make_home(folder):
         "\n".join([head, *(f"clips/{line}" for line in lines)]) + "\n"
     )
     do("train --data clips --scenario general -o general.safetensors")
-    write_day(folder / "day.flac", minutes=2, seed=2)
+    write_day(folder / "day.flac", 2, seed=2, manifest=None)
     cough = next((folder / "clips" / "coughing").iterdir())
     for name in ("cough.flac", "cough.wav", "a.wav", "b.flac"):
         do_copy(cough, folder / name)

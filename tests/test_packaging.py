@@ -16,6 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
 DATA = {"py.typed", "page.html"}
+CLIPS = PurePosixPath("tools/home/clips")
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = CONFIGURATION["project"]
 
@@ -25,7 +26,8 @@ def installed_as(path):
     path = PurePosixPath(path)
     if path.parts[0] not in FOLDERS or path.parts[:2] == ("tools", "bench"):
         return None
-    if path.suffix not in {".py", ".msg"} and path.name not in DATA:
+    kept = path.name in DATA or path.is_relative_to(CLIPS)
+    if path.suffix not in {".py", ".msg"} and not kept:
         return None
     inner = path.relative_to("tools/package") if path.parts[1] == "package" else path
     return f"hearthlog/{inner}"

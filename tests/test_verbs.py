@@ -75,7 +75,7 @@ def folder(tmp_path_factory):
         (folder / path).parent.mkdir(exist_ok=True)
         (folder / path).write_text(TRAP)
     write_training_set(folder / "clips", clips_per_class=3, seed=1)
-    write_day(folder / "day.flac", minutes=2, seed=2)
+    write_day(folder / "day.flac", 2, seed=2, manifest=None)
     for command in MAKING:
         result = run(folder, command)
         assert (result.returncode, sprung(folder)) == (0, []), f"{command}: {result.stderr}"

@@ -64,7 +64,7 @@ class Workload:
         """
         if self.audio is None:
             day = self.folder / "day.flac"
-            write_day(day, self.minutes, _SEED + 1)
+            write_day(day, self.minutes, _SEED + 1, manifest=None)
             samples, _ = soundfile.read(day, dtype="int16")
         else:
             samples = _recordings(self.audio)

@@ -39,7 +39,7 @@ def demo(
 
     _say(f"1. Simulating a home: clips to learn from, and a day of {minutes:g} minutes")
     manifest = write_training_set(output / "clips", clips_per_class=12, seed=_SEED)
-    truth = write_day(day, minutes, seed=_SEED + 1)
+    truth = write_day(day, minutes, seed=_SEED + 1, manifest=None)
     scenario.write_text(
         "[classes]\n" + "".join(f'{label} = ["{label}"]\n' for label in LABELS), "utf-8"
     )
@@ -54,7 +54,7 @@ def demo(
     record_files(settings, settings.microphone[0], FileSource([day], start), Flag())
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
-    print(f"{_agreement(logs, start, truth):.1%} of the labels are what was simulated")
+    print(f"{_agreement(logs, start, truth.spans):.1%} of the labels are what was simulated")
     print("(synthetic sounds are easy to tell apart; those of a real home are not)")
 
     _say(f"4. hearthlog info {logs}")

@@ -1,0 +1,335 @@
+"""Days of a home are planned, composed of real clips, and recorded with known truth."""
+
+import csv
+import shutil
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+import soundfile
+from mcap.reader import make_reader
+
+from hearthlog.models.features.auros21 import AUROS21
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.licences import may_be_shipped
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.recording import record_files
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
+from hearthlog.tools.home.composition import Composition
+from hearthlog.tools.home.plan import Plan, PlannedSound, SteadyNoise
+from hearthlog.tools.home.record import record_composition, write_sound
+from hearthlog.tools.home.rooms import PERIOD_FRAMES, Rooms
+from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
+from hearthlog.tools.home.truth import truth_of
+
+HOUR = DAY_FRAMES // 24
+START = 1_772_323_200_000_000_000
+PERSON = {"resident", "visitor", "phone"}
+
+
+@pytest.fixture(scope="module")
+def library():
+    return ClipLibrary()
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    return Rooms("living_room", seed=1)
+
+
+@pytest.fixture(scope="module")
+def evening(library, rooms):
+    """Twenty minutes before the television is on, and twenty with it."""
+    plan = plan_days(1, library, Habits(seed=1))
+    first = next(sound.start for sound in plan.sounds if sound.origin == "television")
+    return Composition(part(plan, first - HOUR // 3, 2 * HOUR // 3), library, rooms)
+
+
+def part(plan, first, frames):
+    """A part of a plan, as a plan."""
+    sounds = [
+        replace(sound, start=sound.start - first)
+        for sound in plan.sounds
+        if first <= sound.start and sound.end <= first + frames
+    ]
+    steady = [replace(one, start=one.start - first, end=one.end - first) for one in plan.steady]
+    return Plan(frames, sounds, steady)
+
+
+def full_scale(samples):
+    return samples.astype(np.float32) / 32768
+
+
+def test_the_same_seed_plans_the_same_days_and_more_days_begin_alike(library):
+    days = plan_days(3, library, Habits(seed=5))
+    again = plan_days(5, library, Habits(seed=5))
+    assert list(days.sounds) == [sound for sound in again.sounds if sound.start < days.frames]
+    assert list(days.sounds) != list(plan_days(3, library, Habits(seed=6)).sounds)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_month_is_plausible_and_planned_in_a_moment(library, seed):
+    began = time.process_time()
+    plan = plan_days(30, library, Habits(seed))
+    assert time.process_time() - began < 10
+    days = [[] for _ in range(30)]
+    for sound in plan.sounds:
+        days[sound.start // DAY_FRAMES].append(sound)
+    watched, showers = [], []
+    for sounds in days:
+        count = Counter((one.clip.label, one.origin) for one in sounds)
+        assert 2 <= count["flushing_water", "resident"] <= 16
+        assert 10 <= count["objects_activity", "resident"] <= 500
+        assert count["phone_ring", "phone"] <= 8
+        showers.append(count["shower", "resident"] > 0)
+        watched.append(sum(one.frames for one in sounds if one.origin == "television") / HOUR)
+        for one in sounds:
+            if one.origin == "television":
+                assert 14 < one.start % DAY_FRAMES / HOUR < 24
+    assert showers in ([True, False] * 15, [False, True] * 15)
+    assert 1.0 < min(watched) < max(watched) < 6.0
+    at_night = [one for one in plan.sounds if one.activity == "night"]
+    assert {one.clip.label for one in at_night} == {"coughing"}
+    assert 100 < len(at_night) < 600
+    assert any(one.activity == "visit" for one in plan.sounds)
+
+
+def test_a_person_and_a_device_make_one_sound_at_a_time(library):
+    plan = plan_days(14, library, Habits(seed=2))
+    assert [one.start for one in plan.sounds] == sorted(one.start for one in plan.sounds)
+    for origins in (PERSON, {"television"}, {"radio"}, {"outside"}):
+        sounds = [one for one in plan.sounds if one.origin in origins]
+        assert sounds
+        assert all(one.end <= other.start for one, other in pairwise(sounds))
+    for name in ("fridge", "street", "fan"):
+        noises = [one for one in plan.steady if one.name == name]
+        assert noises
+        assert all(one.end <= other.start for one, other in pairwise(noises))
+
+
+def test_nights_get_worse_from_the_day_asked_for_and_are_the_same_before(library):
+    usual = plan_days(21, library, Habits(seed=3))
+    worse = plan_days(21, library, Habits(seed=3, coughs_from=14))
+    change = 14 * DAY_FRAMES
+    before = [[one for one in plan.sounds if one.start < change] for plan in (usual, worse)]
+    assert before[0] == before[1]
+
+    def coughs(plan):
+        return sum(one.activity == "night" and one.start >= change for one in plan.sounds)
+
+    assert coughs(worse) > 2 * coughs(usual)
+
+
+def test_the_truth_covers_the_time_and_lies_where_the_energy_is(evening):
+    truth = truth_of(evening)
+    frames = evening.plan.frames
+    starts, ends, labels = zip(*truth.spans, strict=True)
+    assert (starts[0], ends[-1]) == (0.0, pytest.approx(frames * FRAME_SECONDS))
+    assert starts[1:] == ends[:-1]
+    assert {"silence", "speech"} <= set(labels)
+    power = frame_powers(full_scale(evening.samples(0, frames)).ravel())
+    above = 10 * np.log10(power / evening.floor_power(0, frames))
+    for start, end, label in truth.spans:
+        span = above[round(start / FRAME_SECONDS) : round(end / FRAME_SECONDS)]
+        if label == "silence":
+            assert np.percentile(span, 90) < 5
+        else:
+            assert span.max() > 1.5
+    heard = sum(event.heard_frames for event in truth.events) * FRAME_SECONDS
+    silent = sum(end - start for start, end, label in truth.spans if label == "silence")
+    assert heard + silent == pytest.approx(frames * FRAME_SECONDS)
+
+
+@pytest.mark.parametrize(("level", "heard"), [(-15.0, True), (-55.0, False)])
+def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, heard):
+    speech, cough = library.of("speech")[0], library.of("coughing")[0]
+    sounds = [
+        PlannedSound(100, 400, speech, "television", "living_room", -35.0, "television"),
+        PlannedSound(200, 20, cough, "resident", "living_room", level, "day"),
+    ]
+    truth = truth_of(Composition(Plan(600, sounds, ()), library, rooms))
+    here = {name for start, end, name in truth.spans if start < 220 / 20 and end > 200 / 20}
+    assert ("coughing" in here) is heard
+    assert {name for *_, name in truth.spans} >= {"speech", "silence"}
+    assert [event.plan.origin for event in truth.events] == ["television", "resident"]
+    assert bool(truth.events[1].heard_frames) is heard
+
+
+def test_what_is_not_heard_through_a_wall_is_silence(library):
+    tap = library.of("tap_water")[0]
+    sound = PlannedSound(20, 100, tap, "resident", "bathroom", -62.0, "washing")
+    for room, heard in (("bathroom", True), ("living_room", False)):
+        rooms = Rooms(room, seed=0)
+        rooms.floor *= 1e-2 ** (room == "bathroom")
+        truth = truth_of(Composition(Plan(200, [sound], ()), library, rooms))
+        assert bool(truth.events[0].heard_frames) is heard
+        assert (len(truth.spans) > 1) is heard
+
+
+def test_walls_take_level_and_the_high_frequencies_first(library):
+    sound = library.sound(library.of("coughing")[0], 20)
+    near, far = (Rooms(room, seed=0).heard(sound, "bedroom") for room in ("bedroom", "bathroom"))
+    assert 11 < 10 * np.log10(frame_powers(near).mean() / frame_powers(far).mean()) < 25
+    bright = [np.abs(np.fft.rfft(one))[len(one) // 4 :].std() for one in (near, far)]
+    dark = [np.abs(np.fft.rfft(one))[: len(one) // 16].std() for one in (near, far)]
+    assert bright[0] / bright[1] > 2 * dark[0] / dark[1]
+
+
+@pytest.mark.parametrize("features", [DEFAULT, AUROS21], ids=lambda one: one.name)
+def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, features):
+    frames = evening.plan.frames
+    expected = features.extractor()(full_scale(evening.samples(0, frames)))
+    busy = evening.busy(0, frames)
+    assert 0.2 < busy.mean() < 0.9
+    for size in (frames, 5000, 777):
+        stream = evening.features(features)
+        blocks = [stream(first, min(size, frames - first)) for first in range(0, frames, size)]
+        assert np.array_equal(np.concatenate(blocks), expected)
+
+
+def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
+    steady = [SteadyNoise("fridge", 500, 3 * PERIOD_FRAMES + 100)]
+    quiet = Composition(Plan(4 * PERIOD_FRAMES, (), steady), library, rooms)
+    values = quiet.features(DEFAULT)(0, quiet.plan.frames)
+    on = values[PERIOD_FRAMES : 2 * PERIOD_FRAMES]
+    assert np.array_equal(on, values[2 * PERIOD_FRAMES : 3 * PERIOD_FRAMES])
+    assert not np.array_equal(on[600:], values[3 * PERIOD_FRAMES + 600 :])
+    sound = full_scale(quiet.samples(0, quiet.plan.frames))
+    assert np.array_equal(values, DEFAULT.extractor()(sound))
+    assert quiet.busy(0, quiet.plan.frames).sum() == 40
+
+
+def test_the_logs_are_those_that_the_recorder_leaves_of_the_sound(evening, model_file, tmp_path):
+    write_sound(evening, tmp_path / "evening.flac", 0, evening.plan.frames)
+    found = []
+    for name in ("recorded", "composed"):
+        settings = Settings(output=tmp_path / name, model=model_file)
+        if name == "recorded":
+            source = FileSource([tmp_path / "evening.flac"], START)
+            logs = record_files(settings, settings.microphone[0], source, Flag()).logs
+        else:
+            logs = record_composition(evening, settings, START, "evening.flac")
+        assert [log.name for log in logs] == ["home_20260301T000000Z.mcap"]
+        with logs[0].open("rb") as stream:
+            messages = make_reader(stream).iter_messages()
+            found.append([(channel.topic, one.log_time, one.data) for _, channel, one in messages])
+    assert found[0] == found[1]
+    assert {topic for topic, *_ in found[0]} >= {"/mic/features", "/mic/label", "/mic/segment"}
+
+
+def test_a_clip_is_cut_or_repeated_to_a_length_as_loud_as_every_other(library):
+    for label in ("coughing", "music", "shower"):
+        for clip in library.of(label):
+            for frames in (clip.frames, 10, 400):
+                sound = library.sound(clip, frames)
+                assert sound.shape == (frames * FRAME_SAMPLES,)
+                assert abs(sound[0]) < 0.01 > abs(sound[-1])
+            assert 0.2 < frame_powers(library.sound(clip, clip.frames)).max() < 200
+
+
+def test_every_shipped_clip_may_be_given_away_and_says_whose_it_is():
+    with SHIPPED.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = "path label source_group source licence seconds detail author title url"
+    assert list(rows[0]) == columns.split()
+    for row in rows:
+        assert may_be_shipped(row["licence"])
+        assert row["source"]
+        assert row["author"]
+        assert row["url"].startswith("https://")
+        info = soundfile.info(SHIPPED.parent / row["path"])
+        assert (info.format, info.samplerate, info.channels) == ("FLAC", SAMPLE_RATE, 1)
+        assert float(row["seconds"]) == pytest.approx(info.duration, abs=0.001)
+        assert info.duration <= 10.0
+    found = [path for path in SHIPPED.parent.rglob("*") if path.is_file()]
+    assert len(found) == len(rows) + 1
+    assert sum(path.stat().st_size for path in found) <= 4_000_000
+
+
+def test_what_a_manifest_lacks_is_made_up_and_the_table_says_so(tmp_path):
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    shutil.copy(SHIPPED.parent / "coughing" / "coughing_01.flac", clips / "cough.flac")
+    manifest = clips / "manifest.csv"
+    manifest.write_text("path,label,source_group\ncough.flac,coughing,me\n")
+    library = ClipLibrary(manifest)
+    assert [clip.name for clip in library.of("coughing")] == ["cough.flac"]
+    assert all(clip.path is None for clip in library.of("speech"))
+    assert library.of("other_negative") == []
+    assert plan_days(2, library, Habits()).sounds
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("gone.flac,coughing,me", "no such file"),
+        ("broken.flac,coughing,me", "take it out of"),
+        ("short.flac,coughing,me", "shorter than a frame"),
+        ("long.flac,silence,me", "no sound but silence"),
+        ("", "lists no clips"),
+    ],
+)
+def test_clips_that_cannot_be_used_are_named_in_one_line(tmp_path, rows, said):
+    (tmp_path / "broken.flac").write_bytes(b"no audio")
+    for name, samples in (("short", 300), ("long", 9000)):
+        soundfile.write(tmp_path / f"{name}.flac", np.zeros(samples), SAMPLE_RATE)
+    manifest = tmp_path / "manifest.csv"
+    manifest.write_text(f"path,label,source_group\n{rows}\n")
+    with pytest.raises(HearthlogError, match=said) as error:
+        ClipLibrary(manifest)
+    assert "\n" not in str(error.value)
+
+
+def simulate(*arguments):
+    command = [sys.executable, "-m", "hearthlog.tools.home", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("0",), "1 to 3660 days, not 0"),
+        (("9999",), "1 to 3660 days, not 9999"),
+        (("1", "--seed", "-1"), "whole number from 0"),
+        (("1", "--room", "garage"), "no room is called 'garage'"),
+        (("1", "--manifest", "gone.csv"), "gone.csv"),
+        (("1", "--model", "gone.safetensors"), "gone.safetensors"),
+    ],
+)
+def test_a_home_that_cannot_be_is_refused_in_one_line(tmp_path, arguments, said):
+    result = simulate(*arguments, "-o", tmp_path / "home")
+    assert result.returncode == 1
+    assert said in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "home").exists()
+
+
+def test_a_simulated_home_never_overwrites(tmp_path):
+    result = simulate("1", "-o", tmp_path)
+    assert (result.returncode, result.stderr.count("\n")) == (1, 1)
+    assert "name a new folder" in result.stderr
+
+
+def test_a_day_of_a_home_is_24_logs_and_its_truth(tmp_path):
+    result = simulate("1", "-o", tmp_path / "home", "--seed", "4", "--start", "2026-05-01")
+    assert result.returncode == 0, result.stderr
+    logs = sorted(path.name for path in (tmp_path / "home" / "logs").rglob("*.mcap"))
+    assert logs == [f"home_20260501T{hour:02}0000Z.mcap" for hour in range(24)]
+    track = (tmp_path / "home" / "truth.txt").read_text().splitlines()
+    assert track[0].startswith("0.000000\t")
+    assert track[-1].split("\t")[1] == "86400.000000"
+    with (tmp_path / "home" / "events.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {"television", "resident"} <= {row["from"] for row in rows}
+    assert {row["made_up"] for row in rows} == {"no"}
+    assert all(Path(row["clip"]).parts[0] in {"made_up", row["label"]} for row in rows)
