@@ -36,7 +36,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
         raise DataError(f"{path}:{line}: is not UTF-8; save the {what} as UTF-8") from error
 
 
-def csv_records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
     """Yield the records of CSV that are not blank.
 
     Parameters
@@ -45,6 +45,8 @@ def csv_records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
         Of the file, for the message.
     text : str
         All of it.
+    delimiter : str
+        Between fields.
 
     Yields
     ------
@@ -71,7 +73,7 @@ def csv_records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
                 raise csv.Error(f"a record is longer than {_LONGEST >> 20} MB")
             yield text_line
 
-    reader = csv.reader(lines(), strict=True)
+    reader = csv.reader(lines(), strict=True, delimiter=delimiter)
     while True:
         length = 0
         line = reader.line_num + 1

@@ -26,6 +26,7 @@ from hearthlog.tools.cli.enrol import enrol
 from hearthlog.tools.cli.evaluate import evaluate
 from hearthlog.tools.cli.export import export
 from hearthlog.tools.cli.info import info
+from hearthlog.tools.cli.manifest import manifest
 from hearthlog.tools.cli.merge import merge
 from hearthlog.tools.cli.models import models
 from hearthlog.tools.cli.output import OutputClosedError, checked_output
@@ -45,7 +46,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover)
-for verb in (*_ON_LOGS, train, enrol, diff, review, watch, report, replay, relabel, demo):
+_LEARNING = (manifest, train, enrol)
+for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)
 app.add_typer(annotate, name="annotate")
 app.add_typer(evaluate, name="evaluate")

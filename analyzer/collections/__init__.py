@@ -1,0 +1,1 @@
+"""Public collections of labelled sound, as manifests."""

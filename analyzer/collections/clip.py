@@ -1,0 +1,48 @@
+"""What the reader of a collection yields: audio files, and what is heard in them."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Sound(NamedTuple):
+    """What is heard in a file, or in a part of it.
+
+    Attributes
+    ----------
+    categories : tuple of str
+        In the words of the collection; several are heard together.
+    start, end : float
+        Seconds; `end` is infinite for the rest of the file.
+    """
+
+    categories: tuple[str, ...]
+    start: float = 0.0
+    end: float = math.inf
+
+
+class CollectionClip(NamedTuple):
+    """An audio file of a collection.
+
+    Attributes
+    ----------
+    path : Path
+        Need not exist, where a collection was not downloaded completely.
+    sounds : tuple of Sound
+        All that the collection says to be in it.
+    source_group : str
+        The original recording or speaker, with a prefix for where its number is from: groups of
+        two collections are the same only if their recordings are.
+    licence : str
+    seconds : float
+        Length of the file, where the collection says it.
+    left_out : str
+        Why the clip is of no use; empty if it is.
+    """
+
+    path: Path
+    sounds: tuple[Sound, ...]
+    source_group: str
+    licence: str
+    seconds: float = math.inf
+    left_out: str = ""

@@ -1,0 +1,174 @@
+"""Files of a collection: tables, JSON, and audio found by its name."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.text_files import csv_records, read_text
+from hearthlog.schemas.storage.small_file import read_whole
+
+_TABLE_LIMIT = 128 << 20  # the largest, of AudioSet, has 50 MB
+_JSON_LIMIT = 256 << 20
+_AUDIO = frozenset(
+    {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf"}
+    | {".w64", ".rf64", ".voc"}
+)
+
+
+def read_table(
+    path: Path, columns: Sequence[str], delimiter: str = ","
+) -> Iterator[tuple[str, list[str]]]:
+    """Yield some columns of a table whose first line names them.
+
+    Parameters
+    ----------
+    path : Path
+        CSV in UTF-8.
+    columns : sequence of str
+    delimiter : str
+        Between fields.
+
+    Yields
+    ------
+    where : str
+        File and line, for messages.
+    values : list of str
+        One for each of `columns`.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is larger than 128 MB, is no such table, lacks one of the
+        columns, or has a line that ends before them.
+    """
+    lines = csv_records(path, read_text(path, "table", _TABLE_LIMIT), delimiter)
+    number, header = next(lines, (1, []))
+    names = [name.strip() for name in header]
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise DataError(
+            f"{path}:{number}: no column {', '.join(missing)} in the first line; is this another "
+            "version of the collection?"
+        )
+    places = [names.index(name) for name in columns]
+    for number, record in lines:
+        where = f"{path}:{number}"
+        if len(record) <= max(places):
+            raise DataError(f"{where}: has {len(record)} fields, the first line names {len(names)}")
+        yield where, [record[place].strip() for place in places]
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """Read an object of JSON.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is larger than 256 MB, or is no object of JSON.
+    """
+    try:
+        content = json.loads(read_whole(path, "file of the collection", _JSON_LIMIT, DataError))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: is not JSON ({str(error)[:100]})") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: holds no object of JSON")
+    return content
+
+
+def inside(where: str, folder: Path, name: str) -> Path:
+    """Return the path of a file that a table names.
+
+    Parameters
+    ----------
+    where : str
+        File and line of the table, for the message.
+    folder : Path
+    name : str
+        Relative to the folder.
+
+    Raises
+    ------
+    DataError
+        If the name leads out of the folder, or none can be called so.
+    """
+    pure = PurePosixPath(name)
+    if not name or pure.is_absolute() or ".." in pure.parts or "\0" in name:
+        raise DataError(f"{where}: {name[:64]!r} is no name of a file of the collection")
+    return folder / pure
+
+
+def is_audio(name: str) -> bool:
+    """Whether a file is named as audio that can be read.
+
+    Parameters
+    ----------
+    name : str
+    """
+    return os.path.splitext(name)[1].lower() in _AUDIO  # noqa: PTH122
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield all files in a folder and its folders, also those behind links, sorted by folder.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+    seen: set[tuple[int, int]] = set()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        status = Path(parent).stat()
+        if (status.st_dev, status.st_ino) in seen:  # a link that leads back
+            folders.clear()
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        folders.sort()
+        yield from (Path(parent, name) for name in sorted(names))
+
+
+def audio_by_name(folder: Path) -> dict[str, Path]:
+    """Find audio files by their names, wherever they are in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    dict of str to Path
+        The first one, where several have a name.
+    """
+    found: dict[str, Path] = {}
+    for path in files_below(folder):
+        if is_audio(path.name):
+            found.setdefault(path.name, path)
+    return found
+
+
+def seconds(where: str, *texts: str) -> list[float]:
+    """Read times in seconds.
+
+    Parameters
+    ----------
+    where : str
+        File and line, for the message.
+    *texts : str
+
+    Raises
+    ------
+    DataError
+        If one is no number from 0 to 1e9.
+    """
+    try:
+        values = [float(text) for text in texts]
+    except ValueError:
+        values = []
+    if len(values) < len(texts) or not all(0 <= value <= 1e9 for value in values):
+        shown = ", ".join(repr(text[:32]) for text in texts)
+        raise DataError(f"{where}: {shown}: a time is not in seconds")
+    return values
