@@ -5,9 +5,11 @@ import importlib
 import re
 import shlex
 import shutil
+from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 
+import collectionfolders as made
 import numpy as np
 import pytest
 import soundfile
@@ -282,6 +284,20 @@ def make_home(folder):
     shutil.copy("labels.txt", "day.txt")
     do("annotate import logs labels.txt")
     shutil.copytree("logs", "homes/anna")
+    made.write_esc50(folder / "ESC-50-master")
+    made.write_fsd50k(folder / "FSD50K")
+    made.write_urbansound8k(folder / "UrbanSound8K")
+    made.write_desed(folder / "DESED")
+    made.write_vocalsound(folder / "vocalsound")
+    made.write_audioset_strong(folder / "AudioSet")
+    for number, clip in enumerate(sorted((folder / "clips").glob("*/*.flac"))):
+        place = folder / "mine" / clip.parent.name / f"room {number}" / "1.flac"
+        place.parent.mkdir(parents=True)
+        shutil.copy(clip, place)
+    for words in ("esc50 ESC-50-master", "fsd50k FSD50K", "vocalsound vocalsound", "folder mine"):
+        name = words.split()[0].replace("folder", "mine")
+        do(f"manifest {words} -o {name}.csv")
+    shutil.copy(files("hearthlog.analyzer.collections") / "maps" / "fsd50k.toml", "map.toml")
     log = min(find_logs(folder / "logs"))
     for name in ("a.mcap", "b.mcap"):
         shutil.copy(log, name)
