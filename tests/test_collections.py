@@ -257,6 +257,14 @@ def test_a_folder_of_ones_own_has_sources_by_folder_or_name(written, tmp_path):
     assert {(row["source"], row["licence"]) for row in rows} == {("me", "CC BY 4.0")}
 
 
+def test_a_folder_gives_its_sounds_its_name(written, tmp_path, monkeypatch):
+    monkeypatch.chdir(written["folder"])
+    make_manifest(NAMED["folder"], Path(), tmp_path / "m.csv", ignore_progress)
+    clips = read_manifest(tmp_path / "m.csv", LABELS)
+    assert {clip.source for clip in clips} == {written["folder"].name}
+    assert {clip.licence for clip in clips} == {""}
+
+
 def test_folders_that_are_called_otherwise_need_a_map(copied, tmp_path):
     folder = copied("folder")
     (folder / "coughing").rename(folder / "dry cough")
@@ -511,6 +519,12 @@ def test_a_table_beyond_reason_is_refused_unread(copied, tmp_path):
     with (folder / "meta" / "esc50.csv").open("wb") as stream:
         stream.truncate(1 << 40)
     assert "larger than 128 MB" in refusal("esc50", folder, tmp_path / "m.csv")
+
+
+def test_a_manifest_that_could_not_be_read_again_is_not_made(written, tmp_path, monkeypatch):
+    monkeypatch.setattr("hearthlog.analyzer.collections.make_manifest.SIZE_LIMIT", 500)
+    message = refusal("esc50", written["esc50"], tmp_path / "m.csv")
+    assert message.endswith("which `train` does not read; leave out some of the audio")
 
 
 def test_a_file_that_is_listed_twice_is_taken_once(copied, tmp_path):

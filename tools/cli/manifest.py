@@ -34,11 +34,11 @@ def manifest(
         typer.Option("--map", help="Labels of its categories (TOML), as --print-map prints them."),
     ] = None,
     source: Annotated[
-        str, typer.Option(help="Name of the sounds in a `folder`.", show_default="its name")
-    ] = "",
+        str | None, typer.Option(help="Name of the sounds in a `folder`; by default its own.")
+    ] = None,
     licence: Annotated[
-        str, typer.Option(help="Licence of the sounds in a `folder`, such as CC0.")
-    ] = "",
+        str | None, typer.Option(help="Licence of the sounds in a `folder`, such as CC0.")
+    ] = None,
     print_map: Annotated[
         bool, typer.Option("--print-map", help="Only print the map of the collection, to edit it.")
     ] = False,
@@ -63,7 +63,7 @@ def manifest(
         wrong_use("give the folder of the collection, and --output; or --print-map")
     check_output("--output", output, ".csv", "a manifest")
     with share_done(f"looking at {folder}") as report:
-        made = make_manifest(chosen, folder, output, report, map_file, source, licence)
+        made = make_manifest(chosen, folder, output, report, map_file, source or "", licence or "")
     _print(made)
     print(f"\n{output}: {number(made.clips.total(), 'clip')}")
     if made.missing:
