@@ -240,12 +240,12 @@ def test_a_clip_is_cut_or_repeated_to_a_length_as_loud_as_every_other(library):
 def test_every_shipped_clip_may_be_given_away_and_says_whose_it_is():
     with SHIPPED.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    columns = "path label source_group source licence seconds detail author title url"
+    columns = "path label source_group source licence seconds detail credit url"
     assert list(rows[0]) == columns.split()
     for row in rows:
         assert may_be_shipped(row["licence"])
         assert row["source"]
-        assert row["author"]
+        assert row["credit"]
         assert row["url"].startswith("https://")
         info = soundfile.info(SHIPPED.parent / row["path"])
         assert (info.format, info.samplerate, info.channels) == ("FLAC", SAMPLE_RATE, 1)
@@ -331,5 +331,5 @@ def test_a_day_of_a_home_is_24_logs_and_its_truth(tmp_path):
     with (tmp_path / "home" / "events.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {"television", "resident"} <= {row["from"] for row in rows}
-    assert {row["made_up"] for row in rows} == {"no"}
+    assert {row["made_up"] for row in rows} == {"yes", "no"}
     assert all(Path(row["clip"]).parts[0] in {"made_up", row["label"]} for row in rows)
