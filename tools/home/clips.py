@@ -3,7 +3,6 @@
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -108,11 +107,6 @@ class ClipLibrary:
         for label in _MADE_UP_SECONDS:
             self._clips.setdefault(label, _made_up(label))
         self._decoded = ArrayCache(_CACHE_BYTES)
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """The labels that there are clips of."""
-        return sorted(self._clips)
 
     def of(self, label: str) -> Sequence[Clip]:
         """Return the clips of a label; none where there is no such sound."""
