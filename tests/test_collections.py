@@ -305,6 +305,18 @@ def test_the_map_that_is_printed_can_be_used(written, tmp_path, name):
     assert set(read_map(name).label_of.values()) <= LABELS
 
 
+def test_what_is_left_out_is_counted_by_its_reason(written, tmp_path):
+    done = command("manifest", "urbansound8k", written["urbansound8k"], "-o", tmp_path / "m.csv")
+    assert "\nlicences: CC BY-NC 3.0 7\nother_negative is: dog_bark 3\n" in done.stdout
+    assert "\nleft out: 2, may be one of ours\n" in done.stdout
+    assert "\nleft out: 1, in the background of other sounds\n" in done.stdout
+    of_ours = "those that may be one of ours are: children_playing 1, air_conditioner 1\n"
+    assert of_ours in done.stdout
+    done = command("manifest", "desed", written["desed"], "-o", tmp_path / "d.csv")
+    assert "\nleft out: 2, several sounds at once\n" in done.stdout
+    assert "\nleft out: 1, nothing in it that the collection has a category for\n" in done.stdout
+
+
 def test_an_edited_map_changes_labels(written, tmp_path):
     own = tmp_path / "map.toml"
     text = shipped_map("esc50").replace('"footsteps", ', "").replace('crying = ["crying_baby"]', "")

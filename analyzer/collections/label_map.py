@@ -14,7 +14,7 @@ from hearthlog.schemas.text import listed
 
 _KEYS = {"labels", "broad", "skip"}
 BROAD = "only broad categories"
-SKIPPED = "may be one of ours: "  # and the category
+SKIPPED = "may be one of ours"
 SEVERAL = "several sounds at once"
 
 
@@ -26,7 +26,7 @@ class Decision(NamedTuple):
     label : str
         Empty if they are left out.
     detail : str
-        The categories that say so.
+        The categories that say so; of those that the map skips, the first.
     reason : str
         Why they are left out; empty if they are not.
     """
@@ -71,7 +71,7 @@ class LabelMap:
         if not told:
             return Decision("", "", BROAD)
         if skipped:
-            return Decision("", detail, f"{SKIPPED}{skipped[0]}")
+            return Decision("", skipped[0], SKIPPED)
         if len(labels) > 1:
             return Decision("", detail, SEVERAL)
         return Decision(labels.pop(), detail)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.collections.clip import CollectionClip
 from hearthlog.analyzer.collections.installed import FOLDER, Collection, check_folder
-from hearthlog.analyzer.collections.label_map import LabelMap, read_map
+from hearthlog.analyzer.collections.label_map import SKIPPED, LabelMap, read_map
 from hearthlog.analyzer.collections.spans import Part, labelled_parts
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import OPTIONAL, REQUIRED, SIZE_LIMIT
@@ -42,6 +42,8 @@ class Summary:
         Number of lines of `other_negative` with each detail.
     left_out : Counter of str
         Number of sounds, or of files of several, by the reason.
+    skipped : Counter of str
+        Number of those that the map leaves out, by the category.
     files, missing : int
         Number of files that the collection lists, and of those that are not there.
     first_missing : Path or None
@@ -52,6 +54,7 @@ class Summary:
     licences: Counter[str] = field(default_factory=Counter)
     negatives: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
     files: int = 0
     missing: int = 0
     first_missing: Path | None = None
@@ -157,14 +160,14 @@ def _parts(clip: CollectionClip, label_map: LabelMap, summary: Summary) -> Itera
     elif not clip.sounds:
         summary.left_out[_UNLABELLED] += 1
     elif not parts:
-        summary.left_out += left_out
+        _count_left_out(summary, left_out)
     elif not _is_file(clip.path):
         summary.missing += 1
         summary.first_missing = summary.first_missing or clip.path
     elif not _is_utf_8(clip.path):
         summary.left_out[_NOT_UTF_8] += 1
     else:
-        summary.left_out += left_out
+        _count_left_out(summary, left_out)
         yield from parts
 
 
@@ -174,6 +177,13 @@ def _count(summary: Summary, clip: CollectionClip, part: Part) -> None:
     summary.licences[clip.licence] += 1
     if part.label == OTHER_NEGATIVE:
         summary.negatives[part.detail] += 1
+
+
+def _count_left_out(summary: Summary, left_out: Counter[tuple[str, str]]) -> None:
+    for (reason, categories), count in left_out.items():
+        summary.left_out[reason] += count
+        if reason == SKIPPED:
+            summary.skipped[categories] += count
 
 
 def _nothing_left(folder: Path, summary: Summary) -> str:

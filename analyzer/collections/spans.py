@@ -25,7 +25,7 @@ class Part(NamedTuple):
 
 def labelled_parts(
     sounds: Sequence[Sound], seconds: float, label_map: LabelMap
-) -> tuple[list[Part], Counter[str]]:
+) -> tuple[list[Part], Counter[tuple[str, str]]]:
     """Return the parts of a file in which one label is heard alone.
 
     A sound shorter than a second is extended evenly to one. What overlaps a sound of another label,
@@ -44,8 +44,8 @@ def labelled_parts(
     -------
     parts : list of Part
         By label and time.
-    left_out : Counter of str
-        Number of sounds, by the reason.
+    left_out : Counter of (str, str)
+        Number of sounds, by the reason and the categories.
     """
     decided = [(sound, label_map.decide(sound.categories)) for sound in sounds]
     told = [(sound, what) for sound, what in decided if what.reason != BROAD]
@@ -54,12 +54,12 @@ def labelled_parts(
         covered.setdefault(what.label, []).append((sound.start, sound.end))
     joined = {label: _joined(spans) for label, spans in covered.items()}
     alone: dict[str, list[tuple[_Span, str]]] = {}
-    left_out: Counter[str] = Counter()
+    left_out: Counter[tuple[str, str]] = Counter()
     for sound, what in decided:
         span = _extended(sound, seconds)
         reason = what.reason or _reason(span, what, joined)
         if reason:
-            left_out[reason] += 1
+            left_out[reason, what.detail] += 1
         else:
             alone.setdefault(what.label, []).append((span, what.detail))
     parts = []

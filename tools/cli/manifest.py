@@ -8,7 +8,7 @@ import typer
 from hearthlog.tools.cli.options import check_output
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import end_with_warnings, first_of, number, print_lines, wrong_use
+from hearthlog.tools.cli.text import end_with_warnings, number, print_lines, wrong_use
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -81,12 +81,12 @@ def _print(made: "Summary") -> None:
     print()
     print_lines(_counts("licences", made.licences, "unstated"))
     print_lines(_counts("other_negative is", made.negatives))
-    reasons = [f"{count:,}, {why}" for why, count in made.left_out.most_common()]
-    print_lines(first_of("left out", reasons, hint=""))
+    print_lines(f"left out: {count:,}, {why}" for why, count in made.left_out.most_common())
+    print_lines(_counts("those that may be one of ours are", made.skipped))
 
 
 def _counts(what: str, counts: "Counter[str]", unnamed: str = "") -> list[str]:
     """List what is most frequent in a line, if there is anything."""
     named = [f"{name or unnamed} {count:,}" for name, count in counts.most_common(_SHOWN)]
-    more = [f"and {len(counts) - _SHOWN} more"] if len(counts) > _SHOWN else []
+    more = [f"and {len(counts) - _SHOWN:,} more"] if len(counts) > _SHOWN else []
     return [f"{what}: {', '.join(named + more)}"] if named else []
