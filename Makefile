@@ -2,7 +2,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history dist clean
+.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history dist clean
+
+# What a machine with a microphone and a screen needs, in .venv.
+install: $(VENV)/.analyzer
 
 # Sets up, simulates a home, learns, records, labels, and writes demo/day.rrd to look at.
 demo: $(VENV)/.analyzer

@@ -271,7 +271,7 @@ def make_home(folder):
     for name in ("cough.flac", "cough.wav", "a.wav", "b.flac"):
         do_copy(cough, folder / name)
     (folder / "models").mkdir()
-    for name in ("general-1", "general-2", "new", "home"):
+    for name in ("general-1", "general-2", "new", "home", "home-1"):
         shutil.copy("general.safetensors", f"{name}.safetensors")
         shutil.copy("general.safetensors", f"models/{name}.safetensors")
     do("models promote general-1")
@@ -281,7 +281,8 @@ def make_home(folder):
     for model in ("general-2", "new"):
         do(f"relabel logs --model {model}.safetensors")
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
-    shutil.copy("labels.txt", "day.txt")
+    for name in ("day.txt", "ten.txt"):
+        shutil.copy("labels.txt", name)
     do("annotate import logs labels.txt")
     shutil.copytree("logs", "homes/anna")
     made.write_esc50(folder / "ESC-50-master")

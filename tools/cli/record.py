@@ -109,11 +109,11 @@ def record(
 def _with_model(settings: "Settings") -> "Settings":
     """Choose the model where none is configured, and say so where it has not heard the home."""
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
-    from hearthlog.models.starter import GENERAL, STARTERS
+    from hearthlog.models.starter import GENERAL, STARTERS, starter_file
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
     starter = GENERAL if model == DEFAULT_MODEL and not model.exists() else str(model)
-    if starter in STARTERS and not Path(starter).exists():
+    if starter in STARTERS and not Path(starter).exists() and starter_file(starter).exists():
         tell(f"the labels are by the starter model {starter}, which has never heard this home")
     return settings.model_copy(update={"model": model})
 
