@@ -174,6 +174,47 @@ def test_labels_that_are_the_truth_are_perfect(monkeypatch, heard):
     assert list(found.truth.labels) == list(found.found.labels)
 
 
+def test_what_is_recorded_is_what_was_composed(monkeypatch, heard, training_set):
+    recorded = []
+
+    def record(self, scene):
+        del self
+        recorded.append(scene)
+        return scene.truth, evaluation._labelling(scene.truth)
+
+    monkeypatch.setattr(evaluation._Recorder, "record", record)
+    options = replace(OPTIONS, colour="pink", floor=-50.0, gain=-3.0)
+    evaluate_scenes(*heard, options, ignore_progress)
+    clips = {}
+    for clip in heard[2]:
+        if clip.label in heard[1].classes[1:]:
+            clips.setdefault(clip.label, []).append(clip.path)
+    assert training_set.parent in clips["music"][0].parents
+
+    def read(path):
+        return soundfile.read(path, dtype="float32")[0]
+
+    for seed, scene, single in zip((10, 11), recorded[::2], recorded[1::2], strict=True):
+        noises = [background(120.0, -50.0, "pink", seed) for _ in range(2)]
+        expected = compose(clips, read, noises[0], seed, -3.0)
+        coughs = compose_single("coughing", clips["coughing"], read, noises[1], seed, -3.0)
+        assert (scene.truth, single.truth) == (expected.truth, coughs.truth)
+        assert np.array_equal(scene.samples, expected.samples)
+        assert np.array_equal(single.samples, coughs.samples)
+
+
+def test_a_cough_of_two_labels_is_found_once(monkeypatch, heard):
+    def halved(truth):
+        middle = (truth.starts + truth.ends) // 2
+        starts = np.stack([truth.starts, middle], axis=1).ravel()
+        ends = np.stack([middle, truth.ends], axis=1).ravel()
+        return replace(truth, starts=starts, ends=ends, labels=np.repeat(truth.labels, 2))
+
+    found = labelled(monkeypatch, heard, halved)
+    assert found.coughs.found == 1.0
+    assert found.coughs.median_seconds == pytest.approx(0.15)
+
+
 def test_late_labels_and_wrong_ones_are_not(monkeypatch, heard):
     late = labelled(monkeypatch, heard, lambda truth: evaluation._moved(truth, 10**9))
     assert late.scores.macro_f1 < 0.85
