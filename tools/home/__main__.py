@@ -56,6 +56,8 @@ def home(
     if model is not None:
         load_model(model)  # before hours of a home are planned and written
     library = ClipLibrary(manifest)
+    if library.made_up:
+        print(f"hearthlog: made up without clips: {', '.join(library.made_up)}", file=sys.stderr)
     habits = Habits(seed, start.weekday(), coughs_from)
     composition = Composition(plan_days(days, library, habits), library, Rooms(room, seed))
     start = start.replace(tzinfo=UTC)

@@ -91,6 +91,11 @@ class ClipLibrary:
     manifest : Path or None
         As of `hearthlog train`, with any labels; None for made-up sounds alone.
 
+    Attributes
+    ----------
+    made_up : list of str
+        Labels that there are no recordings of.
+
     Raises
     ------
     DataError
@@ -104,12 +109,22 @@ class ClipLibrary:
         self._clips: dict[str, list[Clip]] = {}
         for clip in recorded:
             self._clips.setdefault(clip.label, []).append(clip)
-        for label in _MADE_UP_SECONDS:
-            self._clips.setdefault(label, _made_up(label))
+        self.made_up = [label for label in _MADE_UP_SECONDS if label not in self._clips]
+        self._clips |= {label: _made_up(label) for label in self.made_up}
         self._decoded = ArrayCache(_CACHE_BYTES)
 
     def of(self, label: str) -> Sequence[Clip]:
-        """Return the clips of a label; none where there is no such sound."""
+        """Return the clips of a label.
+
+        Parameters
+        ----------
+        label : str
+
+        Returns
+        -------
+        sequence of Clip
+            Empty where there is no such sound.
+        """
         return self._clips.get(label, [])
 
     def of_groups(self, label: str, count: int, rng: np.random.Generator) -> Sequence[Clip]:
@@ -121,6 +136,10 @@ class ClipLibrary:
         count : int
             Groups, at most.
         rng : np.random.Generator
+
+        Returns
+        -------
+        sequence of Clip
         """
         groups = sorted({clip.source_group for clip in self.of(label)})
         chosen = {groups[place] for place in rng.permutation(len(groups))[:count]}
@@ -169,7 +188,20 @@ class ArrayCache:
         self._arrays: OrderedDict[object, Float32] = OrderedDict()
 
     def __call__(self, key: object, make: Callable[[], Float32]) -> Float32:
-        """Return the array of a key, made if it is not kept."""
+        """Return the array of a key.
+
+        Parameters
+        ----------
+        key : object
+            Hashable.
+        make : callable
+            Makes it if it is not kept.
+
+        Returns
+        -------
+        np.ndarray
+            Not to be written to.
+        """
         if key in self._arrays:
             self._arrays.move_to_end(key)
             return self._arrays[key]
@@ -243,7 +275,16 @@ def _normalised(sound: Float64) -> Float32:
 
 
 def frame_powers(sound: Float64 | Float32) -> Float64:
-    """Return the mean square of each frame of whole frames of sound."""
+    """Return the mean square of each frame.
+
+    Parameters
+    ----------
+    sound : np.ndarray [shape=(n * FRAME_SAMPLES,)]
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+    """
     frames = sound.reshape(-1, FRAME_SAMPLES)
     power: Float64 = np.einsum("ij,ij->i", frames, frames, dtype=np.float64) / FRAME_SAMPLES
     return power

@@ -44,7 +44,17 @@ _LOWEST_HERTZ = 20.0
 
 
 def attenuation(room: str, microphone: str) -> float:
-    """Return by how many dB a sound in one room is weaker in another."""
+    """Return by how many dB a sound of a room is weaker where the microphone is.
+
+    Parameters
+    ----------
+    room, microphone : str
+        Two rooms, or the same one; the first may be outside.
+
+    Returns
+    -------
+    float
+    """
     if room == microphone:
         return 0.0
     return _WALLS.get(frozenset({room, microphone}), _WINDOW)

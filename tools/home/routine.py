@@ -140,7 +140,17 @@ class Cast:
             self._clips[VISITOR, label] = self._clips[TELEVISION, label] = others or own
 
     def of(self, origin: str, label: str) -> Sequence[Clip]:
-        """Return the clips of a label that may sound from there; none if there are none."""
+        """Return the clips of a label that may sound from an origin.
+
+        Parameters
+        ----------
+        origin, label : str
+
+        Returns
+        -------
+        sequence of Clip
+            Empty if there are none.
+        """
         return self._clips.get((origin, label)) or self._library.of(label)
 
 
@@ -163,11 +173,22 @@ class Voices:
         self._end = end
 
     def wait(self, seconds: Range) -> None:
-        """Let a random time pass."""
+        """Let a random time pass.
+
+        Parameters
+        ----------
+        seconds : (float, float)
+            Its limits.
+        """
         self.now += round(self._rng.uniform(*seconds) / FRAME_SECONDS)
 
     def wait_until(self, frame: int) -> None:
-        """Let time pass, if it is not that late already."""
+        """Let time pass, if it is not that late already.
+
+        Parameters
+        ----------
+        frame : int
+        """
         self.now = max(self.now, frame)
 
     def sound(
@@ -178,7 +199,17 @@ class Voices:
         seconds: float | None = None,
         origin: str = RESIDENT,
     ) -> None:
-        """Add a clip, or as many as last for some seconds; none where there are no such clips."""
+        """Add a clip, or as many as last for some seconds.
+
+        Parameters
+        ----------
+        label : str
+            Nothing is added where there are no clips of it.
+        room, activity : str
+        seconds : float, optional
+        origin : str, optional
+            Whose sound it is.
+        """
         clips = self._cast.of(origin, label)
         if not clips:
             return
