@@ -127,14 +127,14 @@ def test_clips_of_esc_50_have_the_licence_of_their_subset(written, tmp_path):
     assert rows[0] == {
         "path": "audio/1-19111-A-24.wav",
         "label": "coughing",
-        "source_group": "freesound_19111",
+        "source_group": "fs19111",
         "source": "ESC-50",
         "licence": "CC BY-NC 3.0",
         "start": "",
         "end": "",
         "detail": "coughing",
     }
-    assert [row["source_group"] for row in rows[1:3]] == ["freesound_19118"] * 2
+    assert [row["source_group"] for row in rows[1:3]] == ["fs19118"] * 2
     ours = {row["detail"]: (row["label"], row["licence"]) for row in rows}
     assert ours["crying_baby"] == ("crying", "CC BY 3.0")
     assert ours["dog"] == ("other_negative", "CC BY 3.0")
@@ -144,13 +144,13 @@ def test_clips_of_esc_50_have_the_licence_of_their_subset(written, tmp_path):
 def test_background_sounds_of_urbansound8k_are_left_out(written, tmp_path):
     rows = rows_of("urbansound8k", written["urbansound8k"], tmp_path / "m.csv")
     assert {row["path"]: row["source_group"] for row in rows if row["label"] == "music"} == {
-        "audio/fold1/101-9-0-0.wav": "freesound_101",
-        "audio/fold1/101-9-0-1.wav": "freesound_101",
-        "audio/fold2/102-9-0-0.wav": "freesound_102",
-        "audio/fold10/103-9-0-0.wav": "freesound_103",
+        "audio/fold1/101-9-0-0.wav": "fs101",
+        "audio/fold1/101-9-0-1.wav": "fs101",
+        "audio/fold2/102-9-0-0.wav": "fs102",
+        "audio/fold10/103-9-0-0.wav": "fs103",
     }
     assert [row["source_group"] for row in rows if row["label"] == "other_negative"] == [
-        *("freesound_201", "freesound_202", "freesound_203")
+        *("fs201", "fs202", "fs203")
     ]
 
 
@@ -557,7 +557,7 @@ def test_odd_uploaders_and_names_come_through(copied, tmp_path):
     path.write_text(json.dumps(about))
     rows = rows_of("fsd50k", folder, tmp_path / "m.csv")
     groups = [row["source_group"] for row in rows[:3]]
-    assert groups == ['freesound_user_a,"b"\nc', "freesound_user_?", "freesound_103"]
+    assert groups == ['freesound_user_a,"b"\nc', "freesound_user_?", "fs103"]
     assert [row["licence"] for row in rows[2:4]] == ["unstated", "unstated"]
     assert len(read_manifest(tmp_path / "m.csv", LABELS)) == 7
 

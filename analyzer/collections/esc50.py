@@ -31,4 +31,4 @@ def read(folder: Path) -> Iterator[CollectionClip]:
         name, category, esc10, recording = row
         licence = "CC BY 3.0" if esc10 == "True" else "CC BY-NC 3.0"
         path = inside(where, folder / "audio", name)
-        yield CollectionClip(path, (Sound((category,)),), f"freesound_{recording}", licence)
+        yield CollectionClip(path, (Sound((category,)),), f"fs{recording}", licence)

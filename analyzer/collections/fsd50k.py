@@ -48,7 +48,7 @@ def read(folder: Path) -> Iterator[CollectionClip]:
             yield CollectionClip(
                 inside(where, audio, f"{number}.wav"),
                 (Sound(tuple(labels.split(","))),),
-                f"freesound_user_{uploader}" if uploader else f"freesound_{number}",
+                f"freesound_user_{uploader}" if uploader else f"fs{number}",
                 licence,
             )
 

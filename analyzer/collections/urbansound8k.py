@@ -34,7 +34,7 @@ def read(folder: Path) -> Iterator[CollectionClip]:
         yield CollectionClip(
             inside(where, folder / "audio", f"fold{fold}/{name}"),
             (Sound((category,)),),
-            f"freesound_{recording}",
+            f"fs{recording}",
             "CC BY-NC 3.0",
             left_out="" if salience == _FOREGROUND else "in the background of other sounds",
         )
