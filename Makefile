@@ -2,7 +2,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history dist clean
+.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history \
+	starter dist clean
 
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
@@ -75,6 +76,10 @@ bench: $(VENV)/.dev
 bench-history: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.bench --record docs/benchmarks.jsonl
 	$(BIN)/python -m hearthlog.tools.bench.history docs/benchmarks.jsonl docs/benchmarks.svg
+
+# The models that come with hearthlog, learned anew: make starter DATA="a/manifest.csv b/manifest.csv"
+starter: $(VENV)/.dev
+	$(BIN)/python -m hearthlog.tools.starter $(DATA) -o models/starter
 
 $(VENV)/.analyzer: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

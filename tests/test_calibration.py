@@ -95,6 +95,12 @@ def test_two_collections_tell_nothing_of_a_third():
     assert collection_folds(of_collections(30, [45, 45])) == []
 
 
+def test_collections_tell_nothing_if_they_share_fewer_than_half_of_the_classes():
+    data = of_collections(60, [60, 60, 60])
+    data = replace(data, collection=np.where(data.target == 0, data.collection, data.target - 1))
+    assert collection_folds(data) == []
+
+
 def test_a_class_that_other_collections_hardly_have_is_left_out():
     data = of_collections(60, [60, 60, 60])
     rare = data.target == 2

@@ -12,8 +12,8 @@ from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings, 
 from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.rooms import empty_room, in_room, reverberated, steady_noise
-from hearthlog.analyzer.training.scenario import Scenario, load_scenario
-from hearthlog.analyzer.training.svm_method import ROOM
+from hearthlog.analyzer.training.scenario import LABELS, Scenario, load_scenario
+from hearthlog.analyzer.training.svm_method import ROOM, _spread_over_classes
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker
@@ -21,6 +21,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.home.simulate import write_training_set
 
 pytestmark = pytest.mark.fast
 
@@ -224,3 +225,20 @@ def test_steady_noise_is_silence(household_model, monkeypatch, level, slope, gat
     share = (labels.probabilities.argmax(axis=1) == silence).mean()
     assert share > (0.99 if gate else 0.9)
     assert [segment.label for segment in segments] == [silence]
+
+
+def test_of_more_windows_than_can_be_learned_from_small_classes_are_kept_whole(tmp_path):
+    scenario = Scenario("two", {"speech": ("speech",), "music": ("music",)})
+    manifest = write_training_set(tmp_path / "clips", clips_per_class=3, seed=5)
+    clips = read_manifest(manifest, LABELS)
+    clips = [c for c in clips if c.label == "speech" or c.path.name == "music_001.flac"]
+    data = build_dataset(clips, scenario, ignore_progress, features=ROOM.features, rooms=ROOM.rooms)
+    examples = prepare(ROOM, data)
+    few = np.bincount(examples.windows(slice(None))[1])[1]
+    counts = np.bincount(chosen_classes(examples, 2 * few + 10))
+    assert counts.tolist() == [few + 10, few]
+
+
+def chosen_classes(examples, most):
+    _, target, weight = examples.windows(slice(None))
+    return target[_spread_over_classes(target, weight, most)]

@@ -29,7 +29,8 @@ def collection_folds(data: Dataset) -> list[Fold]:
     Returns
     -------
     list of Fold
-        Empty if there are fewer than three folds, or one leaves a single class to learn from.
+        Empty if there are fewer than three folds, if one leaves a single class to learn from, or if
+        fewer than half of the classes are told by other collections.
     """
     counts = np.bincount(data.collection)
     fold = np.where(counts < _FEWEST_SEGMENTS, len(counts), np.arange(len(counts)))[data.collection]
@@ -38,8 +39,21 @@ def collection_folds(data: Dataset) -> list[Fold]:
         for number in np.unique(fold)
     ]
     several = all(len(np.unique(data.target[seen])) > 1 for seen, _ in folds)
-    taught = any(np.isin(data.target[unseen], data.target[seen]).any() for seen, unseen in folds)
-    return folds if len(folds) >= _FEWEST_COLLECTIONS and several and taught else []
+    tried = np.unique(data.target[_taught(data, folds)])
+    enough = 2 * len(tried) >= sum(name != UNKNOWN for name in data.classes)
+    return folds if len(folds) >= _FEWEST_COLLECTIONS and several and enough else []
+
+
+def _taught(data: Dataset, folds: Sequence[Fold]) -> Bool:
+    """Tell which segments are of a class of which the other folds have five sources."""
+    taught = np.zeros(len(data), bool)
+    for seen, unseen in folds:
+        pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
+        sources = np.bincount(pairs[0], minlength=len(data.classes))
+        taught[unseen] = sources[data.target[unseen]] >= _FEWEST_SOURCES
+    if UNKNOWN in data.classes:
+        taught &= data.target != data.classes.index(UNKNOWN)
+    return taught
 
 
 def calibrate_elsewhere(
@@ -65,15 +79,7 @@ def calibrate_elsewhere(
     elsewhere : Elsewhere
         Scores of each fold with the temperature from the others.
     """
-    taught = np.zeros(len(data), bool)
-    for seen, unseen in folds:
-        pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
-        sources = np.bincount(pairs[0], minlength=len(data.classes))
-        taught[unseen] = sources[data.target[unseen]] >= _FEWEST_SOURCES
-    if UNKNOWN in data.classes:
-        taught &= data.target != data.classes.index(UNKNOWN)
-    if not taught.any():
-        taught[:] = True
+    taught = _taught(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
     predicted = probabilities.argmax(axis=1)[taught]
     scores = score(data.target[taught], predicted, data.group[taught], data.classes)

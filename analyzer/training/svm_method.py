@@ -19,7 +19,6 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
-MOST_WINDOWS = 12_000  # the time that fitting takes grows with their square
 _SEED = 20_261_122
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
@@ -39,10 +38,13 @@ class SvmMethod(Method):
         Cost of a window on the wrong side of the margin.
     gamma : float
         Gamma of the kernel, times the number of inputs.
+    most_windows : int
+        That are learned from; the time that it takes grows with their square.
     """
 
     cost: float = 4.0
     gamma: float = 1.0
+    most_windows: int = 12_000
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -70,9 +72,8 @@ class SvmMethod(Method):
         """
         inputs, target, weight = examples.windows(seen)
         remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
-        if len(inputs) > MOST_WINDOWS:
-            kept = np.random.default_rng(_SEED).permutation(len(inputs))
-            kept = kept[np.argsort(-weight[kept], kind="stable")][:MOST_WINDOWS]
+        if len(inputs) > self.most_windows:
+            kept = _spread_over_classes(target, weight, self.most_windows)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
             remembered = remembered[kept]
         inputs = rounded(inputs)
@@ -184,6 +185,17 @@ class SvmMethod(Method):
         width = self.features.inputs[description.inputs].width
         cost, gamma = description.parameters["cost"], description.parameters["gamma"]
         return replace(self, cost=cost, gamma=gamma * width, copies=description.copies)
+
+
+def _spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
+    """Choose windows at random, those of most weight first, but fewer of the large classes."""
+    shuffled = np.random.default_rng(_SEED).permutation(len(target))
+    shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
+    order = np.argsort(target[shuffled], kind="stable")
+    counts = np.bincount(target)
+    rank = np.empty(len(target), np.intp)
+    rank[order] = np.concatenate([np.arange(count) for count in counts])
+    return shuffled[np.sort(np.argsort(rank, kind="stable")[:most])]
 
 
 def rounded(inputs: Float32) -> Float32:

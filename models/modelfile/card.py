@@ -12,6 +12,7 @@ from hearthlog.schemas.logs.log_stream import Attachment
 
 CARD = "model_card.md"
 DESCRIPTION = "model.json"
+_FEW = 12  # sources
 
 
 def model_attachments(model: Model) -> list[Attachment]:
@@ -67,6 +68,9 @@ def model_card(model: Model) -> str:
             f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
             f"{result.f1:.3f} |"
         )
+    thin = [f"{name} ({one.sources})" for name, one in amounts.items() if one.sources < _FEW]
+    if thin:
+        lines += ["", f"Thin, by sources, and not to be trusted much: {', '.join(thin)}"]
     if description.training_data.home:
         lines += [
             "",

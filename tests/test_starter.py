@@ -1,0 +1,139 @@
+"""The models that come with hearthlog."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from conftest import HEARTHLOG
+
+from hearthlog.models.licences import may_be_shipped
+from hearthlog.models.modelfile.card import model_card
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.starter import STARTERS, starter_file
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs
+
+
+@pytest.fixture
+def record(tmp_path):
+    """Record in an empty folder, where nothing is configured."""
+    soundfile.write(tmp_path / "hum.wav", np.full(48_000, 0.01, np.float32), 16_000)
+    env = {name: value for name, value in os.environ.items() if name != "HEARTHLOG_MODEL"}
+
+    def run(*arguments, **variables):
+        return subprocess.run(
+            [*HEARTHLOG, "record", "hum.wav", *map(str, arguments)],
+            cwd=tmp_path,
+            env=env | variables,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    return run
+
+
+def model_of(folder):
+    (log,) = find_logs(folder)
+    return read_columns([log], ["/mic/info"])["/mic/info"]["model"].tolist()
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("licence", "allowed"),
+    [
+        ("CC0", True),
+        ("CC0 1.0", True),
+        ("Public domain", True),
+        ("CC BY 3.0 (repo README; per-clip credits there)", True),
+        ("CC-BY-SA 4.0", True),
+        ("cc by-sa 3.0", True),
+        ("ODbL 1.0 / DbCL", True),
+        ("Apache-2.0 file in repo; clips are from Freesound / own recordings", True),
+        ("", False),
+        ("unstated", False),
+        ("MIT (repo); clip provenance unstated", False),
+        ("CC BY-NC 4.0", False),
+        ("CC BY-NC-SA 3.0", False),
+        ("CC BY-ND 4.0", False),
+        ("CC (per-file .txt: BY / BY-NC / public domain)", False),
+        ("Apache-2.0 (repo); broadcast/commercial excerpts", False),
+        ("GPL-3.0", False),
+        ('sounds: "Personal Use"', False),
+    ],
+)
+def test_a_licence_says_whether_a_model_may_be_shipped(licence, allowed):
+    assert may_be_shipped(licence) == allowed
+
+
+@pytest.mark.fast
+def test_both_starters_together_take_less_than_6_mb():
+    assert sum(starter_file(name).stat().st_size for name in STARTERS) < 6_000_000
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("name", STARTERS)
+def test_a_starter_has_learned_only_from_what_may_be_shipped(name):
+    model = load_model(Path(name))
+    collections = model.description.training_data.collections
+    assert len(collections) > 5
+    assert [one for one in collections if not may_be_shipped(one.licence)] == []
+    assert model.description.scenario_name == name
+    assert "Not to be passed on" not in model_card(model)
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("name", STARTERS)
+def test_a_starter_says_how_good_it_is_in_collections_that_were_left_out(name):
+    elsewhere = load_model(Path(name)).description.elsewhere
+    assert elsewhere.collections > 5
+    assert elsewhere.expected_calibration_error < 0.1
+    low, high = elsewhere.macro_f1_interval
+    assert low < elsewhere.macro_f1 < high
+    assert len(elsewhere.classes) >= 3
+
+
+@pytest.mark.fast
+def test_who_made_the_recordings_is_told_beside_the_starters():
+    page = starter_file("general").with_name("README.md").read_text()
+    for name in STARTERS:
+        for one in load_model(Path(name)).description.training_data.collections:
+            assert one.name in page
+
+
+def test_without_a_model_the_general_starter_labels_and_says_so(record, tmp_path):
+    done = record("-o", "logs")
+    assert done.returncode == 0
+    assert "starter model general, which has never heard this home" in done.stderr
+    assert model_of(tmp_path / "logs") == ["general"]
+
+
+def test_the_champion_of_the_folder_of_models_labels_where_there_is_one(
+    record, model_file, tmp_path
+):
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "champion.safetensors").write_bytes(model_file.read_bytes())
+    done = record("-o", "logs")
+    assert "starter" not in done.stderr
+    assert model_of(tmp_path / "logs") == ["champion"]
+
+
+def test_a_starter_is_taken_by_its_name(record, tmp_path):
+    assert record("-o", "logs", "--model", "bathroom").returncode == 0
+    assert model_of(tmp_path / "logs") == ["bathroom"]
+
+
+def test_no_model_can_be_asked_for(record, tmp_path):
+    assert record("-o", "a", "--model", "none").stderr == ""
+    assert record("-o", "b", HEARTHLOG_MODEL="none").stderr == ""
+    assert model_of(tmp_path / "a") == model_of(tmp_path / "b") == [""]
+
+
+def test_an_installation_without_its_starters_says_so(monkeypatch, tmp_path):
+    monkeypatch.setattr("hearthlog.models.starter.__file__", str(tmp_path / "__init__.py"))
+    with pytest.raises(Exception, match="lacks its starter models"):
+        load_model(Path("general"))
