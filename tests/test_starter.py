@@ -137,3 +137,9 @@ def test_an_installation_without_its_starters_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr("hearthlog.models.starter.__file__", str(tmp_path / "__init__.py"))
     with pytest.raises(Exception, match="lacks its starter models"):
         load_model(Path("general"))
+
+
+def test_the_card_of_a_starter_is_shown_without_a_folder_of_models(hearthlog, tmp_path):
+    shown = hearthlog("models", "show", "general", "--folder", tmp_path / "none")
+    assert shown.stdout.startswith("# Model general")
+    assert "In collections of which nothing was learned" in shown.stdout

@@ -67,8 +67,7 @@ def learn_starters(manifests: Sequence[Path], folder: Path) -> None:
         sounds = [*_joined(clips, Path(temporary)), *_ring_tones(Path(temporary))]
         models = [_learn(name, sounds, folder) for name in STARTERS]
     _write_sources(folder / "sources.csv", manifests, clips)
-    page = "\n".join([_ABOUT, *map(model_card, models)])
-    (folder / "README.md").write_text(page, "utf-8")
+    (folder / "README.md").write_text(_page(models), "utf-8")
 
 
 def _usable(manifests: Sequence[Path]) -> Iterator[LabelledClip]:
@@ -137,6 +136,17 @@ def _learn(name: str, clips: Sequence[LabelledClip], folder: Path) -> Model:
     save_model(model, path)
     print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     return load_model(path)
+
+
+def _page(models: Sequence[Model]) -> str:
+    """Describe the models, and name the classes that they lack."""
+    lacking = [
+        f"- `{name}` has no class `{one}`: there are too few recordings of it to tell it apart."
+        for name, model in zip(STARTERS, models, strict=True)
+        for one in BUILTIN[name].classes
+        if one not in model.classes
+    ]
+    return "\n".join([_ABOUT, *lacking, "", *map(model_card, models)])
 
 
 def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[LabelledClip]) -> None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.compare_models import Comparison
     from hearthlog.analyzer.training.dataset import Recording
     from hearthlog.analyzer.training.scenario import Scenario
+    from hearthlog.models.classifiers.model import Model
     from hearthlog.models.features.feature_set import FeatureSet
     from hearthlog.models.modelfile.registry import ModelEntry
 
@@ -50,15 +51,14 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
 
 @models.command()
 def show(
-    name: Annotated[str, typer.Argument(help="A model, or an alias.")],
+    name: Annotated[str, typer.Argument(help="A model, an alias, or a starter.")],
     folder: _Folder = None,
     as_json: Json = False,
 ) -> None:
     """Print a model's card: what it tells apart, how well, and what it learned from."""
     from hearthlog.models.modelfile.card import model_card
-    from hearthlog.models.modelfile.registry import load
 
-    model = load(models_folder(folder), name)
+    model = _named(models_folder(folder), name)
     if as_json:
         result = {"name": model.name, "sha256": model.sha256} | model.description.model_dump()
         print(json.dumps(result, indent=2))
@@ -85,12 +85,11 @@ def compare(
     from hearthlog.analyzer.evaluation.compare_models import compare_models
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.models.modelfile.registry import load
 
     if (data is None) == (logs is None):
         wrong_use("give either --data or --logs")
     place = models_folder(folder)
-    first, second = load(place, a), load(place, b)
+    first, second = _named(place, a), _named(place, b)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     features = feature_set(first.description.feature_set)
     comparison = compare_models(first, second, _recordings(data, logs, chosen, features), chosen)
@@ -148,6 +147,17 @@ def _recordings(
     clips = read_manifest(manifest_path(data), scenario.labels)
     with share_done(f"listening to {len(clips)} clips") as report:
         return list(clip_recordings(clips, scenario, report, features))
+
+
+def _named(folder: Path, name: str) -> "Model":
+    """Load a model of the folder, or a starter model."""
+    from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+    from hearthlog.models.modelfile.registry import load
+    from hearthlog.models.starter import STARTERS
+
+    if name in STARTERS and not (folder / (name + SUFFIX)).exists():
+        return load_model(Path(name))
+    return load(folder, name)
 
 
 def _after(before: str | None) -> str:
