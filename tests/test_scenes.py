@@ -278,6 +278,12 @@ def test_what_the_model_has_learned_from_is_counted(heard, training_set, new_cli
     assert f"has learned from {known.sources} of the {known.sources} sources" in result.stderr
 
 
+def test_a_model_of_simulated_sounds_is_said_to_be_one_once(second_file, new_clips, capfd):
+    result = run(capfd, *words_of(second_file, new_clips, "--scenes", 2))
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.count("simulated sounds alone") == 1
+
+
 def test_a_clip_may_be_a_part_of_a_file(model_file, tmp_path, capfd):
     data = manifest_of(tmp_path / "parts", ("speech", 9.0))
     (data / "manifest.csv").write_text(

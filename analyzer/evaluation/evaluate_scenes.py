@@ -4,9 +4,11 @@ import tempfile
 import wave
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event as Flag
 
 import numpy as np
@@ -33,7 +35,8 @@ from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.recording import record_files
+from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
 from hearthlog.schemas.arrays import Float32
@@ -194,23 +197,24 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     laid = [clip for same in by_label.values() for clip in same]
     silence = scenario.find(SILENCE) or SILENCE
     coughs = [clip for clip in laid if scenario.find(clip.label) == COUGHING]
-    recorder = _Recorder(path, progress, options.scenes * (2 if coughs else 1))
     scenes: list[tuple[Labelling, Labelling]] = []
     singles: list[tuple[list[Span], Labelling]] = []
     sounds = 0
-    for seed in range(options.seed, options.seed + options.scenes):
-        noise = partial(background, options.seconds, options.floor, options.colour, seed)
-        # Made in the call, so that one scene is held at a time.
-        spans, found = recorder.record(compose(by_label, _read, noise(), seed, options.gain))
-        sounds += len(_without_silence(spans))
-        truth = [span._replace(label=scenario.find(span.label) or silence) for span in spans]
-        scenes.append((_labelling(truth), found))
-        if coughs:
-            singles.append(
-                recorder.record(
-                    compose_single(COUGHING, coughs, _read, noise(), seed, options.gain)
+    with closing(ModelWatch(path, SimpleQueue())) as watch:
+        recorder = _Recorder(watch, progress, options.scenes * (2 if coughs else 1))
+        for seed in range(options.seed, options.seed + options.scenes):
+            noise = partial(background, options.seconds, options.floor, options.colour, seed)
+            # Made in the call, so that one scene is held at a time.
+            spans, found = recorder.record(compose(by_label, _read, noise(), seed, options.gain))
+            sounds += len(_without_silence(spans))
+            truth = [span._replace(label=scenario.find(span.label) or silence) for span in spans]
+            scenes.append((_labelling(truth), found))
+            if coughs:
+                singles.append(
+                    recorder.record(
+                        compose_single(COUGHING, coughs, _read, noise(), seed, options.gain)
+                    )
                 )
-            )
     each = [evaluate_labelling(truth, found, model.classes) for truth, found in scenes]
     true, said = (_apart(same) for same in zip(*scenes, strict=True))
     whole = evaluate_labelling(true, said, model.classes)
@@ -280,10 +284,10 @@ def _sources_learned(model: Model, clips: Sequence[LabelledClip], scenario: Scen
 
 
 class _Recorder:
-    """Records scenes with a model, and reports how much of all of them is done."""
+    """Records scenes with one model, and reports how much of all of them is done."""
 
-    def __init__(self, model: Path, progress: Progress, scenes: int) -> None:
-        self._model = model
+    def __init__(self, watch: ModelWatch, progress: Progress, scenes: int) -> None:
+        self._watch = watch
         self._progress = progress
         self._scenes = scenes
         self._done = 0
@@ -297,10 +301,16 @@ class _Recorder:
         with tempfile.TemporaryDirectory(prefix="hearthlog-scene-") as folder:
             sound, logs = Path(folder) / "scene.wav", Path(folder) / "logs"
             _write(sound, scene.samples)
-            asked = {"output": logs, "model": self._model, "keep_audio": "off", "feature_set": ""}
+            asked = {"output": logs, "keep_audio": "off", "feature_set": ""}
             settings = load_settings(None, asked, {})
             source = FileSource([sound], _START, progress=report)
-            record_files(settings, settings.microphone[0], source, Flag())
+            microphone = settings.microphone[0].name
+            recording = RecordingSession(settings, microphone, source.device, self._watch)
+            try:
+                for event in source.events(Flag()):
+                    recording.add(event)
+            finally:
+                recording.finish()
             found = read_labelling(logs).labelling
         self._done += 1
         return scene.truth, _moved(found, -_START)
