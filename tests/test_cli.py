@@ -57,7 +57,8 @@ def test_info_for_people_has_the_same_figures(logs, hearthlog):
 def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(logs, hearthlog):
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
     heard, unsure, *_, last = hearthlog("info", logs).stdout.splitlines()
-    minutes = sorted(figures["labels"]["hall"].values(), reverse=True)
+    minutes = figures["segment_minutes"]["hall"].values()
+    assert sum(minutes) == pytest.approx(3, abs=0.1)
     assert re.findall(r"([\d.]+) min", heard) == [f"{each:.1f}" for each in minutes]
     rattles = figures["segments"]["hall"]["objects_activity"]
     assert re.search(rf"household sounds [\d.]+ min \({rattles}\)", heard)

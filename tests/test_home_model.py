@@ -7,6 +7,8 @@ import pytest
 from kept import keep_models
 from spliced import run
 
+from hearthlog.models import starter
+from hearthlog.models.modelfile import modelfile
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
 from hearthlog.schemas.logs.files import find_logs
@@ -93,3 +95,22 @@ def test_a_log_without_labels_is_adapted_to_from_a_model_that_is_named(capfd, da
     assert done.stderr.startswith("hearthlog: the latest log has no labels: name a model with --")
     assert not list(Path("models").glob("home-*"))
     assert find_logs(Path("logs"))
+
+
+def test_a_starter_whose_file_is_gone_and_a_name_of_none_are_one_line(
+    day, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HEARTHLOG_MODEL")
+    unknown = run(capfd, "record", day, "--model", "generall")
+    names = "the starter models are general and bathroom"
+    assert unknown.returncode == 1
+    assert unknown.stderr == f"hearthlog: generall: there is no such model file; {names}\n"
+    for module in (starter, modelfile):
+        monkeypatch.setattr(module, "starter_file", lambda name: tmp_path / name / "gone")
+    gone = run(capfd, "record", day)
+    assert gone.returncode == 1
+    assert gone.stderr.startswith("hearthlog: general: this installation of hearthlog lacks its ")
+    assert gone.stderr.endswith("install it again, or name a model file\n")
+    assert gone.stderr.count("\n") == 1
+    assert not list(tmp_path.rglob("*.mcap*"))

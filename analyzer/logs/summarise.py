@@ -172,7 +172,7 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
         if microphone.endswith(f"/{REVIEW}"):  # which has no labels frame by frame
             _note_marks(summary.label_seconds.setdefault(microphone, Counter()), columns)
         else:
-            _note_unsure(summary.unsure.setdefault(microphone, Counter()), columns)
+            _note_segments(summary, microphone, columns)
     elif columns.type == message_types.GAP:
         starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
         fields = starts, seconds, columns["reason"], columns["frames_lost"]
@@ -188,14 +188,16 @@ def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -
             summary.health = worse(summary.health, status)
 
 
-def _note_unsure(unsure: Counter[str], columns: Columns) -> None:
-    doubtful = columns["confidence"] < _UNSURE
-    for label, duration in zip(
-        columns["label"][doubtful].tolist(),
-        (columns["duration"][doubtful] / NANOSECONDS).tolist(),
-        strict=True,
+def _note_segments(summary: Summary, microphone: str, columns: Columns) -> None:
+    seconds = summary.segment_seconds.setdefault(microphone, Counter())
+    unsure = summary.unsure.setdefault(microphone, Counter())
+    durations = (columns["duration"] / NANOSECONDS).tolist()
+    doubtful = (columns["confidence"] < _UNSURE).tolist()
+    for label, duration, doubted in zip(
+        columns["label"].tolist(), durations, doubtful, strict=True
     ):
-        if class_name(label) not in {SILENCE, UNKNOWN}:
+        seconds[label] += duration
+        if doubted and class_name(label) not in {SILENCE, UNKNOWN}:
             unsure.update({"segments": 1, "seconds": duration})
 
 

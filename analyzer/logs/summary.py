@@ -79,6 +79,7 @@ class Summary:
     # by microphone and label; those of a layer are under the name of its topic
     label_seconds: dict[str, Counter[str]] = field(default_factory=dict)
     segments: dict[str, Counter[str]] = field(default_factory=dict)  # their number, likewise
+    segment_seconds: dict[str, Counter[str]] = field(default_factory=dict)  # but for reviews
     # `segments` and `seconds` of them whose labels are likelier wrong than right, likewise
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[GapSummary] = field(default_factory=list)
@@ -138,6 +139,8 @@ class Summary:
             self.label_seconds.setdefault(microphone, Counter()).update(seconds)
         for microphone, counts in other.segments.items():
             self.segments.setdefault(microphone, Counter()).update(counts)
+        for microphone, lengths in other.segment_seconds.items():
+            self.segment_seconds.setdefault(microphone, Counter()).update(lengths)
         for microphone, amounts in other.unsure.items():
             self.unsure.setdefault(microphone, Counter()).update(amounts)
         self.gaps += other.gaps

@@ -102,6 +102,10 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
             microphone: dict(labels.most_common())
             for microphone, labels in summary.segments.items()
         },
+        "segment_minutes": {
+            microphone: {label: seconds / 60 for label, seconds in labels.most_common()}
+            for microphone, labels in summary.segment_seconds.items()
+        },
         "unsure": {
             microphone: {"minutes": amounts["seconds"] / 60, "segments": int(amounts["segments"])}
             for microphone, amounts in summary.unsure.items()
@@ -150,7 +154,7 @@ def _gist(summary: "Summary") -> Iterator[str]:
     """Say in words what was heard, how much of it is in doubt, and what was not heard."""
     from hearthlog.analyzer.report.class_words import in_words
 
-    for microphone, seconds in summary.label_seconds.items():
+    for microphone, seconds in summary.segment_seconds.items():
         if "/" in microphone:  # of a layer
             continue
         segments = summary.segments.get(microphone, Counter())

@@ -232,17 +232,30 @@ def _warn_of_few(segments: "Dataset") -> None:
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
+    data, amounts = model.description.training_data, ("sources", "seconds", "segments")
+    adapted = bool(data.base_sha256)
+    if not adapted:  # else the figures are those of another model, which has said them
+        _print_figures(model)
+    if data.home:
+        home = "also learned from the home"
+        print(home if adapted else f"\n{home} (the figures above are those without it)")
+        rows = [(name, *_amounts(one)) for name, one in data.home.items() if one.segments]
+        print_table(("class", *amounts), rows)
+    print_skipped(segments.skipped)
+
+
+def _print_figures(model: "Model") -> None:
     from hearthlog.models.classifiers.installed import classifier_kind
 
     description, metrics = model.description, model.description.metrics
     data = description.training_data
-    amounts = "sources", "seconds", "segments"
     rows = []
     for name in description.classes:
         amount, result = data.classes[name], metrics.classes[name]
         figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
         rows.append((name, *_amounts(amount), *figures))
-    print_table(("class", *amounts, "precision", "recall", "F1"), rows)
+    head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"
+    print_table(head, rows)
     print(
         f"\nmacro F1 {metrics.macro_f1:.3f}, expected calibration error "
         f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "
@@ -257,11 +270,6 @@ def _print(model: "Model", segments: "Dataset") -> None:
     parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]
     print(*parameters, classifier_kind(description.kind).summary(model), sep=", ", end="\n\n")
     print_counts(description.classes, metrics.confusion)
-    if data.home:
-        print("\nalso learned from the home (the figures above are those without it)")
-        rows = [(name, *_amounts(one)) for name, one in data.home.items() if one.segments]
-        print_table(("class", *amounts), rows)
-    print_skipped(segments.skipped)
 
 
 def _amounts(amount: "Amount") -> tuple[str, str, str]:
