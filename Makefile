@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
 
-# Sets up, simulates a home, learns, records, labels, and writes demo/day.rrd to look at.
+# Sets up, composes a day of a home, records and labels it, and writes demo/day.rrd to look at.
 demo: $(VENV)/.analyzer
 	rm -rf demo
 	$(BIN)/hearthlog demo --output demo

@@ -234,7 +234,13 @@ def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     assert result.returncode == 0, result.stderr
     assert (folder / "day.rrd").stat().st_size > 100_000
     assert len(list(folder.rglob("*.mcap"))) == 1
-    assert "hearthlog record --model" in result.stdout.splitlines()[-1]
+    assert result.stdout.splitlines()[-1].endswith("hearthlog record")
+    shares = re.search(r"right are (\d+)% of the labels, (\d+)% of those of sounds", result.stdout)
+    assert 60 < int(shares[1]) <= 100
+    assert 30 < int(shares[2]) <= 100
+    assert re.search(r"\d+ sounds, of \d+ recordings; made up: \d+", result.stdout)
+    track = (folder / "day.txt").read_text().splitlines()
+    assert track[-1].split("\t")[1] == "240.000000"
     again = hearthlog("demo", "--output", folder)
     assert again.returncode == 1
     assert again.stderr.startswith(f"hearthlog: {folder}: exists already")

@@ -26,7 +26,7 @@ def clips(tmp_path_factory):
 
 @pytest.fixture
 def simulated(hearthlog, clips, tmp_path):
-    """A model trained as the demo trains its own."""
+    """A model that has learned from made-up sounds alone."""
     path = tmp_path / "made_up.safetensors"
     options = ("--data", clips, "--scenario", "general", "--smoothing", "merge", "--output", path)
     assert hearthlog("train", *options).returncode == 0

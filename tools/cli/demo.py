@@ -1,13 +1,17 @@
-"""`hearthlog demo`: the whole way from sound to a timeline, on a simulated home."""
+"""`hearthlog demo`: the whole way from sound to a timeline, on a day of a simulated home."""
 
 import shutil
 import sys
 import time
 from pathlib import Path
 from threading import Event as Flag
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from hearthlog.models.classifiers.model import Model
+    from hearthlog.tools.home.truth import LabelledSpan, Truth
 
 _START = "2026-03-01T00:00:00"
 _SEED = 1
@@ -19,67 +23,80 @@ def demo(
         float, typer.Option(min=1, max=1440, help="Length of the simulated day.")
     ] = 24.0,
 ) -> None:
-    """Simulate a home, learn its sounds, record and label a day of it, and draw the result."""
+    """Compose a day of a home, record it with the starter model, and draw the result."""
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
+    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.starter import GENERAL
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.recording import record_files
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info
     from hearthlog.tools.cli.record import start_time
-    from hearthlog.tools.cli.train import train
-    from hearthlog.tools.home.simulate import write_day, write_training_set
-    from hearthlog.tools.home.sounds import LABELS
+    from hearthlog.tools.home.simulate import write_day
 
     if output.exists():
         raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
-    model, scenario = output / "home.safetensors", output / "scenario.toml"
+    model = load_model(Path(GENERAL))
     day, logs, timeline = output / "day.flac", output / "logs", output / "day.rrd"
 
-    _say(f"1. Simulating a home: clips to learn from, and a day of {minutes:g} minutes")
-    manifest = write_training_set(output / "clips", clips_per_class=12, seed=_SEED)
-    truth = write_day(day, minutes, seed=_SEED + 1, manifest=None)
-    scenario.write_text(
-        "[classes]\n" + "".join(f'{label} = ["{label}"]\n' for label in LABELS), "utf-8"
-    )
+    _say(f"1. Composing a day of a home, {minutes:g} minutes long")
+    truth = write_day(day, minutes, seed=_SEED)
+    print(_composed_of(truth))
 
-    _say(f"2. hearthlog train --data {manifest} --scenario {scenario} --output {model}")
-    train(data=[manifest], scenario=str(scenario), output=model)
-
-    _say(f"3. hearthlog record {day} --model {model} --output {logs} --start {_START}")
-    settings = load_settings(None, {"output": logs, "model": model}, {})
+    _say(f"2. hearthlog record {day} --model {GENERAL} --output {logs} --start {_START}")
+    settings = load_settings(None, {"output": logs, "model": Path(GENERAL)}, {})
     start = start_time(_START, day)
     began = time.perf_counter()
     record_files(settings, settings.microphone[0], FileSource([day], start), Flag())
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
-    print(f"{_agreement(logs, start, truth.spans):.1%} of the labels are what was simulated")
-    print("(synthetic sounds are easy to tell apart; those of a real home are not)")
+    right, of_known = _agreement(logs, start, truth.spans, model)
+    print(f"right are {right:.0%} of the labels, {of_known:.0%} of those of sounds that the model")
+    print("knows; any other sound is right as unknown (it has learned from none of the recordings)")
 
-    _say(f"4. hearthlog info {logs}")
+    _say(f"3. hearthlog info {logs}")
     info(logs)
 
-    _say(f"5. hearthlog review {logs} --save {timeline}")
+    _say(f"4. hearthlog review {logs} --save {timeline}")
     save_timeline(read_timeline([logs]), timeline)
 
     _say(f"Look at it:           {_command('rerun')} --bind 127.0.0.1 {timeline}")
-    print(f"Record a microphone:  {_command('hearthlog')} record --model {model}")
+    print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
+    print(f"Record a microphone:  {_command('hearthlog')} record")
 
 
-def _agreement(logs: Path, start: int, truth: list[tuple[float, float, str]]) -> float:
-    """Share of the labels that the simulation meant in the middle of their frame."""
+def _composed_of(truth: "Truth") -> str:
+    """Say of how many recordings a day is composed, and how many of its sounds are made up."""
+    clips = [event.plan.clip for event in truth.events]
+    recordings = {clip.name for clip in clips if clip.path is not None}
+    made_up = [clip.label for clip in clips if clip.path is None]
+    which = f" ({', '.join(sorted(set(made_up)))})" if made_up else ""
+    return f"{len(clips)} sounds, of {len(recordings)} recordings; made up: {len(made_up)}{which}"
+
+
+def _agreement(
+    logs: Path, start: int, truth: "list[LabelledSpan]", model: "Model"
+) -> tuple[float, float]:
+    """Return the share of labels that are true in the middle of their frame, of all and of known.
+
+    The second share is of the sounds that the model knows, without silence.
+    """
     import numpy as np
 
+    from hearthlog.models.classes import SILENCE, UNKNOWN
     from hearthlog.schemas.logs.columns import read_columns
     from hearthlog.schemas.logs.files import find_logs
 
     labels = read_columns(find_logs(logs), ["/mic/label"])["/mic/label"]
     middle = (labels["header.stamp"] - start) / 1e9 + 0.025
     meant = np.searchsorted([end for _, end, _ in truth], middle, side="right")
-    names = [name for _, _, name in truth]
+    names = [name if name in model.classes else UNKNOWN for *_, name in truth]
     true = np.array([*names, names[-1]], object)[meant]
-    return float(np.mean(labels["label"] == true))
+    right = labels["label"] == true
+    known = (true != UNKNOWN) & (true != SILENCE)
+    return float(np.mean(right)), float(np.mean(right[known])) if known.any() else 1.0
 
 
 def _command(name: str) -> str:
