@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import soundfile
 from conftest import HEARTHLOG
 from mcap.writer import Writer as McapWriter
 
@@ -82,6 +83,11 @@ def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
     hearthlog("annotate", "import", logs, labels)
     assert hearthlog("info", logs).stdout.splitlines()[-1] == (
         f"next: a model of this home, from what is marked: hearthlog train --home {logs}"
+    )
+    soundfile.write(tmp_path / "quiet.wav", np.zeros(16_000 * 20), 16_000)
+    hearthlog("record", tmp_path / "quiet.wav", "--model", "general", "-o", tmp_path / "quiet")
+    assert hearthlog("info", tmp_path / "quiet").stdout.splitlines()[-1] == (
+        "next: nothing but quiet was heard yet: leave it recording, or try the microphone"
     )
     (bare := tmp_path / "bare").mkdir()
     hearthlog("record", day, "--model", "none", "-o", bare)

@@ -185,6 +185,11 @@ def _next(summary: "Summary", path: Path) -> str | None:
     place, latest = shlex.quote(str(path)), summary.streams[-1]
     if not latest["model"]:
         return f"nothing is labelled: hearthlog relabel {place} --model {GENERAL}"
+    heard: Counter[str] = Counter()
+    for counts in summary.segments.values():
+        heard.update(map(class_name, counts))
+    if not heard.keys() - {SILENCE}:
+        return "nothing but quiet was heard yet: leave it recording, or try the microphone"
     marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
     if marked and latest["starter"]:
         return f"a model of this home, from what is marked: hearthlog train --home {place}"
