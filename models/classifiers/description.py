@@ -84,7 +84,11 @@ class ClassMetrics(_Record):
 
 
 class Metrics(_Record):
-    """Scores, cross-validated by source group; true classes are rows of the confusion matrix."""
+    """Scores, cross-validated by source group; true classes are rows of the confusion matrix.
+
+    Macro F1 is the mean over the classes but `unknown`, whose segments count where they are taken
+    for another.
+    """
 
     folds: _Count
     macro_f1: _Share

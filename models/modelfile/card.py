@@ -106,7 +106,7 @@ def _elsewhere(description: Description) -> list[str]:
     elsewhere = description.elsewhere
     if elsewhere is None:
         return []
-    amount = f"{elsewhere.collections} left out in turn, {elsewhere.segments} segments of a second"
+    amount = f"{elsewhere.collections} left out in turn, {elsewhere.segments} segments of its classes"
     lines = [
         "",
         f"In collections of which nothing was learned, as in a new home ({amount}):",
@@ -120,6 +120,7 @@ def _elsewhere(description: Description) -> list[str]:
     between = f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""
     lines += [f"- macro F1: {elsewhere.macro_f1:.3f}{between}"]
     lines += [f"- F1 of {name}: {f1:.3f}" for name, f1 in elsewhere.classes.items()]
+    lines += ["- what other sounds are taken for is counted in the table above, not here"]
     untried = [name for name in description.classes if name not in {*elsewhere.classes, UNKNOWN}]
     if untried:
         lines += [f"- not tried, for the other collections have too little: {', '.join(untried)}"]
