@@ -106,7 +106,8 @@ def _elsewhere(description: Description) -> list[str]:
     elsewhere = description.elsewhere
     if elsewhere is None:
         return []
-    amount = f"{elsewhere.collections} left out in turn, {elsewhere.segments} segments of its classes"
+    collections, segments = elsewhere.collections, elsewhere.segments
+    amount = f"{collections} left out in turn, {segments} segments of its classes"
     lines = [
         "",
         f"In collections of which nothing was learned, as in a new home ({amount}):",
