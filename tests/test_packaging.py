@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
 DATA = {"py.typed", "page.html"}
 CLIPS = PurePosixPath("tools/home/clips")
+STARTERS = "models/starter"
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = CONFIGURATION["project"]
 
@@ -26,7 +27,7 @@ def installed_as(path):
     path = PurePosixPath(path)
     if path.parts[0] not in FOLDERS or path.parts[:2] == ("tools", "bench"):
         return None
-    kept = path.name in DATA or path.is_relative_to(CLIPS)
+    kept = path.name in DATA or path.is_relative_to(CLIPS) or path.is_relative_to(STARTERS)
     if path.suffix not in {".py", ".msg", ".toml"} and not kept:
         return None
     inner = path.relative_to("tools/package") if path.parts[1] == "package" else path
