@@ -33,6 +33,7 @@ MAKING = (
 )
 READING = (
     "info logs",
+    "manifest folder clips --output folder.csv",
     "catalog logs",
     "cat logs --topics /mic/segment",
     "export logs --topics /mic/label --output label.parquet",
@@ -143,7 +144,8 @@ def test_the_traps_work(folder):
 @pytest.mark.parametrize("command", READING)
 def test_a_verb_imports_nothing_of_the_folder(folder, command):
     result = run(folder, command)
-    assert result.returncode == (LOST if command.startswith("recover") else 0), result.stderr
+    lost = command.startswith(("recover", "evaluate"))  # the model has learned from these clips
+    assert result.returncode == (LOST if lost else 0), result.stderr
     assert sprung(folder) == []
 
 

@@ -1,7 +1,6 @@
 """`hearthlog info`: what is in a log, or in a folder of logs."""
 
 import json
-import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -10,10 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
-from hearthlog.models.starter import GENERAL
-from hearthlog.schemas.messages.message_types import RAW_AUDIO
-from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.options import Json, Log
@@ -42,6 +37,7 @@ def info(
     from hearthlog.analyzer.logs.summarise import summarise
     from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
+    from hearthlog.tools.cli.info_gist import next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -51,7 +47,7 @@ def info(
         raise typer.Exit(1)
     for stream in summary.streams:
         stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
-    following = _next(summary, path)
+    following = next_step(summary, path)
     if as_json:
         print(json.dumps(_as_json(summary) | {"next": following}, indent=2))
     else:
@@ -133,7 +129,9 @@ def _health(summary: "Summary") -> dict[str, str] | None:
 
 
 def _print(summary: "Summary") -> None:
-    print_lines(_gist(summary))
+    from hearthlog.tools.cli.info_gist import gist
+
+    print_lines(gist(summary))
     print_lines(_lines(summary))
     topics = [
         (
@@ -148,54 +146,6 @@ def _print(summary: "Summary") -> None:
     print_table(("topic", "type", "messages", "per second", "MB raw"), topics, words=2)
     print_table(("microphone", "label", "minutes", "segments"), _label_rows(summary), words=2)
     print_lines(_gap_lines(summary))
-
-
-def _gist(summary: "Summary") -> Iterator[str]:
-    """Say in words what was heard, how much of it is in doubt, and what was not heard."""
-    from hearthlog.analyzer.report.class_words import in_words
-
-    for microphone, seconds in summary.segment_seconds.items():
-        if "/" in microphone:  # of a layer
-            continue
-        segments = summary.segments.get(microphone, Counter())
-        unsure = summary.unsure.get(microphone, Counter())
-        known = [label for label, _ in seconds.most_common() if class_name(label) != UNKNOWN]
-        amounts = (
-            f"{in_words(label).lower()} {seconds[label] / 60:.1f} min"
-            f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
-            for label in known
-        )
-        yield f"{microphone} heard: {', '.join(amounts)}"
-        other = seconds.keys() - set(known)
-        yield (
-            f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
-            f"of these, and {sum(seconds[label] for label in other) / 60:.1f} min "
-            f"({sum(segments[label] for label in other)}) of no class that it knows"
-        )
-    if summary.gaps:
-        yield (
-            f"not heard: {number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
-        )
-
-
-def _next(summary: "Summary", path: Path) -> str | None:
-    """Say what to do for better labels; None if these are no logs of a recorder."""
-    if not summary.streams:
-        return None
-    place, latest = shlex.quote(str(path)), summary.streams[-1]
-    if not latest["model"]:
-        return f"nothing is labelled: hearthlog relabel {place} --model {GENERAL}"
-    heard: Counter[str] = Counter()
-    for counts in summary.segments.values():
-        heard.update(map(class_name, counts))
-    if not heard.keys() - {SILENCE}:
-        return "nothing but quiet was heard yet: leave it recording, or try the microphone"
-    marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
-    if marked and latest["starter"]:
-        return f"a model of this home, from what is marked: hearthlog train --home {place}"
-    kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
-    what = "listen to" if kept else "judge"
-    return f"ten spans to {what}: hearthlog review {place} --queue"
 
 
 def _lines(summary: "Summary") -> Iterator[str]:

@@ -1,0 +1,60 @@
+"""A summary of logs in words, and what to do next."""
+
+import shlex
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from hearthlog.analyzer.logs.summary import Summary
+from hearthlog.analyzer.report.class_words import in_words
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.starter import GENERAL
+from hearthlog.schemas.messages.message_types import RAW_AUDIO
+from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.tools.cli.text import number
+
+
+def gist(summary: Summary) -> Iterator[str]:
+    """Say in words what was heard, how much of it is in doubt, and what was not heard."""
+    for microphone, seconds in summary.segment_seconds.items():
+        if "/" in microphone:  # of a layer
+            continue
+        segments = summary.segments.get(microphone, Counter())
+        unsure = summary.unsure.get(microphone, Counter())
+        known = [label for label, _ in seconds.most_common() if class_name(label) != UNKNOWN]
+        amounts = (
+            f"{in_words(label).lower()} {seconds[label] / 60:.1f} min"
+            f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
+            for label in known
+        )
+        yield f"{microphone} heard: {', '.join(amounts)}"
+        other = seconds.keys() - set(known)
+        yield (
+            f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
+            f"of these, and {sum(seconds[label] for label in other) / 60:.1f} min "
+            f"({sum(segments[label] for label in other)}) of no class that it knows"
+        )
+    if summary.gaps:
+        yield (
+            f"not heard: {number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
+        )
+
+
+def next_step(summary: Summary, path: Path) -> str | None:
+    """Say what to do for better labels; None if these are no logs of a recorder."""
+    if not summary.streams:
+        return None
+    place, latest = shlex.quote(str(path)), summary.streams[-1]
+    if not latest["model"]:
+        return f"nothing is labelled: hearthlog relabel {place} --model {GENERAL}"
+    heard: Counter[str] = Counter()
+    for counts in summary.segments.values():
+        heard.update(map(class_name, counts))
+    if not heard.keys() - {SILENCE}:
+        return "nothing but quiet was heard yet: leave it recording, or try the microphone"
+    marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
+    if marked and latest["starter"]:
+        return f"a model of this home, from what is marked: hearthlog train --home {place}"
+    kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
+    what = "listen to" if kept else "judge"
+    return f"ten spans to {what}: hearthlog review {place} --queue"
