@@ -61,8 +61,8 @@ def calibrate_elsewhere(
 ) -> tuple[float, Elsewhere]:
     """Find the temperature that holds in collections of which nothing was learned.
 
-    Segments of no class of the scenario are left out, and those of a class of which the others
-    have fewer than five sources.
+    It is found from segments of classes of which the others have five sources. The scores are of
+    these, and macro F1 of segments of no class of the scenario, too.
 
     Parameters
     ----------
@@ -81,12 +81,14 @@ def calibrate_elsewhere(
     """
     taught = _taught(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
-    predicted = probabilities.argmax(axis=1)[taught]
-    scores = score(data.target[taught], predicted, data.group[taught], data.classes)
+    predicted, scored = probabilities.argmax(axis=1), taught.copy()
+    if UNKNOWN in data.classes:
+        scored |= data.target == data.classes.index(UNKNOWN)
+    scores = score(data.target[scored], predicted[scored], data.group[scored], data.classes)
     elsewhere = Elsewhere(
         collections=len(np.unique(data.collection)),
         segments=int(taught.sum()),
-        right=float((predicted == data.target[taught]).mean()),
+        right=float((predicted == data.target)[taught].mean()),
         expected_calibration_error=calibration_error(probabilities[taught], data.target[taught]),
         macro_f1=scores.macro_f1,
         macro_f1_interval=scores.macro_f1_interval and list(scores.macro_f1_interval),

@@ -111,7 +111,7 @@ class Elsewhere(_Record):
     expected_calibration_error : float
         With the temperature from the other collections.
     macro_f1 : float or None
-        Over the classes of these segments; None of models that were not told.
+        Over the classes of these segments and `unknown`; None of models that were not told.
     macro_f1_interval : list of float, or None
         95 %, bootstrap over source groups.
     classes : dict of str to float

@@ -121,7 +121,6 @@ def _elsewhere(description: Description) -> list[str]:
     between = f" ({interval[0]:.3f} to {interval[1]:.3f})" if interval else ""
     lines += [f"- macro F1: {elsewhere.macro_f1:.3f}{between}"]
     lines += [f"- F1 of {name}: {f1:.3f}" for name, f1 in elsewhere.classes.items()]
-    lines += ["- what other sounds are taken for is counted in the table above, not here"]
     untried = [name for name in description.classes if name not in {*elsewhere.classes, UNKNOWN}]
     if untried:
         lines += [f"- not tried, for the other collections have too little: {', '.join(untried)}"]
