@@ -41,6 +41,7 @@ from hearthlog.schemas.logs.files import CATALOG, active_path, find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -131,9 +132,17 @@ def garbage(path: Path) -> None:
 
 
 def overwritten(path: Path) -> None:
-    """Overwrite a few bytes in the middle of a log."""
+    """Overwrite a few bytes of a chunk that has segments."""
     data = bytearray(path.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
+    with LogFile(path) as file:
+        ids = {channel.topic: number for number, channel in file.channels.items()}
+        chunk = next(
+            chunk
+            for chunk in file.chunks
+            if ids["/mic/segment"] in file.channel_sets[chunk["channels"]]
+        )
+    middle = int(chunk["offset"] + chunk["length"] // 2)
+    data[middle : middle + 50] = bytes(50)
     path.write_bytes(data)
 
 

