@@ -122,6 +122,14 @@ def test_the_champion_of_the_folder_of_models_labels_where_there_is_one(
     assert model_of(tmp_path / "logs") == ["champion"]
 
 
+def test_a_champion_that_is_gone_is_missed(record, tmp_path):
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "champion.safetensors").symlink_to("home-1.safetensors")
+    done = record("-o", "logs")
+    assert "models/champion.safetensors: the model that it points to is gone" in done.stderr
+    assert model_of(tmp_path / "logs") == ["general"]
+
+
 def test_a_starter_is_taken_by_its_name(record, tmp_path):
     assert record("-o", "logs", "--model", "bathroom").returncode == 0
     assert model_of(tmp_path / "logs") == ["bathroom"]

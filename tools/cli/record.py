@@ -113,6 +113,8 @@ def _with_model(settings: "Settings") -> "Settings":
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
     starter = GENERAL if model == DEFAULT_MODEL and not model.exists() else str(model)
+    if starter == GENERAL and model.is_symlink():
+        tell(f"{model}: the model that it points to is gone; promote another one")
     if starter in STARTERS and not Path(starter).exists() and starter_file(starter).exists():
         tell(f"the labels are by the starter model {starter}, which has never heard this home")
     return settings.model_copy(update={"model": model})
