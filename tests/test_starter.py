@@ -1,5 +1,6 @@
 """The models that come with hearthlog."""
 
+import csv
 import os
 import subprocess
 from pathlib import Path
@@ -9,12 +10,15 @@ import pytest
 import soundfile
 from conftest import HEARTHLOG
 
+from hearthlog.analyzer.training.manifest import read_manifest
+from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.licences import may_be_shipped
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import STARTERS, starter_file
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.starter import _write_sources
 
 
 @pytest.fixture
@@ -151,3 +155,21 @@ def test_the_card_of_a_starter_is_shown_without_a_folder_of_models(hearthlog, tm
     shown = hearthlog("models", "show", "general", "--folder", tmp_path / "none")
     assert shown.stdout.startswith("# Model general")
     assert "In collections of which nothing was learned" in shown.stdout
+
+
+@pytest.mark.fast
+def test_what_was_learned_from_is_listed_with_its_credits(tmp_path):
+    manifest = Path(__file__).parent / "data" / "household" / "manifest.csv"
+    clips = read_manifest(manifest, LABELS)[:5]
+    _write_sources(tmp_path / "sources.csv", [manifest], clips)
+    with (tmp_path / "sources.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["path"] for row in rows] == [f"coughing/{clip.path.name}" for clip in clips]
+    assert {row["licence"] for row in rows} == {"CC0"}
+
+
+@pytest.mark.fast
+def test_the_sources_of_the_starters_are_named_without_places_on_a_disk():
+    lines = starter_file("general").with_name("sources.csv").read_text().splitlines()
+    assert len(lines) > 1000
+    assert not [line for line in lines if ".." in line.split(",")[0] or line.startswith("/")]

@@ -159,11 +159,10 @@ def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[Labell
         writer.writeheader()
         for manifest in manifests:
             with manifest.open(encoding="utf-8", newline="") as rows:
-                writer.writerows(
-                    row
-                    for row in csv.DictReader(rows)
-                    if manifest.parent / row["path"].strip() in used
-                )
+                for row in csv.DictReader(rows):
+                    clip = Path(row["path"].strip())
+                    if manifest.parent / clip in used:
+                        writer.writerow(row | {"path": Path(*clip.parts[-2:])})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
