@@ -164,7 +164,9 @@ def test_what_was_learned_from_is_listed_with_its_credits(tmp_path):
     _write_sources(tmp_path / "sources.csv", [manifest], clips)
     with (tmp_path / "sources.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["path"] for row in rows] == [f"coughing/{clip.path.name}" for clip in clips]
+    assert [row["path"] for row in rows] == [
+        f"covid19-cough/dataset/coughing/{clip.path.name}" for clip in clips
+    ]
     assert {row["licence"] for row in rows} == {"CC0"}
 
 

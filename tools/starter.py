@@ -44,6 +44,7 @@ _COLUMNS = ("path", "label", "source_group", "source", "licence", "seconds", "cr
 _ABOUT = """# The starter models
 
 `sources.csv` lists every recording that they have learned from, with its licence and its author.
+It is a manifest: with the recordings in the places that it names, it learns the same models again.
 The collections are repositories at https://github.com, or packages of Debian where they say so.
 """
 _PLAYED = Path(__file__).parent / "home" / "clips" / "manifest.csv"
@@ -152,7 +153,7 @@ def _page(models: Sequence[Model]) -> str:
 
 
 def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[LabelledClip]) -> None:
-    """Write which recordings were learned from, and who made them, as the manifests tell."""
+    """Write a manifest of what was learned from, in a folder for each collection."""
     used = {clip.path for clip in clips}
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", lineterminator="\n")
@@ -162,7 +163,8 @@ def _write_sources(path: Path, manifests: Sequence[Path], clips: Sequence[Labell
                 for row in csv.DictReader(rows):
                     clip = Path(row["path"].strip())
                     if manifest.parent / clip in used:
-                        writer.writerow(row | {"path": Path(*clip.parts[-2:])})
+                        place = Path(row["source"].replace(":", "_"), *clip.parts[-2:])
+                        writer.writerow(row | {"path": place})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -83,10 +83,10 @@ def train(
         if scenario or not home or scheduler or (cost, gamma) != (None, None):
             wrong_use("give --data and --scenario, or --home without what is about --data")
         base = base or _model_of(home)
-        output = output or _next_of_home()
     elif output is None or scenario is None or base is not None:
         wrong_use("--data goes with --scenario and --output, and without --base")
-    check_output(output)
+    if output is not None:
+        check_output(output)
     if not data:
         assert base is not None
         assert home is not None
@@ -98,6 +98,7 @@ def train(
         chosen = chosen_method(method, cost=cost, gamma=gamma)
         with joblib_on(scheduler):
             model, segments = _learned(data, scenario, home or [], chosen, smoothing)
+    output = output or _next_of_home()
     save_model(model, output)
     saved = load_model(output)
     if as_json:
