@@ -257,6 +257,17 @@ def test_a_folder_of_ones_own_has_sources_by_folder_or_name(written, tmp_path):
     assert {(row["source"], row["licence"]) for row in rows} == {("me", "CC BY 4.0")}
 
 
+def test_files_of_one_name_are_said_to_count_as_one_recording(tmp_path):
+    for label in ("coughing", "speech"):
+        (tmp_path / "own" / label).mkdir(parents=True)
+    for name in ("coughing/coughing_001", "coughing/coughing_002", "speech/anna", "speech/bert"):
+        (tmp_path / "own" / f"{name}.wav").touch()
+    done = command("manifest", "folder", tmp_path / "own", "-o", tmp_path / "m.csv")
+    assert done.exit_code == 0
+    assert "coughing: all files count as one recording" in done.stderr
+    assert "speech" not in done.stderr
+
+
 def test_a_folder_gives_its_sounds_its_name(written, tmp_path, monkeypatch):
     monkeypatch.chdir(written["folder"])
     make_manifest(NAMED["folder"], Path(), tmp_path / "m.csv", ignore_progress)

@@ -303,6 +303,16 @@ def test_an_array_that_half_precision_can_hold_takes_half_the_room(tmp_path):
     assert load(again.read_bytes())["support_vectors"].dtype == np.float16
 
 
+def test_an_array_that_half_precision_cannot_hold_stays_as_it_is(tmp_path):
+    arrays = load(model_bytes())
+    odd = arrays["support_vectors"].astype(np.float32)
+    odd[0, 0] = 0.1
+    path, again = tmp_path / "odd.safetensors", tmp_path / "again.safetensors"
+    path.write_bytes(content(arrays=arrays | {"support_vectors": odd}))
+    save_model(load_model(path), again)
+    np.testing.assert_array_equal(load_model(again).arrays["support_vectors"], odd)
+
+
 def test_an_array_too_many_is_refused(tmp_path):
     arrays = load(model_bytes())
     refusal(tmp_path, content(arrays=arrays | {"extra\n\x1b[2J": np.zeros(1)}))

@@ -3,6 +3,7 @@
 import csv
 import os
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from conftest import HEARTHLOG
 
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.scenario import LABELS
+from hearthlog.models.classifiers.description import Collection
 from hearthlog.models.licences import may_be_shipped
 from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model
@@ -88,6 +90,17 @@ def test_a_starter_has_learned_only_from_what_may_be_shipped(name):
     assert [one for one in collections if not may_be_shipped(one.licence)] == []
     assert model.description.scenario_name == name
     assert "Not to be passed on" not in model_card(model)
+
+
+@pytest.mark.fast
+def test_a_card_names_the_licences_that_forbid_passing_the_model_on():
+    model = load_model(Path("general"))
+    learned = [Collection(name="esc50", licence="CC BY-NC 3.0", clips=3)]
+    data = model.description.training_data.model_copy(update={"collections": learned})
+    described = model.description.model_copy(update={"training_data": data})
+    card = model_card(replace(model, description=described))
+    assert "Not to be passed on without asking" in card
+    assert "- esc50 (CC BY-NC 3.0)\n" in card
 
 
 @pytest.mark.fast

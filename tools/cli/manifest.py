@@ -8,7 +8,7 @@ import typer
 from hearthlog.tools.cli.options import check_output
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import end_with_warnings, number, print_lines, wrong_use
+from hearthlog.tools.cli.text import end_with_warnings, number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -66,6 +66,12 @@ def manifest(
         made = make_manifest(chosen, folder, output, report, map_file, source or "", licence or "")
     _print(made)
     print(f"\n{output}: {number(made.clips.total(), 'clip')}")
+    alone = [label for label, count in made.clips.items() if len(made.groups[label]) == 1 < count]
+    if chosen == FOLDER and alone:
+        tell(
+            f"{', '.join(alone)}: all files count as one recording, for their names differ in a "
+            "number only, and training wants several; give each recording or person a sub-folder"
+        )
     if made.missing:
         files = number(made.files, "audio file")
         lost = f"{made.missing:,} of {files} are not there, such as {made.first_missing}"
