@@ -666,6 +666,11 @@ def one_mark(folder):
     return patiently(lambda: layers(folder), lambda found: len(found) == 1)[0]
 
 
+def patiently_without_layer(folder):
+    """Wait until there is no layer, without reading one: it may go while it is read."""
+    patiently(lambda: list(folder.rglob("*.review.mcap")), lambda layers: layers == [])
+
+
 def programs_of(review):
     """The command and the programs that it started."""
     process = psutil.Process(review.process.pid)
@@ -705,7 +710,7 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         assert (mark.start, mark.end) == selected
         assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
         review.press("z")
-        patiently(lambda: layers(home), lambda found: found == [])
+        patiently_without_layer(home)
         review.press("3")
         assert one_mark(home)[1:4] == (*selected, "music")
         assert review.quit() == 0
@@ -736,8 +741,7 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             assert 25 < seconds < 45  # of 200 in about 870 pixels
             patiently(page.text, lambda text: text.endswith("speech"))
             page.evaluate(f"{buttons}.find(each => each.textContent == 'zundo').click()")
-            # Not `layers`: the layer may go while it is read.
-            patiently(lambda: list(home.rglob("*.review.mcap")), lambda found: found == [])
+            patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
             assert review.process.wait(60) == 0
 
