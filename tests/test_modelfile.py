@@ -369,6 +369,13 @@ def test_a_description_that_makes_no_sense_is_refused_by_name(tmp_path, key, val
     assert reason in refusal(tmp_path, content(description() | {key: value}))
 
 
+@pytest.mark.parametrize("spans", [[[5, 5]], [[1, 3], [2, 4]], [[1]], [[-1, 1]], [[0, 1]] * 1001])
+def test_spans_of_a_home_that_are_not_in_order_or_too_many_are_refused(tmp_path, spans):
+    about = description()
+    training = about["training_data"] | {"home_spans": spans}
+    assert "home_spans" in refusal(tmp_path, content(about | {"training_data": training}))
+
+
 @pytest.mark.parametrize(
     "key", sorted(description().keys() - {"copies", "base_inverse_temperature"})
 )

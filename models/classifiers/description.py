@@ -12,6 +12,7 @@ from hearthlog.schemas.text import printable
 
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # all other strings of a description
+MOST_SPANS = 1000  # forty kilobytes
 MOST_CLASSES = 32  # more would let the BLAS divide the products of the pairs among threads
 FORMAT: Final = 5
 MOST_WEIGHT: Final = 10.0
@@ -26,6 +27,7 @@ _LONGEST_SECONDS = 1e6
 _Positive = Annotated[float, Field(gt=0.0, le=_LONGEST_SECONDS)]
 _Seconds = Annotated[float, Field(ge=0.0, le=1e12)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
+_Span = Annotated[list[Annotated[int, Field(ge=0, lt=1 << 63)]], Field(min_length=2, max_length=2)]
 
 
 class _Record(BaseModel):
@@ -57,6 +59,9 @@ class TrainingData(_Record):
         What marks of a home added, by class, if the model was adapted.
     home_frames : int
         Frames of the home without marks, from which transitions are.
+    home_spans : list of [start, end]
+        Time of the home whose sound was learned from, in nanoseconds of UTC, in order; by whatever
+        microphone, and with what is less than a minute between.
     base_sha256 : str
         SHA-256 of the model file that was adapted, or empty.
     """
@@ -66,6 +71,7 @@ class TrainingData(_Record):
     collections: list[Collection]
     home: dict[_ClassName, Amount] = {}
     home_frames: _Count = 0
+    home_spans: Annotated[list[_Span], Field(max_length=MOST_SPANS)] = []
     base_sha256: _Text = ""
 
     @property

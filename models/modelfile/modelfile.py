@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +250,9 @@ def _problem_of_classes(description: Description) -> str | None:
         return "its decision_bias has a class that it has not"
     if {len(confusion), *map(len, confusion)} != {len(classes)}:
         return "its confusion matrix does not fit its classes"
+    times = [time for span in description.training_data.home_spans for time in span]
+    if any(later <= time for time, later in pairwise(times)):
+        return "its home_spans are not in order"
     return None
 
 
