@@ -47,6 +47,7 @@ GROWN = {
     message_types.LABEL: Growth("float32[] embedding", None, [], np.arange(3, dtype=np.float32)),
     message_types.SEGMENT: Growth("float32 loudness", float("nan"), None, -12.5),
     message_types.MARK: Growth("string[] tags", None, [], ["sure", "from the next room"]),
+    message_types.REVIEWED: Growth("float32 minutes", 0.0, 0.0, 2.5),
     message_types.GAP: Growth("builtin_interfaces/Time noticed", None, 0.0, None),
     message_types.STREAM_INFO: Growth(
         "hearthlog_msgs/AudioGap last_gap", None, {**_SPAN, "noticed": 0.0}, None

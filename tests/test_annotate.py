@@ -21,7 +21,17 @@ from spliced import run, small_disk, write_log
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import ROUNDING, find_coverage
 from hearthlog.analyzer.marks.formats.formats import FORMATS
-from hearthlog.analyzer.marks.marks import LATEST, Mark, MarkedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import (
+    LATEST,
+    QUEUE,
+    RANDOM,
+    Mark,
+    MarkedSpan,
+    ReviewedSpan,
+    read_marks,
+    read_reviewed,
+    write_marks,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, review_path
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -239,6 +249,49 @@ def test_marks_are_deleted_where_that_is_said_and_cut_around_it(log, zero):
     ]
     layer = write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
     assert not layer.exists()
+
+
+def looked_at(zero, start, end, **said):
+    return ReviewedSpan("mic", zero + start * SECOND, zero + end * SECOND, **said)
+
+
+def test_a_layer_keeps_what_was_looked_at_beside_the_marks(log, zero):
+    minute = looked_at(zero, 0, 60, reviewer="Ann", made=5 * SECOND, chosen=RANDOM)
+    span = looked_at(zero, 10, 12, corrects="other", chosen=QUEUE)
+    write_marks(log, [mark(zero, 1, 2)], reviewed=[minute])
+    write_marks(log, [], reviewed=[span, minute])
+    assert read_reviewed(log) == [minute, span]
+    write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
+    assert (read_marks(log), read_reviewed(log)) == ([], [minute, span])
+    layer = write_marks(log, [], not_reviewed=[minute])
+    assert read_reviewed(log) == [span]
+    write_marks(log, [mark(zero, 3, 4)], not_reviewed=[span])
+    assert (read_marks(log), read_reviewed(log)) == ([mark(zero, 3, 4)], [])
+    write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
+    assert not layer.exists()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"start": 9, "end": 9}, {"chosen": "by chance"}, {"reviewer": "a\nb"}, {"made": -1}],
+)
+def test_a_reviewed_span_that_is_none_is_refused(log, zero, wrong):
+    with pytest.raises(DataError, match=r"review"):
+        write_marks(log, [], reviewed=[looked_at(zero, 1, 2)._replace(**wrong)])
+    assert not review_path(log).exists()
+
+
+def test_a_layer_in_which_nothing_is_marked_is_a_layer(logs, log, zero, hearthlog, tmp_path):
+    layer = write_marks(log, [], reviewed=[looked_at(zero, 0, 60, chosen=RANDOM)])
+    assert hearthlog("doctor", layer).returncode == 0
+    assert "/mic/review/reviewed" in hearthlog("info", layer, "--json").stdout
+    assert f"layer: {layer}" in hearthlog("info", logs).stdout
+    assert "corrects=live chosen=random" in hearthlog("cat", layer).stdout
+    none = hearthlog("diff", logs, "live", "review")
+    assert (none.returncode, none.stderr.count("\n")) == (1, 1)
+    none = hearthlog("annotate", "export", logs, "-o", tmp_path / "none.csv")
+    assert (none.returncode, none.stderr.count("\n")) == (1, 1)
+    assert "Traceback" not in hearthlog("catalog", logs).stderr
 
 
 def test_a_layer_from_before_marks_said_who_made_them_is_read(log, zero):

@@ -1,4 +1,4 @@
-"""Marks: the corrections of a reviewer, in a layer beside the log."""
+"""Marks, the corrections of a reviewer, and what she looked at, in a layer beside the log."""
 
 import re
 import tempfile
@@ -24,16 +24,32 @@ from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import REVIEW, Topic, check_microphone_name, labelling_topic
+from hearthlog.schemas.messages.cdr_codec import Column
+from hearthlog.schemas.messages.topics import (
+    LIVE,
+    REVIEW,
+    Topic,
+    check_microphone_name,
+    labelling_topic,
+)
 from hearthlog.schemas.storage.new_files import locked_folder, replaced_file
 from hearthlog.schemas.times import NANOSECONDS
 
 LATEST = (1 << 31) * NANOSECONDS - 1  # what builtin_interfaces/Time can hold
 PERSON_NAME = re.compile(r"[^\x00-\x1f\x7f\ud800-\udfff]{0,200}")  # of a reviewer, of a labelling
-_KINDS = {message_types.SEGMENT: "segment", message_types.MARK: "mark"}
+_KINDS = {
+    message_types.SEGMENT: "segment",
+    message_types.MARK: "mark",
+    message_types.REVIEWED: "reviewed",
+}
+PERSON, QUEUE, RANDOM = CHOICES = ("person", "queue", "random")  # how a reviewed span was chosen
 _SPAN = ("header.stamp", "duration", "label")
 _ORIGIN = ("reviewer", "made", "corrects")
-_FIELDS = {message_types.SEGMENT: _SPAN, message_types.MARK: (*_SPAN, *_ORIGIN)}
+_FIELDS = {
+    message_types.SEGMENT: _SPAN,
+    message_types.MARK: (*_SPAN, *_ORIGIN),
+    message_types.REVIEWED: ("header.stamp", "duration", *_ORIGIN, "chosen"),
+}
 
 
 class Mark(NamedTuple):
@@ -70,6 +86,34 @@ class MarkedSpan(NamedTuple):
     end: int
 
 
+class ReviewedSpan(NamedTuple):
+    """A span that a reviewer has looked at: what is not marked in it was labelled rightly.
+
+    Attributes
+    ----------
+    microphone : str
+    start, end : int
+        In nanoseconds of UTC.
+    reviewer : str
+        Empty if unknown.
+    made : int
+        When it was looked at, in nanoseconds of UTC; 0 if unknown.
+    corrects : str
+        The labelling that was looked at: `live`, or the name of a model.
+    chosen : str
+        How the span was chosen: `person`, `queue`, or `random`. What was drawn at random is kept to
+        measure how right labels are, and not learned from.
+    """
+
+    microphone: str
+    start: int
+    end: int
+    reviewer: str = ""
+    made: int = 0
+    corrects: str = LIVE
+    chosen: str = PERSON
+
+
 def read_marks(log: Path) -> list[Mark]:
     """Read the marks of a log.
 
@@ -84,9 +128,34 @@ def read_marks(log: Path) -> list[Mark]:
         If the review layer cannot be read, is damaged or cut off, holds other topics, or has marks
         that are invalid or overlap.
     """
-    path = review_path(log)
+    return _read_layer(review_path(log)).marks
+
+
+def read_reviewed(log: Path) -> list[ReviewedSpan]:
+    """Read the spans of a log that a reviewer has looked at.
+
+    Returns
+    -------
+    list of ReviewedSpan
+        By microphone and time; they may overlap. Empty if there is no review layer.
+
+    Raises
+    ------
+    LogError
+        If the review layer cannot be read, is damaged or cut off, holds other topics, or has spans
+        or marks that are invalid.
+    """
+    return _read_layer(review_path(log)).reviewed
+
+
+class _Layer(NamedTuple):
+    marks: list[Mark]
+    reviewed: list[ReviewedSpan]
+
+
+def _read_layer(path: Path) -> _Layer:
     if not path.exists():
-        return []
+        return _Layer([], [])
     with LogFile(path) as file:
         complete = file.complete
     selection = select([path])
@@ -99,19 +168,31 @@ def read_marks(log: Path) -> list[Mark]:
     selection.verify()
     spans: list[Mark] = []
     marks: dict[tuple[Any, ...], Mark] = {}
+    reviewed: list[ReviewedSpan] = []
     for batch in selection.messages():
         for columns in decode_types(path, batch, _FIELDS):
             if columns.type == message_types.SEGMENT:
                 spans += _marks(columns)
+            elif columns.type == message_types.REVIEWED:
+                reviewed += _reviewed(columns)
             else:
                 marks |= {mark[:4]: mark for mark in _marks(columns)}
     try:
-        return _checked(marks.get(mark[:4], mark) for mark in spans)
+        return _Layer(
+            _checked(marks.get(mark[:4], mark) for mark in spans), _checked_reviewed(reviewed)
+        )
     except (DataError, LogError) as error:
         raise LogError(f"{path}: {error}; move this layer away to begin anew") from error
 
 
-def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] = ()) -> Path:
+def write_marks(
+    log: Path,
+    marks: Iterable[Mark],
+    deleted: Iterable[MarkedSpan] = (),
+    *,
+    reviewed: Iterable[ReviewedSpan] = (),
+    not_reviewed: Iterable[ReviewedSpan] = (),
+) -> Path:
     """Add marks to the review layer of a log; where they overlap older marks, they replace these.
 
     The layer is replaced in one step. Processes that write to the same folder wait for each other.
@@ -122,34 +203,40 @@ def write_marks(log: Path, marks: Iterable[Mark], deleted: Iterable[MarkedSpan] 
     marks : iterable of Mark
     deleted : iterable of MarkedSpan
         Where older marks are deleted, or cut off; before the new marks are added.
+    reviewed : iterable of ReviewedSpan
+        What a reviewer has looked at; added to what the layer has.
+    not_reviewed : iterable of ReviewedSpan
+        Spans of the layer that are taken out of it, before those are added.
 
     Returns
     -------
     Path
-        The layer; without marks there is no such file.
+        The layer; without marks and reviewed spans there is no such file.
 
     Raises
     ------
     DataError
-        If the new marks overlap each other, or are invalid.
+        If the new marks overlap each other, or new marks or spans are invalid.
     LogError
         If there is no such log, if its layer cannot be read or is damaged, if the name of a
         microphone is invalid, or if the layer cannot be written.
     """
-    new = _checked(marks)
+    new, looked_at = _checked(marks), _checked_reviewed(reviewed)
     path = review_path(log)
     with _locked(path):
-        layer = read_marks(log)
+        layer, before = _read_layer(path)
         for span in deleted:
             layer = list(_subtract(layer, [span]))
         layer = _checked([*_subtract(layer, new), *new])
-        if not layer:
+        kept = set(before).difference(not_reviewed)
+        looked_at = sorted(kept.union(looked_at))
+        if not (layer or looked_at):
             path.unlink(missing_ok=True)
             return path
         node = next((record.get("node", "") for record in select([log]).metadata), "")
         metadata = provenance(node, log=stem(log) + SUFFIX)
         with replaced_file(path) as temporary:
-            temporary.write_bytes(_layer_bytes(path.name, layer, metadata))
+            temporary.write_bytes(_layer_bytes(path.name, layer, looked_at, metadata))
     return path
 
 
@@ -173,23 +260,45 @@ def _marks(columns: Columns) -> Iterator[Mark]:
         yield Mark(microphone, *row)
 
 
+def _reviewed(columns: Columns) -> Iterator[ReviewedSpan]:
+    microphone = columns.topic.split("/")[1]
+    starts = columns["header.stamp"]
+    ends = starts + columns["duration"]
+    others = [columns[name].tolist() for name in (*_ORIGIN, "chosen")]
+    for row in zip(starts.tolist(), ends.tolist(), *others, strict=True):
+        yield ReviewedSpan(microphone, *row)
+
+
 def _checked(marks: Iterable[Mark]) -> list[Mark]:
     """Sort marks; raise DataError if one is invalid."""
     ordered = sorted(marks)
     for mark in ordered:
-        if not 0 <= mark.start < mark.end <= LATEST:
-            raise DataError(f"a mark from {mark.start} to {mark.end} ns is no span of time")
+        _check(mark, "mark")
         if not CLASS_NAME.fullmatch(mark.label):
             raise DataError(f"{mark.label[:64]!r} cannot be the name of a class")
-        names = PERSON_NAME.fullmatch(mark.reviewer) and PERSON_NAME.fullmatch(mark.corrects)
-        if not (0 <= mark.made <= LATEST and names):
-            raise DataError(f"a mark cannot be made by {mark.reviewer[:64]!r} at {mark.made} ns")
-    for microphone in {mark.microphone for mark in ordered}:
-        check_microphone_name(microphone)
     for one, other in pairwise(ordered):
         if one.microphone == other.microphone and other.start < one.end:
             raise DataError(f"{one.label} and {other.label} overlap at {other.start} ns")
     return ordered
+
+
+def _checked_reviewed(spans: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
+    """Sort reviewed spans; raise DataError if one is invalid."""
+    ordered = sorted(set(spans))
+    for span in ordered:
+        _check(span, "review")
+        if not CLASS_NAME.fullmatch(span.chosen):
+            raise DataError(f"a reviewed span cannot be chosen by {span.chosen[:64]!r}")
+    return ordered
+
+
+def _check(span: Mark | ReviewedSpan, what: str) -> None:
+    if not 0 <= span.start < span.end <= LATEST:
+        raise DataError(f"a {what} from {span.start} to {span.end} ns is no span of time")
+    names = PERSON_NAME.fullmatch(span.reviewer) and PERSON_NAME.fullmatch(span.corrects)
+    if not (0 <= span.made <= LATEST and names):
+        raise DataError(f"a {what} cannot be made by {span.reviewer[:64]!r} at {span.made} ns")
+    check_microphone_name(span.microphone)
 
 
 def _subtract(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
@@ -216,36 +325,46 @@ def _around(old: Mark, starts: Sequence[int], ends: Sequence[int]) -> list[Mark]
     ]
 
 
-def _layer_bytes(name: str, marks: Sequence[Mark], metadata: dict[str, str]) -> bytes:
+def _layer_bytes(
+    name: str,
+    marks: Sequence[Mark],
+    reviewed: Sequence[ReviewedSpan],
+    metadata: dict[str, str],
+) -> bytes:
     """Write the file in another folder, where nobody takes it for a log being recorded."""
-    microphones = sorted({mark.microphone for mark in marks})
-    topics = [
-        Topic(labelling_topic(microphone, REVIEW, kind), type_)
+    rows: dict[str, Sequence[Mark | ReviewedSpan]] = {
+        message_types.SEGMENT: marks,
+        message_types.MARK: marks,
+        message_types.REVIEWED: reviewed,
+    }
+    batches = [
+        (
+            Topic(labelling_topic(microphone, REVIEW, kind), type_),
+            [span for span in rows[type_] if span.microphone == microphone],
+        )
         for type_, kind in _KINDS.items()
-        for microphone in microphones
+        for microphone in sorted({span.microphone for span in rows[type_]})
     ]
     with tempfile.TemporaryDirectory(prefix="hearthlog") as folder:
-        writer = LogWriter(Path(folder) / name, topics, metadata)
-        writer.write_columns([_rows(t.name, t.type, marks) for t in topics])
+        writer = LogWriter(Path(folder) / name, [topic for topic, _ in batches], metadata)
+        writer.write_columns([_rows(*batch) for batch in batches])
         return writer.finish().read_bytes()
 
 
-def _rows(name: str, kind: str, marks: Sequence[Mark]) -> TopicBatch:
-    microphone = name.split("/")[1]
-    own = [mark for mark in marks if mark.microphone == microphone]
-    starts = np.array([mark.start for mark in own])
-    ends = np.array([mark.end for mark in own])
-    fields = {
+def _rows(topic: Topic, spans: Sequence[Mark | ReviewedSpan]) -> TopicBatch:
+    starts = np.array([span.start for span in spans])
+    ends = np.array([span.end for span in spans])
+    fields: dict[str, Column] = {
         "header.stamp": starts,
-        "header.frame_id": microphone,
+        "header.frame_id": spans[0].microphone,
         "duration": ends - starts,
-        "label": [mark.label for mark in own],
     }
-    if kind == message_types.SEGMENT:
-        return TopicBatch(name, ends, fields | {"confidence": np.ones(len(own), np.float32)})
-    origin = {
-        "reviewer": [mark.reviewer for mark in own],
-        "made": np.array([mark.made for mark in own]),
-        "corrects": [mark.corrects for mark in own],
-    }
-    return TopicBatch(name, ends, fields | origin)
+    if topic.type == message_types.SEGMENT:
+        fields["confidence"] = np.ones(len(spans), np.float32)
+    else:
+        for name in ("reviewer", "corrects"):
+            fields[name] = [getattr(span, name) for span in spans]
+        fields["made"] = np.array([span.made for span in spans])
+    own = "chosen" if topic.type == message_types.REVIEWED else "label"
+    fields[own] = [getattr(span, own) for span in spans]
+    return TopicBatch(topic.name, ends, fields)

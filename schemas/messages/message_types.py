@@ -19,12 +19,23 @@ STATISTICS = f"{PACKAGE}/msg/AudioStatistics"
 LABEL = f"{PACKAGE}/msg/AudioLabel"
 SEGMENT = f"{PACKAGE}/msg/AudioSegment"
 MARK = f"{PACKAGE}/msg/AudioMark"
+REVIEWED = f"{PACKAGE}/msg/AudioReview"
 GAP = f"{PACKAGE}/msg/AudioGap"
 RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
 
-_DEFINED_HERE = (STREAM_INFO, FEATURES, STATISTICS, LABEL, SEGMENT, MARK, GAP, RAW_AUDIO)
+_DEFINED_HERE = (
+    STREAM_INFO,
+    FEATURES,
+    STATISTICS,
+    LABEL,
+    SEGMENT,
+    MARK,
+    REVIEWED,
+    GAP,
+    RAW_AUDIO,
+)
 
 
 @cache
