@@ -1,0 +1,177 @@
+"""A simulated person, who reviews what a home recorded and knows what is true of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hearthlog.analyzer.logs.coverage import Coverage, find_coverage
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.spans import one, overlay, pieces
+from hearthlog.analyzer.marks.marks import QUEUE, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.review.queue.ranking import UNCERTAIN
+from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.session.session import ReviewItem
+from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
+from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.home.sounds import generator
+from hearthlog.tools.home.truth import LabelledSpan
+
+_LOOK_SECONDS = 5.0  # to look at a span and press a key, besides the time to hear it
+_MARK_SECONDS = 10.0  # to set the borders of a mark in a minute
+_MINUTE = 30.0  # what is longer is gone through sound by sound
+_MOST_ITEMS = 200
+_HEARD = NANOSECONDS // 5  # shorter than this is not noticed
+_WRONG = NANOSECONDS // 2  # wrong for so long, or for half of a sound, is corrected
+
+
+@dataclass(frozen=True)
+class Review:
+    """What a person did.
+
+    Attributes
+    ----------
+    marks : list of Mark
+    reviewed : list of ReviewedSpan
+    seconds : float
+        That it took.
+    """
+
+    marks: list[Mark]
+    reviewed: list[ReviewedSpan]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Person:
+    """A person who hears what is true, and corrects labels accordingly.
+
+    Attributes
+    ----------
+    truth : Labelling
+        In nanoseconds of UTC, one label at a time, as of `true_labelling`.
+    name : str
+        The reviewer.
+    wrong : float
+        Share of the marks, drawn at random, that have the label after the right one, in the order
+        of the alphabet.
+    seed : int
+        Not negative; it draws those.
+    """
+
+    truth: Labelling
+    name: str = "Ann"
+    wrong: float = 0.0
+    seed: int = 0
+
+    def review(
+        self,
+        logs: Path,
+        minutes: float,
+        made: int,
+        limits: tuple[int | None, int | None] = (None, None),
+        queue: str = UNCERTAIN,
+    ) -> Review:
+        """Go through the queue of a labelling of logs, and write marks beside them.
+
+        A span takes 5 s and its length, a whole minute its length and 10 s for each mark. The
+        person stops before the item that would take too long.
+
+        Parameters
+        ----------
+        logs : Path
+            Folder of logs with the recorder's labels, of one microphone.
+        minutes : float
+            That there are.
+        made : int
+            When this is done, in nanoseconds of UTC.
+        limits : (int or None, int or None)
+            Start and end of what is reviewed, in nanoseconds of UTC.
+        queue : str
+            As of `hearthlog review --queue`.
+
+        Raises
+        ------
+        DataError
+            If there is nothing to review.
+        LogError
+            If logs or layers cannot be read, or marks cannot be written.
+        """
+        sources = find_labellings(logs)
+        microphone = sources.microphone(None)
+        said = sources.read(microphone, LIVE, *limits)
+        coverage = find_coverage(logs)[microphone]
+        rng = generator(self.seed, made % (1 << 32))
+        done = Review([], [], 0.0)
+        for item in queue_items(queue, sources, (microphone, LIVE), limits, _MOST_ITEMS):
+            labels = self._corrections(item, said, rng)
+            seconds = done.seconds + _seconds(item, len(labels))
+            if seconds > 60.0 * minutes:
+                break
+            about = (self.name, made, LIVE)
+            marks = [Mark(microphone, *label, *about) for label in labels]
+            looked_at = ReviewedSpan(microphone, item.start, item.end, *about, QUEUE)
+            _write(coverage, marks, looked_at)
+            done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
+        return done
+
+    def _corrections(
+        self, item: ReviewItem, said: NamedLabelling, rng: np.random.Generator
+    ) -> list[tuple[int, int, str]]:
+        """Return the sounds in an item, with their true borders, that are not labelled rightly."""
+        inside, row, _ = pieces(self.truth, one(item.start, item.end))
+        labels = self.truth.labels[row]
+        parts = overlay([inside, said.labelling]).in_all()
+        true, own = labels[parts.rows[0]], said.labelling.labels[parts.rows[1]]
+        differs = np.array([not _same(a, b) for a, b in zip(true, own, strict=True)], bool)
+        wrong = np.bincount(
+            parts.rows[0], (parts.ends - parts.starts) * differs, minlength=len(labels)
+        )
+        lengths = inside.ends - inside.starts
+        marked = (lengths >= _HEARD) & (wrong >= np.minimum(_WRONG, lengths / 2))
+        return [
+            (int(inside.starts[i]), int(inside.ends[i]), self._said(labels[i], rng))
+            for i in np.flatnonzero(marked)
+        ]
+
+    def _said(self, label: str, rng: np.random.Generator) -> str:
+        if rng.random() < self.wrong:
+            names = sorted(set(self.truth.labels))
+            label = names[(names.index(label) + 1) % len(names)]
+        return UNKNOWN if label == OTHER_NEGATIVE else label
+
+
+def true_labelling(spans: list[LabelledSpan], start: int) -> Labelling:
+    """Return the truth of a composition at the times of its logs.
+
+    Parameters
+    ----------
+    spans : list of LabelledSpan
+    start : int
+        Time of the first sample, in nanoseconds of UTC.
+    """
+    seconds = np.array([span[:2] for span in spans])
+    times = start + np.rint(seconds / FRAME_SECONDS).astype(np.int64) * FRAME_NANOSECONDS
+    return Labelling(times[:, 0], times[:, 1], np.array([span[2] for span in spans], object))
+
+
+def _same(true: str, said: str) -> bool:
+    if true == OTHER_NEGATIVE:
+        return said in {OTHER_NEGATIVE, UNKNOWN}
+    return class_name(true) == class_name(said)
+
+
+def _seconds(item: ReviewItem, marks: int) -> float:
+    length = (item.end - item.start) / NANOSECONDS
+    return length + (_MARK_SECONDS * marks if length >= _MINUTE else _LOOK_SECONDS)
+
+
+def _write(coverage: Coverage, marks: list[Mark], looked_at: ReviewedSpan) -> None:
+    """Write what came of one item to the layers of the logs that it is in."""
+    for log, first, last in coverage.split(looked_at.start, looked_at.end):
+        inside = [mark for mark in marks if mark.start < last and mark.end > first]
+        cut = [m._replace(start=max(m.start, first), end=min(m.end, last)) for m in inside]
+        write_marks(log, cut, reviewed=[looked_at._replace(start=first, end=last)])
