@@ -4,6 +4,7 @@ import getpass
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 from functools import partial
@@ -269,6 +270,25 @@ def test_a_layer_keeps_what_was_looked_at_beside_the_marks(log, zero):
     assert (read_marks(log), read_reviewed(log)) == ([mark(zero, 3, 4)], [])
     write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
     assert not layer.exists()
+
+
+def test_a_layer_that_goes_while_it_is_read_is_none(log, zero):
+    done = threading.Event()
+
+    def come_and_go():
+        while not done.is_set():
+            write_marks(log, [mark(zero, 1, 2)])
+            write_marks(log, [], [MarkedSpan("mic", zero, zero + 9 * SECOND)])
+
+    writer = threading.Thread(target=come_and_go)
+    writer.start()
+    try:
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            assert read_marks(log) in ([], [mark(zero, 1, 2)])
+    finally:
+        done.set()
+        writer.join()
 
 
 @pytest.mark.parametrize(

@@ -154,8 +154,17 @@ class _Layer(NamedTuple):
 
 
 def _read_layer(path: Path) -> _Layer:
-    if not path.exists():
-        return _Layer([], [])
+    """Read a layer; one that is not there, or goes while it is read, is empty."""
+    if path.exists():
+        try:
+            return _read_existing(path)
+        except LogError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
+    return _Layer([], [])
+
+
+def _read_existing(path: Path) -> _Layer:
     with LogFile(path) as file:
         complete = file.complete
     selection = select([path])
