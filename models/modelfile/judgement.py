@@ -1,0 +1,114 @@
+"""What was found of a model before it may label a home: one small file for each, beside the models.
+
+The file is named by the content of the model, so that another model of the same name has none.
+"""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from hearthlog.models.errors import ModelError
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.storage.new_files import replaced_file
+
+_FOLDER = "judgements"
+_LARGEST = 1 << 16  # bytes
+_MOST_REASONS = 32
+_LONGEST_REASON = 500  # characters
+_SHA256 = "[0-9a-f]{64}"
+
+_Text = Annotated[str, StringConstraints(max_length=_LONGEST_REASON, pattern="^[^\x00-\x1f\x7f]*$")]
+
+
+class Judgement(BaseModel):
+    """Whether a model may label.
+
+    Attributes
+    ----------
+    model : str
+        SHA-256 of its file.
+    champion : str
+        SHA-256 of the model that it was compared with; empty if there was none.
+    judged : int
+        When, in nanoseconds of UTC.
+    reasons : tuple of str
+        Why it may not, each a sentence; empty if it may.
+    insisted : bool
+        Whether a person lets it label all the same.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: Annotated[str, StringConstraints(pattern=f"^{_SHA256}$")]
+    champion: Annotated[str, StringConstraints(pattern=f"^({_SHA256})?$")]
+    judged: Annotated[int, Field(ge=0, lt=1 << 63, strict=True)]
+    reasons: Annotated[tuple[_Text, ...], Field(max_length=_MOST_REASONS)] = ()
+    insisted: Annotated[bool, Field(strict=True)] = False
+
+    @property
+    def may_speak(self) -> bool:
+        """Whether the model may label."""
+        return self.insisted or not self.reasons
+
+
+def judgement_path(folder: Path, sha256: str) -> Path:
+    """Return where the judgement of a model is kept.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    sha256 : str
+        Of the model's file.
+    """
+    return folder / _FOLDER / f"{sha256}.json"
+
+
+def read_judgement(folder: Path, sha256: str) -> Judgement | None:
+    """Read the judgement of a model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    sha256 : str
+        Of the model's file.
+
+    Returns
+    -------
+    Judgement or None
+        None if there is none; what is no judgement of this model counts as none.
+    """
+    path = judgement_path(folder, sha256)
+    with suppress(OSError, ValidationError):
+        if path.is_file():
+            with path.open("rb") as stream:
+                data = stream.read(_LARGEST + 1)
+            found = Judgement.model_validate_json(data) if len(data) <= _LARGEST else None
+            return found if found is not None and found.model == sha256 else None
+    return None
+
+
+def write_judgement(folder: Path, judgement: Judgement) -> None:
+    """Keep a judgement, in the place of an earlier one of the same model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    judgement : Judgement
+
+    Raises
+    ------
+    ModelError
+        If it cannot be written.
+    """
+    path = judgement_path(folder, judgement.model)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        with replaced_file(path) as temporary:
+            temporary.write_text(judgement.model_dump_json(indent=2))
+    except (LogError, OSError) as error:
+        raise ModelError(f"{path}: cannot be written ({error})") from error
