@@ -154,14 +154,23 @@ class _Layer(NamedTuple):
 
 
 def _read_layer(path: Path) -> _Layer:
-    """Read a layer; one that is not there, or goes while it is read, is empty."""
-    if path.exists():
+    """Read a layer; if another process replaces it meanwhile, read again, and it may be gone."""
+    while (before := _identity(path)) is not None:
         try:
             return _read_existing(path)
-        except LogError as error:
-            if not isinstance(error.__cause__, FileNotFoundError):
+        except LogError:
+            if _identity(path) == before:
                 raise
     return _Layer([], [])
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what differs between two files of one name; None if there is no file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def _read_existing(path: Path) -> _Layer:
