@@ -1,0 +1,256 @@
+"""`python -m hearthlog.tools.bench.quarter FOLDER`: a quarter of a home, reviewed every week.
+
+Every week the recorder labels with the model of the week before, a person reviews for some minutes,
+a model is learned from all marks, and may label if it is let.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.recorder.config import Settings
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.bench.quarter_picture import line_of, save_picture
+from hearthlog.tools.bench.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored
+from hearthlog.tools.bench.timing import HEARTHLOG
+from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
+from hearthlog.tools.home.composition import Composition
+from hearthlog.tools.home.microphones import NarrowRooms
+from hearthlog.tools.home.person import Person, true_labelling
+from hearthlog.tools.home.plan import LIVING_ROOM, Plan
+from hearthlog.tools.home.record import record_composition
+from hearthlog.tools.home.rooms import Rooms
+from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
+from hearthlog.tools.home.sounds import SimulationError
+from hearthlog.tools.home.truth import truth_of
+
+_MINUTES = 10.0  # of review a week
+_DAY = DAY_FRAMES * FRAME_NANOSECONDS
+_STEP = 3  # days by which the first day of a week moves on, so that every weekday comes
+
+
+@dataclass(frozen=True)
+class Home:
+    """A home whose quarter is simulated.
+
+    Attributes
+    ----------
+    folder : Path
+        For its logs and models; new.
+    plans : sequence of sequence of Plan
+        For each week the days that are recorded.
+    library : ClipLibrary
+        That they are made of.
+    seed : int
+    start : int
+        Time at which the first week begins, in nanoseconds of UTC.
+    """
+
+    folder: Path
+    plans: Sequence[Sequence[Plan]]
+    library: ClipLibrary
+    seed: int
+    start: int
+
+
+def live(home: Home) -> Iterator[Week]:
+    """Live week by week: record, score, review, learn, promote.
+
+    Parameters
+    ----------
+    home : Home
+
+    Yields
+    ------
+    Week
+        As it ends.
+
+    Raises
+    ------
+    HearthlogError
+        If a command fails in another way than to refuse a model.
+    """
+    (home.folder / "models").mkdir(parents=True)
+    logs = home.folder / "logs"
+    for number, plans in enumerate(home.plans, start=1):
+        begin = home.start + (number - 1) * 7 * _DAY
+        end = begin + 7 * _DAY
+        model = _champion(home.folder)
+        truth, recorded = _record(home, number, plans, begin, model)
+        sources = find_labellings(logs)
+        microphone = sources.microphone(None)
+        said = sources.read(microphone, LIVE, begin, end).labelling
+        starter = said if model == starter_file(GENERAL) else _labelled(recorded)
+        person = Person(truth, wrong=float(number == WRONG_WEEK), seed=home.seed)
+        done = person.review(logs, _MINUTES, end, (begin, end))
+        trained, promoted, lines = _learn(home.folder)
+        yield Week(
+            number,
+            model.resolve().stem,
+            scored(truth, said),
+            scored(truth, starter),
+            round(done.seconds / 60.0, 2),
+            len(done.marks),
+            sum(span.chosen != RANDOM for span in done.reviewed),
+            sum(span.chosen == RANDOM for span in done.reviewed),
+            trained,
+            promoted,
+            lines,
+        )
+
+
+def _champion(folder: Path) -> Path:
+    champion = folder / "models" / "champion.safetensors"
+    return champion if champion.exists() else starter_file(GENERAL)
+
+
+def _record(
+    home: Home, number: int, plans: Sequence[Plan], begin: int, model: Path
+) -> tuple[Labelling, list[Path]]:
+    """Record the days of a week; return what is true of them, and their logs."""
+    rooms = (NarrowRooms if number == MICROPHONE_WEEK else Rooms)(LIVING_ROOM, home.seed)
+    settings = Settings(output=home.folder / "logs", model=model, timezone="UTC")
+    truths, logs = [], []
+    for day, plan in zip(_days(number, len(plans)), plans, strict=True):
+        start = begin + day * _DAY
+        composition = Composition(plan, home.library, rooms)
+        logs += record_composition(composition, settings, start)
+        truths.append(true_labelling(truth_of(composition).spans, start))
+    arrays = ("starts", "ends", "labels")
+    return Labelling(*(np.concatenate([getattr(t, a) for t in truths]) for a in arrays)), logs
+
+
+def _labelled(logs: Sequence[Path]) -> Labelling:
+    """Label logs as the starter model would have."""
+    model = load_model(starter_file(GENERAL))
+    classifier = Classifier(model)
+    labeller = StreamLabeller(classifier)
+    for log in logs:
+        for event in read_sound(info_for_model(log, model, log)[0], 0):
+            labeller.push(event)
+    labeller.close()
+    rows = labeller.segments
+    return Labelling(
+        np.array([row.start for row in rows]),
+        np.array([row.end for row in rows]),
+        np.array([classifier.classes[row.run.label] for row in rows], object),
+    )
+
+
+def _learn(folder: Path) -> tuple[bool, bool, list[str]]:
+    """Learn a model of the home, and let it label; return whether both came to pass."""
+    models, champion = folder / "models", _champion(folder).resolve()
+    before = {*models.glob("home-*.safetensors")}
+    lines = _said(folder, "train", "--home", "logs")
+    made = {*models.glob("home-*.safetensors")} - before
+    for model in made:
+        lines += _said(folder, "models", "promote", model.stem)
+    return bool(made), _champion(folder).resolve() != champion, lines
+
+
+def _said(folder: Path, *arguments: str) -> list[str]:
+    """Run the command in a folder, as a person there would, and return its lines."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("HEARTHLOG_")}
+    done = subprocess.run(  # noqa: S603  ours
+        [*HEARTHLOG, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return [*done.stdout.splitlines(), *done.stderr.splitlines()]
+
+
+def _days(number: int, count: int) -> list[int]:
+    """Return the days of a week that are recorded, so that every weekday comes in turn."""
+    return sorted((_STEP * (number - 1 + day)) % 7 for day in range(count))
+
+
+def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list[list[Plan]]:
+    """Plan a home, and take some days of each week.
+
+    Parameters
+    ----------
+    weeks, days : int
+        Days of a week that are recorded, from 1 to 7.
+    library : ClipLibrary
+    seed : int
+
+    Raises
+    ------
+    SimulationError
+        If weeks or days are out of range.
+    """
+    if not 1 <= days <= 7:
+        raise SimulationError(f"a week has 1 to 7 days, not {days}")
+    whole = plan_days(7 * weeks, library, Habits(seed))
+    return [
+        [_part(whole, 7 * week + day) for day in _days(week + 1, days)] for week in range(weeks)
+    ]
+
+
+def _part(plan: Plan, day: int) -> Plan:
+    """Return a day of a plan, without the sounds that go on at midnight."""
+    first, end = day * DAY_FRAMES, (day + 1) * DAY_FRAMES
+    sounds = [
+        replace(sound, start=sound.start - first)
+        for sound in plan.sounds
+        if first <= sound.start and sound.end <= end
+    ]
+    steady = [
+        replace(noise, start=noise.start - first, end=noise.end - first)
+        for noise in plan.steady
+        if noise.start < end and noise.end > first
+    ]
+    return Plan(DAY_FRAMES, sounds, steady)
+
+
+def quarter(
+    folder: Annotated[Path, typer.Argument(help="New folder, for the home and the figures.")],
+    weeks: Annotated[int, typer.Option(min=1)] = 13,
+    days: Annotated[int, typer.Option(min=1, max=7, help="That are recorded of a week.")] = 1,
+    seed: Annotated[int, typer.Option(help="Another one makes another home.")] = 0,
+    manifest: Annotated[Path, typer.Option(help="Clips to compose of.")] = SHIPPED,
+) -> None:
+    """Live a quarter of a home; write `quarter.jsonl`, a line for each week, and `quarter.png`."""
+    if folder.exists():
+        raise SimulationError(f"{folder}: exists already; name a new folder")
+    library = ClipLibrary(manifest)
+    start = round(datetime(2026, 3, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
+    plans = plan_quarter(weeks, days, library, seed)
+    home = Home(folder, plans, library, seed, start)
+    lived = []
+    for week in live(home):
+        lived.append(week)
+        with (folder / "quarter.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(week)) + "\n")
+        print(line_of(week), flush=True)
+    save_picture(folder / "quarter.png", lived)
+
+
+if __name__ == "__main__":
+    try:
+        typer.run(quarter)
+    except HearthlogError as error:
+        sys.exit(f"hearthlog bench: {error}")
