@@ -44,8 +44,11 @@ from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.home.truth import truth_of
 
+Part = tuple[int, Plan]  # of a week: its first frame, and what sounds
 _MINUTES = 10.0  # of review a week
 _DAY = DAY_FRAMES * FRAME_NANOSECONDS
+_HOUR = DAY_FRAMES // 24
+_RECORDED = (7 * _HOUR, 9 * _HOUR), (18 * _HOUR, 20 * _HOUR)  # of a day: up, and the evening
 _STEP = 3  # days by which the first day of a week moves on, so that every weekday comes
 
 
@@ -57,8 +60,8 @@ class Home:
     ----------
     folder : Path
         For its logs and models; new.
-    plans : sequence of sequence of Plan
-        For each week the days that are recorded.
+    weeks : sequence of list of (int, Plan)
+        For each week what is recorded, and its first frame in the week.
     library : ClipLibrary
         That they are made of.
     seed : int
@@ -67,7 +70,7 @@ class Home:
     """
 
     folder: Path
-    plans: Sequence[Sequence[Plan]]
+    weeks: Sequence[list[Part]]
     library: ClipLibrary
     seed: int
     start: int
@@ -92,7 +95,7 @@ def live(home: Home) -> Iterator[Week]:
     """
     (home.folder / "models").mkdir(parents=True)
     logs = home.folder / "logs"
-    for number, plans in enumerate(home.plans, start=1):
+    for number, plans in enumerate(home.weeks, start=1):
         begin = home.start + (number - 1) * 7 * _DAY
         end = begin + 7 * _DAY
         model = _champion(home.folder)
@@ -106,7 +109,7 @@ def live(home: Home) -> Iterator[Week]:
         trained, promoted, lines = _learn(home.folder)
         yield Week(
             number,
-            model.resolve().stem,
+            model.stem,
             scored(truth, said),
             scored(truth, starter),
             round(done.seconds / 60.0, 2),
@@ -121,18 +124,18 @@ def live(home: Home) -> Iterator[Week]:
 
 def _champion(folder: Path) -> Path:
     champion = folder / "models" / "champion.safetensors"
-    return champion if champion.exists() else starter_file(GENERAL)
+    return champion.resolve() if champion.exists() else starter_file(GENERAL)
 
 
 def _record(
-    home: Home, number: int, plans: Sequence[Plan], begin: int, model: Path
+    home: Home, number: int, plans: list[Part], begin: int, model: Path
 ) -> tuple[Labelling, list[Path]]:
-    """Record the days of a week; return what is true of them, and their logs."""
+    """Record a week; return what is true of it, and its logs."""
     rooms = (NarrowRooms if number == MICROPHONE_WEEK else Rooms)(LIVING_ROOM, home.seed)
     settings = Settings(output=home.folder / "logs", model=model, timezone="UTC")
     truths, logs = [], []
-    for day, plan in zip(_days(number, len(plans)), plans, strict=True):
-        start = begin + day * _DAY
+    for first, plan in plans:
+        start = begin + first * FRAME_NANOSECONDS
         composition = Composition(plan, home.library, rooms)
         logs += record_composition(composition, settings, start)
         truths.append(true_labelling(truth_of(composition).spans, start))
@@ -159,13 +162,13 @@ def _labelled(logs: Sequence[Path]) -> Labelling:
 
 def _learn(folder: Path) -> tuple[bool, bool, list[str]]:
     """Learn a model of the home, and let it label; return whether both came to pass."""
-    models, champion = folder / "models", _champion(folder).resolve()
+    models, champion = folder / "models", _champion(folder)
     before = {*models.glob("home-*.safetensors")}
     lines = _said(folder, "train", "--home", "logs")
     made = {*models.glob("home-*.safetensors")} - before
     for model in made:
         lines += _said(folder, "models", "promote", model.stem)
-    return bool(made), _champion(folder).resolve() != champion, lines
+    return bool(made), _champion(folder) != champion, lines
 
 
 def _said(folder: Path, *arguments: str) -> list[str]:
@@ -182,13 +185,8 @@ def _said(folder: Path, *arguments: str) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
-def _days(number: int, count: int) -> list[int]:
-    """Return the days of a week that are recorded, so that every weekday comes in turn."""
-    return sorted((_STEP * (number - 1 + day)) % 7 for day in range(count))
-
-
-def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list[list[Plan]]:
-    """Plan a home, and take some days of each week.
+def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list[list[Part]]:
+    """Plan a home, and take some hours of some days of each week.
 
     Parameters
     ----------
@@ -196,6 +194,11 @@ def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list
         Days of a week that are recorded, from 1 to 7.
     library : ClipLibrary
     seed : int
+
+    Returns
+    -------
+    list of list of (int, Plan)
+        For each week the first frame in it, and the plan, of what is recorded.
 
     Raises
     ------
@@ -206,24 +209,29 @@ def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list
         raise SimulationError(f"a week has 1 to 7 days, not {days}")
     whole = plan_days(7 * weeks, library, Habits(seed))
     return [
-        [_part(whole, 7 * week + day) for day in _days(week + 1, days)] for week in range(weeks)
+        [
+            (first, _part(whole, week * 7 * DAY_FRAMES + first, end - begin))
+            for day in sorted((_STEP * (week + number)) % 7 for number in range(days))
+            for begin, end in _RECORDED
+            for first in [day * DAY_FRAMES + begin]
+        ]
+        for week in range(weeks)
     ]
 
 
-def _part(plan: Plan, day: int) -> Plan:
-    """Return a day of a plan, without the sounds that go on at midnight."""
-    first, end = day * DAY_FRAMES, (day + 1) * DAY_FRAMES
+def _part(plan: Plan, first: int, frames: int) -> Plan:
+    """Return a part of a plan, without the sounds that go on at its ends."""
     sounds = [
         replace(sound, start=sound.start - first)
         for sound in plan.sounds
-        if first <= sound.start and sound.end <= end
+        if first <= sound.start and sound.end <= first + frames
     ]
     steady = [
         replace(noise, start=noise.start - first, end=noise.end - first)
         for noise in plan.steady
-        if noise.start < end and noise.end > first
+        if noise.start < first + frames and noise.end > first
     ]
-    return Plan(DAY_FRAMES, sounds, steady)
+    return Plan(frames, sounds, steady)
 
 
 def quarter(
@@ -238,8 +246,7 @@ def quarter(
         raise SimulationError(f"{folder}: exists already; name a new folder")
     library = ClipLibrary(manifest)
     start = round(datetime(2026, 3, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
-    plans = plan_quarter(weeks, days, library, seed)
-    home = Home(folder, plans, library, seed, start)
+    home = Home(folder, plan_quarter(weeks, days, library, seed), library, seed, start)
     lived = []
     for week in live(home):
         lived.append(week)
