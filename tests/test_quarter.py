@@ -13,6 +13,7 @@ from hearthlog.tools.bench.quarter_scores import scored
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.microphones import NarrowRooms
 from hearthlog.tools.home.rooms import Rooms
+from hearthlog.tools.home.routine import Habits, plan_days
 from hearthlog.tools.home.short_day import plan_short_day
 
 START = 1_772_323_200_000_000_000
@@ -70,16 +71,18 @@ def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():
         assert b[outside].sum() < 1e-4 * a[outside].sum()
 
 
-def test_the_hours_of_a_week_move_on_and_are_those_of_the_home():
-    library = ClipLibrary(None)
-    weeks = quarter.plan_quarter(3, 2, library, 1)
-    day = 24 * 3600 * 20
-    assert [[first // day for first, _ in week] for week in weeks] == [
-        [0, 0, 3, 3],
-        [3, 3, 6, 6],
-        [2, 2, 6, 6],
-    ]
-    parts = [part for week in weeks for part in week]
-    hours = {(plan.frames, first % day // (day // 24)) for first, plan in parts}
-    assert hours == {(day // 12, 7), (day // 12, 18)}
-    assert all(0 <= s.start < s.end <= plan.frames for _, plan in parts for s in plan.sounds)
+def test_the_hours_of_a_week_are_those_in_which_the_most_is_heard():
+    library, two_hours = ClipLibrary(None), 2 * 3600 * 20
+    weeks = quarter.plan_quarter(2, library, 1)
+    whole = plan_days(14, library, Habits(1))
+    for number, ((first, one), (second, other)) in enumerate(weeks):
+        assert 0 <= first < second < 84 * two_hours
+        assert one.frames == other.frames == two_hours
+        begin = (number * 84) * two_hours
+        heard = {s.clip.label for s in whole.sounds if begin <= s.start < begin + 84 * two_hours}
+        assert len(heard - {s.clip.label for s in (*one.sounds, *other.sounds)}) <= 1
+        assert [s.frames for s in one.sounds] == [
+            s.frames
+            for s in whole.sounds
+            if begin + first <= s.start and s.end <= begin + first + two_hours
+        ]

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated
 
@@ -47,9 +48,7 @@ from hearthlog.tools.home.truth import truth_of
 Part = tuple[int, Plan]  # of a week: its first frame, and what sounds
 _MINUTES = 10.0  # of review a week
 _DAY = DAY_FRAMES * FRAME_NANOSECONDS
-_HOUR = DAY_FRAMES // 24
-_RECORDED = (7 * _HOUR, 9 * _HOUR), (18 * _HOUR, 20 * _HOUR)  # of a day: up, and the evening
-_STEP = 3  # days by which the first day of a week moves on, so that every weekday comes
+_STRETCH = DAY_FRAMES // 12
 
 
 @dataclass(frozen=True)
@@ -95,11 +94,11 @@ def live(home: Home) -> Iterator[Week]:
     """
     (home.folder / "models").mkdir(parents=True)
     logs = home.folder / "logs"
-    for number, plans in enumerate(home.weeks, start=1):
+    for number, parts in enumerate(home.weeks, start=1):
         begin = home.start + (number - 1) * 7 * _DAY
         end = begin + 7 * _DAY
         model = _champion(home.folder)
-        truth, recorded = _record(home, number, plans, begin, model)
+        truth, recorded = _record(home, number, parts, begin, model)
         sources = find_labellings(logs)
         microphone = sources.microphone(None)
         said = sources.read(microphone, LIVE, begin, end).labelling
@@ -128,13 +127,13 @@ def _champion(folder: Path) -> Path:
 
 
 def _record(
-    home: Home, number: int, plans: list[Part], begin: int, model: Path
+    home: Home, number: int, parts: list[Part], begin: int, model: Path
 ) -> tuple[Labelling, list[Path]]:
     """Record a week; return what is true of it, and its logs."""
     rooms = (NarrowRooms if number == MICROPHONE_WEEK else Rooms)(LIVING_ROOM, home.seed)
     settings = Settings(output=home.folder / "logs", model=model, timezone="UTC")
     truths, logs = [], []
-    for first, plan in plans:
+    for first, plan in parts:
         start = begin + first * FRAME_NANOSECONDS
         composition = Composition(plan, home.library, rooms)
         logs += record_composition(composition, settings, start)
@@ -185,59 +184,58 @@ def _said(folder: Path, *arguments: str) -> list[str]:
     return [*done.stdout.splitlines(), *done.stderr.splitlines()]
 
 
-def plan_quarter(weeks: int, days: int, library: ClipLibrary, seed: int) -> list[list[Part]]:
-    """Plan a home, and take some hours of some days of each week.
+def plan_quarter(weeks: int, library: ClipLibrary, seed: int) -> list[list[Part]]:
+    """Plan a home, and choose what is recorded: each week those hours in which the most is heard.
 
     Parameters
     ----------
-    weeks, days : int
-        Days of a week that are recorded, from 1 to 7.
+    weeks : int
     library : ClipLibrary
     seed : int
 
     Returns
     -------
     list of list of (int, Plan)
-        For each week the first frame in it, and the plan, of what is recorded.
+        For each week the first frame in it, and the plan, of each of two stretches of two hours:
+        together they have the most labels of all that begin at even hours.
 
     Raises
     ------
     SimulationError
-        If weeks or days are out of range.
+        If there is no week.
     """
-    if not 1 <= days <= 7:
-        raise SimulationError(f"a week has 1 to 7 days, not {days}")
     whole = plan_days(7 * weeks, library, Habits(seed))
-    return [
-        [
-            (first, _part(whole, week * 7 * DAY_FRAMES + first, end - begin))
-            for day in sorted((_STEP * (week + number)) % 7 for number in range(days))
-            for begin, end in _RECORDED
-            for first in [day * DAY_FRAMES + begin]
-        ]
-        for week in range(weeks)
-    ]
+    labels: list[set[str]] = [set() for _ in range(whole.frames // _STRETCH)]
+    for sound in whole.sounds:
+        labels[sound.start // _STRETCH].add(sound.clip.label)
+    count = 7 * DAY_FRAMES // _STRETCH
+    quarter = []
+    for begin in range(0, len(labels), count):
+        pairs = combinations(range(begin, begin + count), 2)
+        best = max(pairs, key=lambda pair: len(labels[pair[0]] | labels[pair[1]]))
+        quarter.append([((at - begin) * _STRETCH, _part(whole, at * _STRETCH)) for at in best])
+    return quarter
 
 
-def _part(plan: Plan, first: int, frames: int) -> Plan:
-    """Return a part of a plan, without the sounds that go on at its ends."""
+def _part(plan: Plan, first: int) -> Plan:
+    """Return a stretch of a plan, without the sounds that go on at its ends."""
+    end = first + _STRETCH
     sounds = [
         replace(sound, start=sound.start - first)
         for sound in plan.sounds
-        if first <= sound.start and sound.end <= first + frames
+        if first <= sound.start and sound.end <= end
     ]
     steady = [
         replace(noise, start=noise.start - first, end=noise.end - first)
         for noise in plan.steady
-        if noise.start < first + frames and noise.end > first
+        if noise.start < end and noise.end > first
     ]
-    return Plan(frames, sounds, steady)
+    return Plan(_STRETCH, sounds, steady)
 
 
 def quarter(
     folder: Annotated[Path, typer.Argument(help="New folder, for the home and the figures.")],
     weeks: Annotated[int, typer.Option(min=1)] = 13,
-    days: Annotated[int, typer.Option(min=1, max=7, help="That are recorded of a week.")] = 1,
     seed: Annotated[int, typer.Option(help="Another one makes another home.")] = 0,
     manifest: Annotated[Path, typer.Option(help="Clips to compose of.")] = SHIPPED,
 ) -> None:
@@ -246,7 +244,7 @@ def quarter(
         raise SimulationError(f"{folder}: exists already; name a new folder")
     library = ClipLibrary(manifest)
     start = round(datetime(2026, 3, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
-    home = Home(folder, plan_quarter(weeks, days, library, seed), library, seed, start)
+    home = Home(folder, plan_quarter(weeks, library, seed), library, seed, start)
     lived = []
     for week in live(home):
         lived.append(week)
