@@ -1,4 +1,7 @@
-"""The model file in use, watched: a file that replaces it is loaded and checked in a thread."""
+"""The model file in use, watched: a file that replaces it is loaded and checked in a thread.
+
+A model that replaces another one labels only if there is a judgement that lets it.
+"""
 
 import sys
 from collections.abc import Iterator
@@ -11,6 +14,7 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.modelfile.judgement import judgement_path, read_judgement
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 from hearthlog.models.starter import GENERAL
@@ -59,6 +63,8 @@ class ModelWatch:
         self._starts_with_starter = path == DEFAULT_MODEL and self._seen is None
         self.first = _load(Path(GENERAL) if self._starts_with_starter else path)
         self.ready: Loaded | None = None
+        self._awaited: Path | None = None  # the judgement that the model in the file lacks
+        self._judged: _Identity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
         self._results: SimpleQueue[Loaded | str] = SimpleQueue()
@@ -93,9 +99,13 @@ class ModelWatch:
             requested = self._wait()
             now = _identity(self._path)
             nothing_yet = self._starts_with_starter and now is None and self._seen is None
-            if (now != self._seen or requested) and not (nothing_yet or self._closed.is_set()):
+            changed = now != self._seen or self._awaited_judgement() != self._judged
+            if (changed or requested) and not (nothing_yet or self._closed.is_set()):
                 self._seen = now
                 self._look()
+
+    def _awaited_judgement(self) -> _Identity:
+        return None if self._awaited is None else _identity(self._awaited)
 
     def _wait(self) -> bool:
         """Wait for the next check; return whether it was requested."""
@@ -108,6 +118,7 @@ class ModelWatch:
         return True
 
     def _look(self) -> None:
+        self._awaited = self._judged = None
         try:
             loaded = _load(self._path)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
@@ -119,13 +130,32 @@ class ModelWatch:
             self._refuse(f"it is for feature set {theirs}, not {ours}; start the recorder anew")
             return
         model = loaded.model
-        if (model.name, model.sha256) != (self._last.name, self._last.sha256):
-            self._last = model
-            _warn_if_simulated(model)
-            self._results.put(loaded)
+        if (model.name, model.sha256) == (self._last.name, self._last.sha256):
+            return
+        if model.sha256 != self._last.sha256 and (reason := self._unjudged(model)):
+            self._refuse(reason, model.name)
+            return
+        self._last = model
+        _warn_if_simulated(model)
+        self._results.put(loaded)
 
-    def _refuse(self, reason: str) -> None:
-        text = f"model {self._path.stem} refused: {reason}; going on with {self._last.name}"
+    def _unjudged(self, model: Model) -> str:
+        """Tell why a model may not label; empty if it may."""
+        folder = self._path.parent
+        awaited = judgement_path(folder, model.sha256)
+        judged = _identity(awaited)  # before it is read: a later one is another one
+        judgement = read_judgement(folder, model.sha256)
+        if judgement is not None and judgement.may_speak:
+            return ""
+        self._awaited, self._judged = awaited, judged
+        promote = f"hearthlog models promote {model.name}"
+        if judgement is None:
+            return f"it was not judged in this home; `{promote}` judges it"
+        return f"{judgement.reasons[0]}; `{promote} --anyway` insists"
+
+    def _refuse(self, reason: str, name: str = "") -> None:
+        name = name or self._path.stem
+        text = f"model {name} refused: {reason}; going on with {self._last.name}"
         self._results.put(text)
         _say(text)
 

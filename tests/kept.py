@@ -8,11 +8,12 @@ import numpy as np
 from hearthlog.models.classifiers.description import Smoothing
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:
-    """Make the models `one`, `two` and `broad`, the first of them the champion."""
+    """Make the models `one`, `two` and `broad`, the first of them the champion; each may label."""
     folder.mkdir()
     one = load_model(model_file)
     rng = np.random.default_rng(3)
@@ -28,6 +29,8 @@ def keep_models(folder: Path, model_file: Path) -> Path:
     save_model(two, folder / "two.safetensors")
     save_model(_of_a_second(one), folder / "broad.safetensors")
     (folder / "champion.safetensors").symlink_to("one.safetensors")
+    for name in ("one", "two", "broad"):
+        insist(folder, load_model(folder / f"{name}.safetensors").sha256)
     return folder
 
 

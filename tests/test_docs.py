@@ -274,7 +274,7 @@ def make_home(folder):
     for name in ("general-1", "general-2", "new", "home", "home-1"):
         shutil.copy("general.safetensors", f"{name}.safetensors")
         shutil.copy("general.safetensors", f"models/{name}.safetensors")
-    do("models promote general-1")
+    do("models promote general-1 --anyway")
     do("models promote general-2")
     do("models promote general-1 --to candidate")
     do("record day.flac --model general.safetensors --start 2026-03-01T06:59 -o logs")

@@ -84,7 +84,10 @@ def test_an_evening_with_nothing_but_a_microphone(
         assert info.stdout.splitlines()[-1].endswith("hearthlog train --home logs")
         trained = hearthlog("train", "--home", "logs")
         assert trained.returncode == 0, trained.stderr
-        promoted = hearthlog("models", "promote", "home-1")
+        refused = hearthlog("models", "promote", "home-1")
+        assert refused.returncode == 1
+        assert "record for some hours" in refused.stderr  # it has learned from all there is
+        promoted = hearthlog("models", "promote", "home-1", "--anyway")
         assert promoted.returncode == 0, promoted.stderr
         wait_for(lambda: [m.model for m in latest("info")] == ["home-1"])
         wait_for(lambda: len(latest("label")) > 40)

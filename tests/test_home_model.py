@@ -49,7 +49,7 @@ def test_the_models_of_a_home_are_numbered_and_it_is_said_how_one_labels(capfd):
         done = trained(capfd)
         assert done.returncode == 0, done.stderr
         assert "adapting one, which labelled the latest log" in done.stderr
-        assert f"`hearthlog models promote home-{number}`" in done.stdout.splitlines()[-1]
+        assert f"`hearthlog models promote home-{number}" in done.stdout.splitlines()[-1]
         assert base_of(f"home-{number}") == sha256_of("one")
 
 

@@ -176,7 +176,7 @@ def test_a_model_is_shown_by_its_card(folder, capfd):
 
 
 def test_promotion_and_rollback_say_what_was_done(folder, capfd):
-    command = ("models", "promote", "two", "--folder", folder)
+    command = ("models", "promote", "two", "--folder", folder, "--anyway")
     short = load(folder, "two").sha256[:12]
     assert run(capfd, *command).stdout == f"two ({short}) is the champion, after one\n"
     assert run(capfd, *command).stdout == "two is the champion already\n"

@@ -9,6 +9,7 @@ from time import sleep
 import pytest
 
 from hearthlog.models.classifiers.description import SIMULATED, Amount, Collection
+from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.tools.home.simulate import write_training_set
@@ -66,6 +67,7 @@ def test_a_model_that_takes_the_place_of_another_is_looked_at_as_well(
 ):
     link = tmp_path / "champion.safetensors"
     link.symlink_to(model_file)
+    insist(tmp_path, load_model(simulated).sha256)
     watch = ModelWatch(link, asked := SimpleQueue())
     link.unlink()
     link.symlink_to(simulated)

@@ -64,21 +64,20 @@ class Changes:
 
 
 def changes_of_frames(
-    classes: Sequence[str], before: Indices, after: Indices, minutes_a_day: float
+    classes: Sequence[str], before: Indices, after: Indices, minutes: Float64
 ) -> Changes:
-    """Count the changes of frames that stand for a day.
+    """Count the changes of frames.
 
     Parameters
     ----------
     classes : sequence of str
     before, after : np.ndarray [shape=(n,)], int
-        Indices of the classes of the same frames in both labellings; at least one frame.
-    minutes_a_day : float
-        That are labelled.
+        Indices of the classes of the same frames in both labellings.
+    minutes : np.ndarray [shape=(n,)], float64
+        Of a day, that each frame stands for.
     """
-    counts = np.bincount(before * len(classes) + after, minlength=len(classes) ** 2)
-    table = counts.reshape(len(classes), len(classes)).astype(np.float64)
-    return Changes(classes, table / len(before) * minutes_a_day)
+    counts = np.bincount(before * len(classes) + after, minutes, len(classes) ** 2)
+    return Changes(classes, counts.reshape(len(classes), len(classes)).astype(np.float64))
 
 
 def changes_of_labellings(difference: Difference) -> Changes:

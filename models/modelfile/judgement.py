@@ -3,6 +3,7 @@
 The file is named by the content of the model, so that another model of the same name has none.
 """
 
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -112,3 +113,24 @@ def write_judgement(folder: Path, judgement: Judgement) -> None:
             temporary.write_text(judgement.model_dump_json(indent=2))
     except (LogError, OSError) as error:
         raise ModelError(f"{path}: cannot be written ({error})") from error
+
+
+def insist(folder: Path, sha256: str) -> None:
+    """Let a model label whatever its judgement says, or without one.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of model files.
+    sha256 : str
+        Of the model's file.
+
+    Raises
+    ------
+    ModelError
+        If that cannot be written.
+    """
+    found = read_judgement(folder, sha256)
+    judgement = found or Judgement(model=sha256, champion="", judged=time.time_ns())
+    if found is None or not found.may_speak:
+        write_judgement(folder, judgement.model_copy(update={"insisted": True}))

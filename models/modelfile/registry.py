@@ -15,6 +15,7 @@ from pathlib import Path
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import STARTERS, starter_file
 from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
@@ -181,6 +182,8 @@ def is_starter(name: str, sha256: str) -> bool:
 def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str | None]:
     """Point an alias to a model, if that model can be used.
 
+    Whether it may label is for a judgement to say, which a recorder asks for.
+
     Parameters
     ----------
     folder : Path
@@ -213,7 +216,7 @@ def promote(folder: Path, name: str, alias: str = CHAMPION) -> tuple[Model, str 
 
 
 def rollback(folder: Path) -> tuple[Model, str]:
-    """Make the last earlier champion that can still be used the champion again.
+    """Make the last earlier champion that can still be used the champion again: it may label.
 
     Parameters
     ----------
@@ -239,6 +242,7 @@ def rollback(folder: Path) -> tuple[Model, str]:
         while earlier:
             with suppress(ModelError):
                 model = load(folder, earlier.pop())
+                insist(folder, model.sha256)
                 _point(folder, CHAMPION, model.name)
                 _write_history(folder, earlier)
                 return model, before

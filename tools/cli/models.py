@@ -11,6 +11,7 @@ from hearthlog.tools.cli.options import CLIPS, Json, OwnScenario, manifest_path,
 from hearthlog.tools.cli.scores import share
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, print_lines, tell, wrong_use
+from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.compare_models import Comparison
@@ -112,11 +113,23 @@ def promote(
     to: Annotated[
         Literal["champion", "candidate"], typer.Option(help="What it becomes.")
     ] = "champion",
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option(help="Logs of the home to judge it by.", show_default="where they are made"),
+    ] = None,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Let it label without a judgement, or against it.")
+    ] = False,
 ) -> None:
-    """Check a model, and make it the champion in one step; a recorder that runs takes it over."""
+    """Make a model the champion, if it does no harm; a recorder that runs takes it over.
+
+    It is compared with the model that labels now, on recent logs that it has not learned from.
+    """
     from hearthlog.models.modelfile.registry import promote as promote_model
 
     place = models_folder(folder)
+    if to == "champion":
+        _check_harmless(place, name, logs or [_logs_folder()], anyway=anyway)
     model, before = promote_model(place, name, to)
     if model.name == before:
         print(f"{model.name} is the {to} already")
@@ -131,6 +144,34 @@ def rollback(folder: _Folder = None) -> None:
 
     model, before = roll_back(models_folder(folder))
     print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
+
+
+def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
+    """End with a line if a model was judged to do harm; judge it first if it was not."""
+    from hearthlog.analyzer.gate.judge import judge, judged_against
+    from hearthlog.models.errors import ModelError
+    from hearthlog.models.modelfile.judgement import insist
+    from hearthlog.models.modelfile.registry import load
+    from hearthlog.tools.cli.progress import share_done
+
+    model = load(folder, name)
+    if anyway:
+        insist(folder, model.sha256)
+        return
+    judgement = judged_against(folder, model, home)
+    if judgement is None:
+        with share_done(f"judging {model.name}", announce=True) as report:
+            verdict = judge(folder, model, home, report)
+        print_verdict(verdict)
+        judgement = verdict.judgement
+    if not judgement.may_speak:
+        raise ModelError(refusal(judgement, model.name))
+
+
+def _logs_folder() -> Path:
+    from hearthlog.recorder.config import load_settings
+
+    return load_settings(None, {}, {}).output
 
 
 def _recordings(

@@ -24,8 +24,10 @@ from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, tell, wrong_use
+from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.gate.judge import Verdict
     from hearthlog.analyzer.training.dataset import Dataset, Recording
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.description import Amount
@@ -101,17 +103,40 @@ def train(
     output = output or _next_of_home()
     save_model(model, output)
     saved = load_model(output)
+    verdict = _judged(saved, output, home) if home else None
     if as_json:
         result = {"model": str(output), "sha256": saved.sha256, "skipped": dict(segments.skipped)}
+        if verdict is not None:
+            result["judgement"] = verdict.judgement.model_dump()
         print(json.dumps(result | saved.description.model_dump()))
-    else:
-        _print(saved, segments)
-        print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
-        if output.parent == models_folder():
-            print(
-                f"`hearthlog models promote {output.stem}` lets it label: a recorder without "
-                "--model takes it over within about a second"
-            )
+        return
+    _print(saved, segments)
+    print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
+    if verdict is not None:
+        print_verdict(verdict)
+        _print_next(verdict, output)
+
+
+def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
+    from hearthlog.analyzer.gate.judge import judge
+    from hearthlog.models.errors import ModelError
+
+    try:
+        with share_done("listening to what it would change", announce=True) as report:
+            return judge(output.parent, model, home, report)
+    except ModelError as error:  # the model is made all the same
+        tell(str(error))
+        return None
+
+
+def _print_next(verdict: "Verdict", output: Path) -> None:
+    if not verdict.judgement.may_speak:
+        print(f"\n{refusal(verdict.judgement, verdict.model)}")
+    elif output.parent == models_folder():
+        print(
+            f"\nno harm is seen: `hearthlog models promote {output.stem}` lets it label, and a "
+            "recorder without --model takes it over within about a second"
+        )
 
 
 def _next_of_home() -> Path:

@@ -1,0 +1,203 @@
+"""What another model would change in a home, measured on time that it has not learned from."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.gate.changes import Changes, changes_of_frames
+from hearthlog.analyzer.gate.hearing import NOTHING, Ears, Heard, hear, joined_frames
+from hearthlog.analyzer.gate.recent_time import (
+    Part,
+    RecentLog,
+    choose,
+    learned_time,
+    minutes_a_day,
+    sounding_time,
+    unlearned_time,
+)
+from hearthlog.analyzer.gate.reference import Sound, reference, spans_of
+from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.models.classes import translation
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Float64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
+
+SURE = 0.9  # probability
+_REFERENCE_SECONDS = 3_600.0
+_NEAR = 60 * NANOSECONDS
+_MOST = 0.5  # of a sound
+
+
+class Right(NamedTuple):
+    """Known sounds, and how many of them each model gives the right label for most of their time.
+
+    Attributes
+    ----------
+    sounds : int
+    before, after : int
+        Right in the first model, in the second.
+    gained, lost : int
+        Right in the second alone, in the first alone.
+    """
+
+    sounds: int = 0
+    before: int = 0
+    after: int = 0
+    gained: int = 0
+    lost: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Two models on the same recent time of a home.
+
+    Attributes
+    ----------
+    minutes : float
+        Of the time that both have labelled.
+    changes : Changes
+        From the first model to the second.
+    sure : np.ndarray [shape=(C, C)], float64
+        As `changes.minutes`, of the time in which the first model is sure.
+    random, marks : Right
+        Sounds of the minutes that were drawn at random; of other marks that neither has learned
+        from.
+    losses : list of str
+        Logs and layers that cannot be used, and why.
+    """
+
+    minutes: float
+    changes: Changes
+    sure: Float64
+    random: Right
+    marks: Right
+    losses: list[str]
+
+
+def gather_evidence(
+    before: Model,
+    after: Model,
+    logs: Sequence[RecentLog],
+    progress: Progress = ignore_progress,
+) -> Evidence:
+    """Run two models over a sample of the recent time of a home, and over its known sounds.
+
+    Parameters
+    ----------
+    before, after : Model
+        Of the same feature set; the second would take the place of the first.
+    logs : sequence of RecentLog
+    progress : callable, optional
+        Is told the share of the sound that is done, 0 to 1.
+
+    Raises
+    ------
+    ModelError
+        If the feature set of the models, or a kind of classifier, is not installed.
+    """
+    losses: list[str] = []
+    known = _known_sounds(logs, losses)
+    learned = _learned(before, after, known)
+    chosen = choose(unlearned_time(logs, learned), sounding_time(logs))
+    places = _places(
+        [(log, [s for s in own if s.random or not _is_in(learned, s)]) for log, own in known]
+    )
+    hearing = _Hearing(Ears.of(before, after), len(chosen) + len(places), losses, progress)
+    heard = joined_frames([hearing.of(*weighted) for weighted in chosen])
+    right = [_right(sounds, hearing.of(part), hearing.classes) for part, sounds in places]
+    share = heard.weight / max(heard.weight.sum(), 1.0)
+    day, sure = share * minutes_a_day(logs), heard.confidence >= SURE
+    return Evidence(
+        minutes=len(heard.stamps) * FRAME_SECONDS / 60,
+        changes=changes_of_frames(hearing.classes, heard.before, heard.after, day),
+        sure=changes_of_frames(hearing.classes, heard.before, heard.after, day * sure).minutes,
+        random=_sum(one for one, _ in right),
+        marks=_sum(one for _, one in right),
+        losses=losses,
+    )
+
+
+class _Hearing:
+    """Both models on one part after the other; their classes are those of the first, and others."""
+
+    def __init__(self, ears: Ears, parts: int, losses: list[str], progress: Progress) -> None:
+        first, second = (model.classes for model in ears.models)
+        names = translation(second, first)
+        self.classes = list(dict.fromkeys([*first, *names.values()]))
+        self._numbers = np.array([self.classes.index(names[name]) for name in second])
+        self._ears, self._parts, self._losses, self._progress = ears, parts, losses, progress
+        self._done = 0
+
+    def of(self, part: Part, weight: float = 1.0) -> Heard:
+        try:
+            heard = hear(part, self._ears, weight)
+        except LogError as error:
+            self._losses.append(str(error))
+            heard = NOTHING
+        self._done += 1
+        self._progress(self._done / self._parts)
+        return heard._replace(after=self._numbers[heard.after])
+
+
+def _known_sounds(
+    logs: Sequence[RecentLog], losses: list[str]
+) -> list[tuple[RecentLog, list[Sound]]]:
+    known = []
+    for log in logs:
+        try:
+            known.append((log, reference(log.path)))
+        except (DataError, LogError) as error:
+            losses.append(str(error))
+    return known
+
+
+def _learned(before: Model, after: Model, known: list[tuple[RecentLog, list[Sound]]]) -> Spans:
+    """Return the time that one of the models has learned from."""
+    chosen = [(s.start, s.end) for _, sounds in known for s in sounds if not s.random]
+    marked = spans_of(chosen)
+    both = [learned_time(model, marked) for model in (before, after)]
+    starts, ends = (np.concatenate(edges) for edges in zip(*both, strict=True))
+    return joined(starts, ends)
+
+
+def _is_in(spans: Spans, sound: Sound) -> bool:
+    return bool(rows_at(spans, np.array([(sound.start + sound.end) // 2]))[0] >= 0)
+
+
+def _places(known: list[tuple[RecentLog, list[Sound]]]) -> list[tuple[Part, list[Sound]]]:
+    """Join sounds that are near each other, so that they are heard at once; the latest at most."""
+    places: list[tuple[Part, list[Sound]]] = []
+    for log, sounds in known:
+        times = spans_of([(s.start, s.end) for s in sounds], _NEAR)
+        rows = rows_at(times, np.array([s.start for s in sounds], np.int64))
+        for row, (start, end) in enumerate(zip(*(edge.tolist() for edge in times), strict=True)):
+            inside = [sound for sound, own in zip(sounds, rows, strict=True) if own == row]
+            places.append((Part(log.path, start, end), inside))
+    # What was drawn at random goes first, then the latest.
+    places.sort(key=lambda place: (any(s.random for s in place[1]), place[0].start), reverse=True)
+    seconds = np.cumsum([(part.end - part.start) / NANOSECONDS for part, _ in places])
+    return places[: int(np.searchsorted(seconds, _REFERENCE_SECONDS, side="right"))]
+
+
+def _right(sounds: Sequence[Sound], heard: Heard, classes: Sequence[str]) -> tuple[Right, Right]:
+    """Count the sounds that each model is right about: those drawn at random, and the others."""
+    names = translation({sound.label for sound in sounds}, classes)
+    counts = {True: Right(), False: Right()}
+    for sound in sounds:
+        first, last = np.searchsorted(heard.stamps, [sound.start, sound.end])
+        if names[sound.label] not in classes or last <= first:
+            continue
+        number = classes.index(names[sound.label])
+        a, b = (bool((one[first:last] == number).mean() > _MOST) for one in heard[1:3])
+        counts[sound.random] = _sum([counts[sound.random], Right(1, a, b, b > a, a > b)])
+    return counts[True], counts[False]
+
+
+def _sum(several: Iterable[Right]) -> Right:
+    return Right(*(sum(column) for column in zip(Right(), *several, strict=True)))

@@ -1,0 +1,129 @@
+"""What two models say of the same sound, frame by frame, as their labels would be."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.gate.recent_time import Part
+from hearthlog.analyzer.logs.spans import Spans, rows_at
+from hearthlog.analyzer.relabel.reading import info_for_model
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
+from hearthlog.analyzer.replay.recorded import Features, read_recorded
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.recorder.events import Gap
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
+from hearthlog.schemas.times import NANOSECONDS
+
+_FLOOR_WARM_UP = 150 * NANOSECONDS
+_LABELS_WARM_UP = 5 * NANOSECONDS
+_BEHIND = 5 * NANOSECONDS  # sound after the part that its last labels depend on
+
+
+class Heard(NamedTuple):
+    """Frames that two models have labelled.
+
+    Attributes
+    ----------
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    before, after : np.ndarray [shape=(n,)], int
+        Indices of the classes of the segments of each model that the frames lie in.
+    confidence : np.ndarray [shape=(n,)], float32
+        Probability that the first model gives to its label.
+    weight : np.ndarray [shape=(n,)], float64
+        How many frames of the home's time each stands for.
+    """
+
+    stamps: Int64
+    before: Indices
+    after: Indices
+    confidence: Float32
+    weight: Float64
+
+
+NOTHING = Heard(
+    np.empty(0, np.int64),
+    np.empty(0, np.intp),
+    np.empty(0, np.intp),
+    np.empty(0, np.float32),
+    np.empty(0),
+)
+
+
+def joined_frames(several: Sequence[Heard]) -> Heard:
+    """Put frames behind each other."""
+    columns = zip(NOTHING, *several, strict=True)
+    return Heard(*(np.concatenate(column) for column in columns))
+
+
+class Ears(NamedTuple):
+    """Two models of the same feature set, ready to label."""
+
+    models: tuple[Model, Model]
+    classifiers: tuple[Classifier, Classifier]
+
+    @classmethod
+    def of(cls, before: Model, after: Model) -> "Ears":
+        """Make them ready."""
+        return cls((before, after), (Classifier(before), Classifier(after)))
+
+
+def hear(part: Part, ears: Ears, weight: float = 1.0) -> Heard:
+    """Label a part of a log with two models, each as a recorder would.
+
+    Parameters
+    ----------
+    part : Part
+    ears : Ears
+    weight : float, optional
+        Of its frames.
+
+    Returns
+    -------
+    Heard
+        Of the frames that both models label.
+
+    Raises
+    ------
+    LogError
+        If the log cannot be read, or has no features of the set of the models.
+    """
+    info, _ = info_for_model(part.log, ears.models[0], part.log)
+    sound = [
+        event
+        for batch in read_recorded(
+            info, part.start - _FLOOR_WARM_UP, part.end + _BEHIND, sound_only=True
+        )
+        for event in batch.events
+        if isinstance(event, Features | Gap)
+    ]
+    first, second = (_labelled(sound, part, classifier) for classifier in ears.classifiers)
+    stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
+    weights = np.full(len(stamps), weight)
+    return Heard(stamps, first.labels[a], second.labels[b], first.confidence[a], weights)
+
+
+class _Labelled(NamedTuple):
+    stamps: Int64
+    labels: Indices
+    confidence: Float32
+
+
+def _labelled(sound: Sequence[Features | Gap], part: Part, classifier: Classifier) -> _Labelled:
+    labeller = StreamLabeller(classifier, part.start - _LABELS_WARM_UP)
+    pieces = [said for event in sound if (said := labeller.push(event)) is not None]
+    labeller.close()
+    segments = labeller.segments
+    if not (pieces and segments):
+        none = np.empty(0, np.int64)
+        return _Labelled(none, none.astype(np.intp), none.astype(np.float32))
+    times = np.array([(segment.start, segment.end) for segment in segments], np.int64)
+    names = np.array([segment.label for segment in segments], np.intp)
+    stamps = np.concatenate([one.stamps for one in pieces])
+    rows = rows_at(Spans(times[:, 0], times[:, 1]), stamps)
+    kept = (stamps >= part.start) & (stamps < part.end) & (rows >= 0)
+    labels = names[rows[kept]]
+    probabilities = np.concatenate([one.probabilities for one in pieces])[kept]
+    return _Labelled(stamps[kept], labels, probabilities[np.arange(len(labels)), labels])

@@ -1,0 +1,151 @@
+"""Judge a model before it labels a home: against the one that labels there now."""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from hearthlog.analyzer.gate.evidence import Evidence, gather_evidence
+from hearthlog.analyzer.gate.recent_time import recent_logs
+from hearthlog.analyzer.gate.rules import damages
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.judgement import Judgement, read_judgement, write_judgement
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import CHAMPION, find_model, load
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.progress import Progress, ignore_progress
+
+_LONGEST = 400  # characters of a reason
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What was found of a model.
+
+    Attributes
+    ----------
+    judgement : Judgement
+    model, champion : str
+        Names; that of the champion is empty if nothing labels yet.
+    evidence : Evidence or None
+        None if there is nothing to compare, or with.
+    """
+
+    judgement: Judgement
+    model: str
+    champion: str
+    evidence: Evidence | None
+
+
+def judge(
+    folder: Path, model: Model, home: Sequence[Path], progress: Progress = ignore_progress
+) -> Verdict:
+    """Compare a model with the one that labels a home now, and keep the judgement.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model; its champion labels now, or else the model that labelled the latest logs.
+    model : Model
+    home : sequence of Path
+        Folders of the home's logs; need not exist.
+    progress : callable, optional
+        Is told the share that is done, 0 to 1.
+
+    Raises
+    ------
+    ModelError
+        If the model that labels now cannot be found or used, a feature set is not installed, or the
+        judgement cannot be written.
+    """
+    champion = find_champion(folder, home, model.sha256)
+    evidence, reasons = None, list[str]()
+    if champion is None:
+        reasons = [f"there are no labels in {_names(home)} to compare its own with"]
+    elif champion.description.feature_set != model.description.feature_set:
+        mine, theirs = (one.description.feature_set for one in (model, champion))
+        text = f"it is for feature set {mine}, and {champion.name}, which labels now, for {theirs}"
+        reasons = [f"{text}: they cannot be compared on the same logs"]
+    elif champion.sha256 != model.sha256:
+        evidence = gather_evidence(champion, model, recent_logs(home), progress)
+        reasons = damages(evidence, champion.name)
+    judgement = Judgement(
+        model=model.sha256,
+        champion="" if champion is None else champion.sha256,
+        judged=time.time_ns(),
+        reasons=tuple(reason[:_LONGEST] for reason in reasons),
+    )
+    write_judgement(folder, judgement)
+    return Verdict(judgement, model.name, "" if champion is None else champion.name, evidence)
+
+
+def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | None:
+    """Find the model that labels a home now.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of models, whose champion it is, unless that is the model that is judged or is gone.
+    home : sequence of Path
+        Folders of logs, the latest of which it else has labelled.
+    sha256 : str
+        Of the model that is judged.
+
+    Returns
+    -------
+    Model or None
+        None if there are no logs with labels.
+
+    Raises
+    ------
+    ModelError
+        If the model that labelled the latest log is gone.
+    """
+    with suppress(ModelError):
+        champion = load(folder, CHAMPION)
+        if champion.sha256 != sha256:
+            return champion
+    with suppress(LogError):
+        for name, labelled_by in find_home_logs(home).latest_models():
+            if name:
+                path = find_model(folder, labelled_by)
+                if path is None:
+                    raise ModelError(
+                        f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
+                        "nor a starter model of this version: put its file there to compare with "
+                        "it, or insist: `hearthlog models promote --anyway`"
+                    )
+                return load_model(path)
+    return None
+
+
+def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgement | None:
+    """Return the judgement of a model, if it labels now or was compared with the model that does.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the model.
+    model : Model
+    home : sequence of Path
+        As of `judge`.
+
+    Raises
+    ------
+    ModelError
+        As `find_champion`.
+    """
+    judgement = read_judgement(folder, model.sha256)
+    with suppress(ModelError):
+        if judgement is not None and load(folder, CHAMPION).sha256 == model.sha256:
+            return judgement if judgement.may_speak else None  # it labels now
+    champion = find_champion(folder, home, model.sha256)
+    sha256 = "" if champion is None else champion.sha256
+    return judgement if judgement is not None and judgement.champion == sha256 else None
+
+
+def _names(home: Sequence[Path]) -> str:
+    return ", ".join(map(str, home))

@@ -1,0 +1,200 @@
+"""The recent time of a home that a model has not learned from, and parts of it to judge it by."""
+
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, without
+from hearthlog.models.classes import SILENCE
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import LIVE, parse_topic
+from hearthlog.schemas.times import NANOSECONDS
+
+_DAY = 86_400 * NANOSECONDS
+_RECENT = 14 * _DAY
+_NEVER = 1 << 62
+_LOUD = 48, 75 * NANOSECONDS  # number of spans that are heard, and their length
+_QUIET = 20, 180 * NANOSECONDS
+_AROUND = 10 * NANOSECONDS  # a sound
+_SHORTEST = 30 * NANOSECONDS  # time that is worth a look into a log
+_SEED = 7
+
+
+class RecentLog(NamedTuple):
+    """A log, and when its messages are (ns of UTC)."""
+
+    path: Path
+    start: int
+    end: int
+
+
+class Part(NamedTuple):
+    """A span of a log, in nanoseconds of UTC."""
+
+    log: Path
+    start: int
+    end: int
+
+
+class WeightedPart(NamedTuple):
+    """A part that stands for more time like it."""
+
+    part: Part
+    weight: float  # how much more
+
+
+def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
+    """Find the logs of the last two weeks of a home, in the order of time.
+
+    Parameters
+    ----------
+    folders : iterable of Path
+        Logs, or folders of logs. What cannot be read is left out.
+    """
+    try:
+        entries = find_home_logs(folders).between(0, _NEVER)
+    except LogError:  # no log at all
+        return []
+    newest = max((entry.start for entry in entries), default=0)
+    logs = []
+    for entry in entries:
+        if newest - entry.start <= _RECENT:
+            with suppress(LogError, OSError):
+                span = time_span(entry.path)
+                if span is not None and span[1] > span[0]:
+                    logs.append(RecentLog(entry.path, *span))
+    return logs
+
+
+def sounding_time(logs: Sequence[RecentLog]) -> Spans:
+    """Return when something else than silence was labelled by who recorded the logs.
+
+    Parameters
+    ----------
+    logs : sequence of RecentLog
+        What cannot be read is left out.
+    """
+    starts, ends = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for log in logs:
+        with suppress(LogError):
+            names = select([log.path]).topics_of(message_types.SEGMENT, SEGMENT_FIELDS)
+            live = {name for name in names if (t := parse_topic(name)) and t.labelling == LIVE}
+            for columns in read_columns([log.path], live, fields=SEGMENT_FIELDS).values():
+                sounds = columns["label"] != SILENCE
+                starts.append(columns["header.stamp"][sounds])
+                ends.append(starts[-1] + columns["duration"][sounds])
+    return joined(np.concatenate(starts), np.concatenate(ends))
+
+
+def learned_time(model: Model, marked: Spans) -> Spans:
+    """Return the time of a home that a model has learned from, as far as that is known.
+
+    Parameters
+    ----------
+    model : Model
+    marked : Spans
+        Marks of the home, from all of which an adapted model that says no time is taken to have
+        learned.
+    """
+    training = model.description.training_data
+    if training.home_spans:
+        times = np.array(training.home_spans, np.int64)
+        return joined(times[:, 0], times[:, 1])
+    return marked if any(amount.segments for amount in training.home.values()) else NONE
+
+
+def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
+    """Return the time of logs that nothing was learned from, in the order of the logs.
+
+    Parameters
+    ----------
+    logs : sequence of RecentLog
+    learned : Spans
+    """
+    parts = []
+    for log in logs:
+        whole = Spans(np.array([log.start]), np.array([log.end]))
+        rest = without(whole, cut(learned, log.start, log.end))
+        times = zip(rest.starts.tolist(), rest.ends.tolist(), strict=True)
+        parts += [Part(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST]
+    return parts
+
+
+def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
+    """Choose parts of the time to judge by: about an hour with sound, and about an hour without.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        In the order of time.
+    sounding : Spans
+        Where something was heard; it is a small part of the time of many homes.
+
+    Returns
+    -------
+    list of WeightedPart
+    """
+    near = joined(sounding.starts - _AROUND, sounding.ends + _AROUND, _AROUND)
+    loud: list[Part] = []
+    quiet: list[Part] = []
+    for part in parts:
+        whole = Spans(np.array([part.start]), np.array([part.end]))
+        inside = cut(near, part.start, part.end)
+        for found, spans in ((loud, inside), (quiet, without(whole, inside))):
+            times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
+            found += [part._replace(start=start, end=end) for start, end in times]
+    return [*_weighted(loud, *_LOUD), *_weighted(quiet, *_QUIET)]
+
+
+def sample(parts: Sequence[Part], count: int, longest: int) -> list[Part]:
+    """Choose spans of time, so many at most.
+
+    One begins in each of as many equal shares of the time, at a moment that is drawn: so they are
+    of all days and of all times of day. The same time gives the same spans.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        In the order of time.
+    count : int
+    longest : int
+        Nanoseconds of each; one ends earlier where its part does.
+    """
+    lengths = np.array([part.end - part.start for part in parts], np.int64)
+    total = int(lengths.sum())
+    if total <= count * longest:
+        return list(parts)
+    drawn = np.random.default_rng(_SEED).random(count)
+    moments = ((np.arange(count) + drawn) * (total / count)).astype(np.int64)
+    begins = np.concatenate([[0], np.cumsum(lengths)])
+    rows = np.searchsorted(begins, moments, side="right") - 1
+    chosen = []
+    for row, moment in zip(rows.tolist(), moments.tolist(), strict=True):
+        part = parts[row]
+        # Back from the end of its part, where it would else be cut short.
+        start = max(min(part.start + moment - int(begins[row]), part.end - longest), part.start)
+        chosen.append(part._replace(start=start, end=min(start + longest, part.end)))
+    return chosen
+
+
+def _weighted(parts: Sequence[Part], count: int, longest: int) -> list[WeightedPart]:
+    chosen = sample(parts, count, longest)
+    there, heard = (sum(part.end - part.start for part in some) for some in (parts, chosen))
+    return [WeightedPart(part, there / heard) for part in chosen]
+
+
+def minutes_a_day(logs: Sequence[RecentLog]) -> float:
+    """Return how much is recorded in a mean day on which there are logs, at most 24 hours."""
+    days = {log.start // _DAY for log in logs} | {(log.end - 1) // _DAY for log in logs}
+    total = sum(log.end - log.start for log in logs)
+    return min(total / max(len(days), 1), _DAY) / (60 * NANOSECONDS)

@@ -1,0 +1,93 @@
+"""What is known of the sounds of a home: marks, and what was looked at and left as it was."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.spans import Spans, joined, remains
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.schemas.times import NANOSECONDS
+
+_SHORTEST = NANOSECONDS // 2  # sound that counts
+
+
+class Sound(NamedTuple):
+    """A sound whose label is known.
+
+    Attributes
+    ----------
+    start, end : int
+        Nanoseconds of UTC.
+    label : str
+    random : bool
+        Whether it is of time that was drawn at random, and not chosen.
+    """
+
+    start: int
+    end: int
+    label: str
+    random: bool
+
+
+def reference(log: Path) -> list[Sound]:
+    """Return the sounds of a log whose labels are known.
+
+    Parameters
+    ----------
+    log : Path
+
+    Returns
+    -------
+    list of Sound
+        Of half a second or more, by the start; first those of time that was drawn at random.
+
+    Raises
+    ------
+    LogError
+        If its review layer is damaged, or what was looked at has gone.
+    """
+    marks, drawn = read_marks(log), _drawn(read_reviewed(log))
+    inside = [sound for span in drawn for sound in _true(log, span, marks)]
+    others = [
+        Sound(mark.start, mark.end, mark.label, random=False)
+        for mark in marks
+        if not any(_inside(mark, span) for span in drawn)
+    ]
+    return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST]
+
+
+def _true(log: Path, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
+    """Yield what is true of a reviewed span: the labelling, and the marks over it."""
+    own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
+    for mark in own:
+        yield Sound(max(mark.start, span.start), min(mark.end, span.end), mark.label, random=True)
+    labellings = find_labellings(log)
+    name = labellings.find(span.microphone, span.corrects)
+    said = labellings.read(span.microphone, name, span.start, span.end).labelling
+    rest, row = remains(said, spans_of([(mark.start, mark.end) for mark in own]))
+    for start, end, label in zip(rest.starts, rest.ends, said.labels[row], strict=True):
+        yield Sound(int(start), int(end), str(label), random=True)
+
+
+def _drawn(reviewed: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
+    return [span for span in reviewed if span.chosen == RANDOM]
+
+
+def _inside(mark: Mark, span: ReviewedSpan) -> bool:
+    return mark.start < span.end and mark.end > span.start
+
+
+def spans_of(times: Sequence[tuple[int, int]], pause: int = 0) -> Spans:
+    """Join spans of time that overlap or are no more than a pause apart.
+
+    Parameters
+    ----------
+    times : sequence of (int, int)
+        Start and end of each, in any order.
+    pause : int, optional
+    """
+    array = np.array(times, np.int64).reshape(-1, 2)
+    return joined(array[:, 0], array[:, 1], pause)

@@ -1,0 +1,397 @@
+"""A model is judged in the home before it labels there: damage is refused, and it is said why."""
+
+import json
+import os
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event as Flag
+
+import numpy as np
+import pytest
+from spliced import run
+
+from hearthlog.analyzer.evaluation.difference import compare_labellings
+from hearthlog.analyzer.gate.changes import changes_of_frames, changes_of_labellings
+from hearthlog.analyzer.gate.evidence import Right
+from hearthlog.analyzer.gate.recent_time import Part, choose, recent_logs, sample
+from hearthlog.analyzer.gate.rules import clearly_better
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import NamedLabelling
+from hearthlog.analyzer.logs.spans import Spans, common
+from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.models.modelfile.judgement import (
+    Judgement,
+    insist,
+    judgement_path,
+    read_judgement,
+    write_judgement,
+)
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile.registry import promote, rollback, target
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.recording import record
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.tools.home.simulate import write_day
+
+OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
+SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+START = 1_772_348_400 * SECOND
+MINUTES = 12
+
+
+@pytest.fixture(scope="session")
+def lived(tmp_path_factory, model_file):
+    """A folder with `logs` by the champion of `models`; what is true of them beside it."""
+    folder = tmp_path_factory.mktemp("lived")
+    (folder / "models").mkdir()
+    shutil.copy(model_file, folder / "models" / "one.safetensors")
+    (folder / "models" / "champion.safetensors").symlink_to("one.safetensors")
+    sound = folder / "day.flac"
+    write_day(sound, MINUTES, seed=33, manifest=None)
+    settings = Settings(output=folder / "logs", model=folder / "models" / "one.safetensors")
+    record(settings, settings.microphone[0], FileSource([sound], START), Flag())
+    return folder
+
+
+@pytest.fixture
+def place(lived, tmp_path, monkeypatch):
+    """The current folder, which has a copy of them."""
+    for name in ("logs", "models"):
+        shutil.copytree(lived / name, tmp_path / name, symlinks=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HEARTHLOG_MODEL")
+    return tmp_path
+
+
+def truth(lived):
+    rows = (line.split("\t") for line in (lived / "day.txt").read_text().splitlines())
+    return [(START + round(float(a) * SECOND), START + round(float(b) * SECOND), c)
+            for a, b, c in rows]  # fmt: skip
+
+
+def keep(name, **changes):
+    """Put a model into the folder that is the champion but for some of its description."""
+    one = load_model(Path("models/one.safetensors"))
+    about = one.description.model_copy(update=changes)
+    save_model(replace(one, description=about), Path(f"models/{name}.safetensors"))
+    return load_model(Path(f"models/{name}.safetensors"))
+
+
+def keep_deaf(name="deaf"):
+    return keep(name, gate=0.0, decision_bias={"silence": -30.0})
+
+
+def keep_swapped(first="speech", second="silence"):
+    classes = list(load_model(Path("models/one.safetensors")).classes)
+    i, j = classes.index(first), classes.index(second)
+    classes[i], classes[j] = second, first
+    return keep("swapped", classes=classes)
+
+
+def keep_alike():
+    """Put a model into the folder that says what the champion says, and is another file."""
+    return keep("alike", scenario_name="general of the home")
+
+
+def champion():
+    return target(Path("models"), "champion")
+
+
+@pytest.mark.usefixtures("place")
+def test_a_model_that_is_deaf_to_silence_is_refused_and_it_is_said_what_would_change(capfd):
+    model = keep_deaf()
+    done = run(capfd, "models", "promote", "deaf")
+    assert done.returncode == 1
+    assert " a day from silence to " in done.stdout
+    refused = done.stderr.splitlines()[-1]
+    assert refused.startswith("hearthlog: deaf refused: silence falls from ")
+    assert "`hearthlog models promote deaf --anyway`" in refused
+    assert champion() == "one"
+    judgement = read_judgement(Path("models"), model.sha256)
+    assert judgement.champion == load_model(Path("models/one.safetensors")).sha256
+    assert not judgement.may_speak
+
+
+@pytest.mark.usefixtures("place")
+def test_who_insists_gets_the_model_and_it_stays_refused_for_the_next(capfd):
+    model = keep_deaf()
+    assert run(capfd, "models", "promote", "deaf").returncode == 1
+    again = run(capfd, "models", "promote", "deaf")  # it is not judged anew
+    assert (again.returncode, again.stdout, again.stderr.count("\n")) == (1, "", 1)
+    assert run(capfd, "models", "promote", "deaf", "--anyway").returncode == 0
+    assert champion() == "deaf"
+    judgement = read_judgement(Path("models"), model.sha256)
+    assert judgement.insisted
+    assert judgement.reasons[0].startswith("silence falls from ")
+
+
+@pytest.mark.usefixtures("place")
+def test_a_model_that_does_no_harm_is_promoted_and_judged_once(capfd):
+    keep_alike()
+    done = run(capfd, "models", "promote", "alike")
+    assert done.returncode == 0, done.stderr
+    assert "changes less than half a minute a day" in done.stdout
+    assert champion() == "alike"
+    assert run(capfd, "models", "promote", "alike").stdout == "alike is the champion already\n"
+
+
+@pytest.mark.usefixtures("place")
+def test_classes_that_change_places_are_refused(capfd):
+    keep_swapped()
+    done = run(capfd, "models", "promote", "swapped")
+    assert done.returncode == 1
+    assert "of silence of which one is sure" in done.stderr
+
+
+def review(lived, chosen, *, marked=True, first=0, count=8):
+    """Look at some minutes, and mark in them what is true."""
+    (log,) = find_logs(Path("logs"))
+    reviewed = [
+        ReviewedSpan("mic", START + i * MINUTE, START + (i + 1) * MINUTE, chosen=chosen)
+        for i in range(first, first + count)
+    ]
+    end = START + (first + count) * MINUTE
+    marks = [
+        Mark("mic", a, min(b, end), "unknown" if c == "other_negative" else c)
+        for a, b, c in truth(lived)
+        if START + first * MINUTE <= a < end
+    ]
+    write_marks(log, marks if marked else [], reviewed=reviewed)
+
+
+@pytest.mark.usefixtures("place")
+def test_what_is_right_in_fewer_sounds_that_were_drawn_at_random_is_refused(lived, capfd):
+    """Nothing is marked, so the champion is right throughout."""
+    review(lived, RANDOM, marked=False)
+    keep_swapped("coughing", "laughing")
+    done = run(capfd, "models", "promote", "swapped")
+    assert done.returncode == 1
+    assert "sounds of the minutes that were drawn at random it is right about" in done.stderr
+
+
+@pytest.mark.usefixtures("place")
+def test_who_repairs_what_the_champion_was_sure_of_is_let_if_random_minutes_say_so(lived, capfd):
+    keep_swapped()
+    folder, link = Path("models"), Path("models/champion.safetensors")
+    (folder / "one.safetensors").rename(folder / "good.safetensors")
+    link.unlink()
+    link.symlink_to("swapped.safetensors")
+    refused = run(capfd, "models", "promote", "good")
+    assert "of which swapped is sure" in refused.stderr
+    assert "wrong marks cannot be seen" in refused.stdout
+    review(lived, RANDOM)
+    judgement_path(Path("models"), load_model(Path("models/good.safetensors")).sha256).unlink()
+    let = run(capfd, "models", "promote", "good")
+    assert let.returncode == 0, let.stderr
+    assert champion() == "good"
+
+
+@pytest.mark.usefixtures("place")
+def test_time_that_a_model_has_learned_from_does_not_speak_for_it(capfd):
+    one = load_model(Path("models/one.safetensors"))
+    end = START + (MINUTES - 4) * MINUTE
+    training = one.description.training_data.model_copy(update={"home_spans": [[START, end]]})
+    keep("learned", training_data=training)
+    done = run(capfd, "models", "promote", "learned")
+    assert done.returncode == 1
+    assert done.stdout.splitlines()[-1:] != ["learned is the champion"]
+    assert "only 4.0 min of the last two weeks are in the logs and not learned" in done.stderr
+
+
+@pytest.mark.usefixtures("place")
+def test_a_model_that_does_not_say_what_it_learned_from_has_learned_from_all_marks(lived, capfd):
+    review(lived, PERSON, first=0, count=9)
+    one = load_model(Path("models/one.safetensors"))
+    amount = next(iter(one.description.training_data.classes.values()))
+    home = {"speech": amount}
+    keep("old", training_data=one.description.training_data.model_copy(update={"home": home}))
+    done = run(capfd, "models", "promote", "old")
+    assert "are in the logs and not learned from" in done.stderr
+
+
+@pytest.mark.usefixtures("place")
+def test_what_cannot_be_judged_is_refused_in_a_line(capfd, tmp_path):
+    def refusal(*options):
+        done = run(capfd, "models", "promote", "alike", *options)
+        assert done.returncode == 1
+        return done.stderr.splitlines()[-1]
+
+    keep_alike()
+    assert "there are no recent logs" in refusal("--logs", tmp_path / "nowhere")
+    Path("models/champion.safetensors").unlink()
+    assert "no labels in" in refusal("--logs", tmp_path / "nowhere")
+    for path in (Path("models/one.safetensors"),):
+        path.rename(tmp_path / "kept")
+    assert "one (" in (gone := refusal())
+    assert "which labels now, is neither in models nor a starter" in gone
+
+
+@pytest.mark.usefixtures("place")
+def test_a_candidate_is_not_judged(capfd):
+    model = keep_deaf()
+    assert run(capfd, "models", "promote", "deaf", "--to", "candidate").returncode == 0
+    assert read_judgement(Path("models"), model.sha256) is None
+
+
+@pytest.mark.usefixtures("place")
+def test_a_model_for_another_feature_set_is_refused_and_its_set_named(capfd):
+    shutil.copy(OLD_MODEL, "models/old.safetensors")
+    done = run(capfd, "models", "promote", "old")
+    assert done.returncode == 1
+    assert "it is for feature set auros21, and one, which labels now, for home33" in done.stderr
+    assert champion() == "one"
+
+
+def judged(folder, model, *, reasons=(), insisted=False):
+    write_judgement(
+        folder,
+        Judgement(model=model.sha256, champion="", judged=1, reasons=reasons, insisted=insisted),
+    )
+
+
+def refusals(watch, count=1):
+    found, deadline = [], time.monotonic() + 20
+    while len(found) < count:
+        assert time.monotonic() < deadline
+        found += watch.refusals()
+        time.sleep(0.02)
+    return found
+
+
+def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
+    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 0.05)
+    folder = place / "models"
+    model = keep_deaf()
+    watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
+    promote(folder, "deaf")
+    (line,) = refusals(watch)
+    assert line == (
+        "model deaf refused: it was not judged in this home; `hearthlog models promote deaf` "
+        "judges it; going on with one"
+    )
+    assert capfd.readouterr().err == f"hearthlog: {line}\n"
+    judged(folder, model, reasons=("silence falls from 10 h to 1.0 min a day",))
+    (line,) = refusals(watch)
+    assert line.startswith("model deaf refused: silence falls from 10 h to 1.0 min a day; ")
+    assert "`hearthlog models promote deaf --anyway` insists" in line
+    time.sleep(0.3)
+    assert (list(watch.refusals()), watch.ready) == ([], None)  # said once
+    insist(folder, model.sha256)
+    deadline = time.monotonic() + 20
+    while watch.ready is None:
+        assert time.monotonic() < deadline
+        assert not list(watch.refusals())
+        time.sleep(0.02)
+    watch.close()
+    assert watch.ready.model.name == "deaf"
+
+
+def test_a_model_that_is_returned_to_may_label(place):
+    folder = place / "models"
+    keep_alike()
+    promote(folder, "alike")
+    model, _ = rollback(folder)
+    assert read_judgement(folder, model.sha256).may_speak
+
+
+def hostile(path, kind, good):
+    path.unlink()
+    if kind == "a pipe":
+        os.mkfifo(path)
+    elif kind == "a folder":
+        path.mkdir()
+    else:
+        path.write_bytes({
+            "no JSON": b"\x00\xff{",
+            "of another model": good.replace(b"a" * 64, b"0" * 64),
+            "endless": good + b" " * (1 << 17),
+            "more than it may say": good.replace(b"}", b', "x": 1}'),
+            "no list of reasons": good.replace(b"[]", b'"none"'),
+            "a word for yes": good.replace(b"false", b'"yes"'),
+            "too many reasons": good.replace(b"[]", json.dumps(["x"] * 40).encode()),
+            "a reason of two lines": good.replace(b"[]", b'["a\\nb"]'),
+        }[kind])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "no JSON", "of another model", "endless", "more than it may say", "no list of reasons",
+        "a word for yes", "too many reasons", "a reason of two lines", "a pipe", "a folder",
+    ],
+)  # fmt: skip
+def test_a_judgement_that_is_none_lets_no_model_speak(tmp_path, kind):
+    sha256 = "a" * 64
+    judgement = Judgement(model=sha256, champion="", judged=1)
+    write_judgement(tmp_path, judgement)
+    assert read_judgement(tmp_path, sha256) == judgement
+    hostile(judgement_path(tmp_path, sha256), kind, judgement.model_dump_json().encode())
+    assert read_judgement(tmp_path, sha256) is None
+
+
+def test_a_sample_is_of_all_days_and_all_times_of_day_and_no_more_than_was_asked_for():
+    hour = 3600 * SECOND
+    parts = [Part(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)]
+    chosen = sample(parts, 36, 300 * SECOND)
+    assert {part.end - part.start for part in chosen} == {300 * SECOND}
+    begins = np.array([part.start for part in chosen])
+    assert len(np.unique((begins - START) // (24 * hour))) == 14
+    assert len(np.unique((begins - START) % (24 * hour) // (6 * hour))) == 4
+    assert sample(parts, 36, 300 * SECOND) == chosen
+    assert sample(parts[:2], 36, 300 * SECOND) == parts[:2]
+
+
+def test_a_home_that_is_mostly_quiet_is_heard_where_it_is_not():
+    hour = 3600 * SECOND
+    parts = [Part(Path(f"{i}"), START + i * hour, START + (i + 1) * hour) for i in range(14 * 24)]
+    starts = START + np.arange(14 * 24) * hour + 600 * SECOND
+    sounding = Spans(starts, starts + 60 * SECOND)
+    chosen = choose(parts, sounding)
+    lengths = np.array([part.end - part.start for part, _ in chosen])
+    weights = np.array([weight for _, weight in chosen])
+    heard = [common(Spans(np.array([part.start]), np.array([part.end])), sounding).length
+             for part, _ in chosen]  # fmt: skip
+    assert lengths.sum() < 2.2 * hour
+    assert sum(heard) > 1800 * SECOND
+    assert (lengths * weights).sum() == pytest.approx(14 * 24 * hour)
+    assert np.array(heard) @ weights == pytest.approx(sounding.length, rel=0.1)
+
+
+def test_changes_are_the_minutes_of_a_day_for_each_pair():
+    before = np.array([0, 0, 0, 1], np.intp)
+    after = np.array([0, 1, 1, 1], np.intp)
+    found = changes_of_frames(["silence", "speech"], before, after, np.full(4, 360.0))
+    assert found.minutes.tolist() == [[360, 720], [0, 360]]
+    assert list(map(str, found.pairs())) == ["12 h 00 min a day from silence to talking"]
+
+
+def test_two_labellings_in_logs_are_compared_in_minutes_a_day():
+    def labelling(name, *labels):
+        starts = START + np.arange(len(labels)) * MINUTE
+        own = Labelling(starts, starts + MINUTE, np.array(labels, object))
+        return NamedLabelling(name, tuple(dict.fromkeys(labels)), own)
+
+    a = labelling("live", "silence", "silence", "speech")
+    b = labelling("candidate", "silence", "speech", "speech")
+    found = changes_of_labellings(compare_labellings(a, b))
+    assert [str(change) for change in found.pairs()] == ["1.0 min a day from silence to talking"]
+
+
+def test_logs_that_cannot_be_read_are_passed_over(place):
+    (log,) = recent_logs([place / "logs"])
+    broken = log.path.with_name("home_20260301T090000Z.mcap")
+    broken.write_bytes(b"garbage")
+    assert recent_logs([place / "logs"]) == [log]
+    assert recent_logs([place / "nowhere"]) == []
+
+
+def test_right_is_better_only_beyond_chance():
+    assert clearly_better(Right(30, 10, 20, 12, 2))
+    assert not clearly_better(Right(30, 10, 12, 6, 4))
+    assert not clearly_better(Right())

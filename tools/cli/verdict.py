@@ -1,0 +1,69 @@
+"""What a model would change in a home, and whether it may label there, in lines."""
+
+from typing import TYPE_CHECKING
+
+from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.text import tell
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.gate.evidence import Evidence, Right
+    from hearthlog.analyzer.gate.judge import Verdict
+    from hearthlog.models.modelfile.judgement import Judgement
+
+_SHOWN = 8  # changes
+
+
+def print_verdict(verdict: "Verdict") -> None:
+    """Print what would change, and on what that is seen."""
+    evidence = verdict.evidence
+    if evidence is None:
+        return
+    for loss in evidence.losses[:1]:
+        more = f" (and {len(evidence.losses) - 1} more)" if len(evidence.losses) > 1 else ""
+        tell(f"not heard: {loss}{more}")
+    if not evidence.minutes:
+        return
+    _print_changes(evidence, verdict.model, verdict.champion)
+    _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
+    _print_right("other sounds that were marked and not learned from", evidence.marks, verdict)
+    if not evidence.random.sounds:
+        print(
+            "no minutes of this home that were drawn at random are reviewed: wrong marks cannot be "
+            "seen; `hearthlog review logs --queue` asks for some"
+        )
+
+
+def refusal(judgement: "Judgement", name: str) -> str:
+    """Say in a line why a model may not label, and how to insist."""
+    return (
+        f"{name} refused: {'; '.join(judgement.reasons)}; "
+        f"`hearthlog models promote {name} --anyway` lets it label all the same"
+    )
+
+
+def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
+    from hearthlog.analyzer.gate.changes import time_words
+
+    changes, heard = evidence.changes, time_words(evidence.minutes)
+    pairs = changes.pairs()
+    print(
+        f"\non {heard} of the last two weeks that it has not learned from, {model} instead of "
+        f"{champion} changes{'' if pairs else ' less than half a minute a day'}"
+    )
+    for change in pairs[:_SHOWN]:
+        print(f"  {change}")
+    rows = [
+        (name, time_words(before), time_words(after))
+        for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True)
+        if before or after
+    ]
+    print()
+    print_table(("a day", champion, model), rows)
+
+
+def _print_right(what: str, right: "Right", verdict: "Verdict") -> None:
+    if right.sounds:
+        print(
+            f"of {right.sounds} {what} {verdict.model} is right about {right.after}, "
+            f"{verdict.champion} about {right.before}"
+        )
