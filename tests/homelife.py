@@ -1,6 +1,5 @@
 """Days of a home as logs, written without sound: only what a report reads of them."""
 
-import json
 from collections.abc import Iterable
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
@@ -11,7 +10,7 @@ import numpy as np
 
 from hearthlog.models.features.auros21.names import FEATURE_NAMES
 from hearthlog.schemas.logs.files import log_path
-from hearthlog.schemas.logs.log_stream import Attachment, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
@@ -31,7 +30,6 @@ GENERAL = [
 ]
 BATHROOM = ["silence", "flushing_water", "shower", "tap_water", "other"]
 HOUR = 3600
-PRECISIONS = {"coughing": 0.86}  # of the model, by its own figures
 
 Event = tuple[float, float, str, float]  # second of the day (UTC), seconds, label, confidence
 
@@ -146,25 +144,11 @@ def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: lis
         yield a, b - a, label, confidence
 
 
-def _model() -> Attachment:
-    """Return what a report reads of the description of a model."""
-    figures = {"recall": 0.9, "f1": 0.9}
-    metrics = {
-        "folds": 5,
-        "macro_f1": 0.9,
-        "expected_calibration_error": 0.01,
-        "classes": {name: figures | {"precision": value} for name, value in PRECISIONS.items()},
-        "confusion": [],
-    }
-    text = json.dumps({"name": "general", "metrics": metrics})
-    return Attachment("model.json", "application/json", text.encode())
-
-
 def _write_hour(  # noqa: PLR0913, PLR0917
     path, microphone, classes, begin, rows, gaps, health, about
 ) -> Path:
     topics = topics_of(microphone, FEATURE_NAMES, classes)
-    writer = LogWriter(path, topics, about, [_model()])
+    writer = LogWriter(path, topics, about)
     written = []
     starts = begin + np.array([round(row[0] * 1000) for row in rows], np.int64) * 1_000_000
     ends = begin + np.array([round((r[0] + r[1]) * 1000) for r in rows], np.int64) * 1_000_000

@@ -7,7 +7,6 @@ from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
-import homelife
 import numpy as np
 import pytest
 from homelife import BATHROOM, GENERAL, HOUR, at, midnight, write_day, write_life
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 from logs import read
 from PIL import Image
 
+from hearthlog.analyzer.accuracy.count_range import Strata, checked_rates
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -81,7 +81,7 @@ def test_spans_are_joined_taken_from_each_other_and_measured_as_sets_are(a, b):
 # Counting
 
 
-def test_sounds_of_a_class_within_ten_seconds_are_one_event_that_counts_as_its_surest(tmp_path):
+def test_sounds_of_a_class_within_ten_seconds_are_one_event(tmp_path):
     events = [
         (at("10:00:00"), 2, "coughing", 0.5),
         (at("10:00:11"), 2, "coughing", 0.9),  # 9 s later: the same
@@ -89,9 +89,7 @@ def test_sounds_of_a_class_within_ten_seconds_are_one_event_that_counts_as_its_s
     ]
     write_day(tmp_path, DAY, events)
     count = look(tmp_path).count("coughing")
-    assert (count.marked, count.certain) == (2, 0)
-    assert count.expected == pytest.approx(0.9 + 0.6)
-    assert count.variance == pytest.approx(0.9 * 0.1 + 0.6 * 0.4)
+    assert (count.labelled, count.certain, count.range) == (2, 0, None)
     assert look(tmp_path).minutes("coughing").minutes == pytest.approx(0.1)
 
 
@@ -106,36 +104,34 @@ def test_a_sound_by_another_name_is_counted_told_and_drawn_as_its_class(tmp_path
         write_day(tmp_path / label, DAY, events, classes=classes)
         pages.append(page_of(tmp_path / label, tmp_path / label))
     day = look(tmp_path / alias)
-    assert (day.count(name).marked, day.minutes(name).minutes) == (2, 1.5)
+    assert (day.count(name).labelled, day.minutes(name).minutes) == (2, 1.5)
     assert day.home.classes == GENERAL
     assert pages[0] == pages[1]
-
-
-def test_names_that_a_report_puts_together_are_as_right_as_the_worst_of_them(tmp_path, monkeypatch):
-    precisions = {"shout": 0.9, "yell": 0.4, "music": 0.8, "yelling": 0.7}
-    monkeypatch.setattr(homelife, "PRECISIONS", precisions)
-    write_day(tmp_path, DAY, [(at("10:00"), 60, "shout", 0.6)], hours=[10])
-    data = read_home(find_home_logs([tmp_path]), "live", 0, day_span(DAY, UTC))
-    assert data.precisions == {"yelling": 0.4, "music": 0.8}
 
 
 def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
     write_day(tmp_path, DAY, [(at("10:00"), 60, "speech", 0.8)], microphone="kitchen", node="a")
     write_day(tmp_path, DAY, [(at("10:00:30"), 60, "speech", 0.6)], microphone="hall", node="b")
     day = look(tmp_path)
-    assert day.count("speech").marked == 1
+    assert day.count("speech").labelled == 1
     assert day.minutes("speech").minutes == pytest.approx(1.5)
     assert day.sound.minutes == pytest.approx(1.5)
     assert day.minutes("silence").minutes == pytest.approx(24 * 60 - 1.5)
     assert day.share == 1
 
 
-def test_a_count_is_said_with_its_uncertainty():
-    assert Count(5.2, 0.6, 0, 7).text == "about 5 (4 to 6)"
+def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
     assert exactly(3).text == "3"
-    assert Count(0.4, 0.24, 0, 1).text == "about 0 (0 to 1)"
-    assert Count(2.6, 0.48, 2, 5).text == "about 3 (2 to 4)", "no less than what is certain"
-    assert (exactly(2) + Count(0.5, 0.25, 0, 1)).text == "about 3 (2 to 3)"
+    assert Count(7, 0, Strata(100, 20, 5, 2)).text == "7"
+    said = np.array([1, 1, 1, 1, 0, 0, 2, 1])
+    rates = checked_rates(said, np.minimum(said, 1), said > 0, 0.5)
+    count = Count(27, 2, Strata(100, 20, 20, 5), rates)
+    low, high = count.range
+    assert 2 <= low < 25 < high
+    assert count.text == f"{low} to {high} (27 labelled)"
+    assert count == Count(27, 2, Strata(100, 20, 20, 5), rates), "the same each time"
+    both = count + Count(3, 3, rates=rates)
+    assert (both.labelled, both.range) == (30, (low + 3, high + 3))
     assert [Minutes(m).text for m in (0, 0.2, 59.4, 125)] == [
         "0 min",
         "under 1 min",
@@ -145,14 +141,14 @@ def test_a_count_is_said_with_its_uncertainty():
     assert Clock(425).text == "07:05"
 
 
-def test_what_is_usual_needs_a_week_and_a_difference_must_be_sure():
+def test_what_is_usual_needs_a_week_and_what_is_unusual_is_outside_of_all_of_it():
     days = [exactly(n) for n in (3, 4, 4, 5, 6, 3, 4)]
     assert usual(days[: FEWEST - 1]) is None
     known = usual(days)
     assert known == (4, 3, 6)
     assert exactly(0).spread(*known) == "4 (3 to 6)"
     assert compared(exactly(7), known) == 1
-    assert compared(Count(8, 4, 0, 12), known) == 0, "it may have been 5"
+    assert compared(exactly(6), known) == 0
     assert compared(exactly(2), known) == -1
 
 
@@ -171,8 +167,8 @@ def test_a_day_begins_at_the_midnight_of_the_home_and_may_have_23_or_25_hours(tm
     )
     day = look(tmp_path, changed, vienna)
     assert day.span.length == 23 * HOUR * NANOSECONDS
-    assert day.count("speech").marked == 2
-    assert day.count("music").marked == 0, "that is of the next day"
+    assert day.count("speech").labelled == 2
+    assert day.count("music").labelled == 0, "that is of the next day"
     assert len(day.sound_by_hour) == 23
     assert day.sound_by_hour[0] == pytest.approx(1.0)
     assert day.share == 1
@@ -204,8 +200,8 @@ def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(reco
         length = sum(nanoseconds(segment.duration) for segment in own)
         assert day.minutes(name).minutes == pytest.approx(length / (60 * NANOSECONDS))
         if name != "silence":
-            assert day.count(name).marked <= len(own)
-            assert bool(day.count(name).marked) == bool(own)
+            assert day.count(name).labelled <= len(own)
+            assert bool(day.count(name).labelled) == bool(own)
     text = text_of(page_of(recorded, tmp_path, start))
     assert "Not heard:" in text
 
@@ -218,8 +214,8 @@ def test_the_night_is_that_which_ends_on_the_day(tmp_path):
     write_day(tmp_path, DAY - timedelta(days=1), coughs)
     write_day(tmp_path, DAY, [*coughs, *((at(t), 2, "coughing", 1.0) for t in ("06:59", "07:01"))])
     day = look(tmp_path)
-    assert day.night_count("coughing").marked == 2
-    assert day.count("coughing").marked == 4
+    assert day.night_count("coughing").labelled == 2
+    assert day.count("coughing").labelled == 4
     assert day.night_hours == 9
 
 
@@ -273,10 +269,10 @@ def test_what_a_reviewer_says_replaces_what_the_model_said_and_is_certain(tmp_pa
     start = midnight(DAY) + 10 * HOUR * NANOSECONDS
     write_marks(logs[0], [Mark("mic", start + 10**9, start + 61 * 10**9, "laughing")])
     day = look(tmp_path)
-    assert day.count("laughing") == exactly(1)
+    assert day.count("laughing").labelled == 1
     assert day.minutes("laughing").minutes == 1
     assert day.minutes("crying").minutes == pytest.approx(1 / 60)
-    assert day.count("crying").expected == pytest.approx(0.6)
+    assert day.count("crying").labelled == 1
 
 
 def test_a_relabelling_is_read_in_place_of_what_the_recorder_said(tmp_path):
@@ -376,7 +372,7 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     text = text_of(flat_page)
     assert "Sunday, 1 March 2026" in text
     assert "Heard: 23 h 10 min of the day (97 %)" in text
-    assert re.search(r"bouts of coughing in the night more often, about 36 \(33 to 39\)", text)
+    assert re.search(r"bouts of coughing in the night more often, 40", text)
     assert "Not heard: 50 min (3 %)" in text
     assert "The microphone went silent: 50 min, once (14:10 to 15:00)" in text
     assert "The microphone bathroom heard nothing for 10 h 00 min" in text

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.classes import translation
+from hearthlog.analyzer.logs.spans import joined, remains
+from hearthlog.models.classes import class_name, translation
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
@@ -44,6 +45,41 @@ class Labelling:
         """
         names = translation(set(self.labels), classes)
         return replace(self, labels=np.array([names[label] for label in self.labels], object))
+
+
+def overlaid(labels: Labelling, above: Labelling) -> Labelling:
+    """Lay a labelling over another one.
+
+    Parameters
+    ----------
+    labels, above : Labelling
+        In the order of time, one label at a time.
+
+    Returns
+    -------
+    Labelling
+        All of `above`, and the parts of `labels` outside of it, in the order of time.
+    """
+    left, rows = remains(labels, joined(above.starts, above.ends))
+    starts = np.concatenate([left.starts, above.starts])
+    order = np.argsort(starts, kind="stable")
+    return Labelling(
+        starts[order],
+        np.concatenate([left.ends, above.ends])[order],
+        np.concatenate([labels.labels[rows], above.labels])[order],
+    )
+
+
+def unified(labels: Labelling) -> Labelling:
+    """Give each label the name of its class.
+
+    Parameters
+    ----------
+    labels : Labelling
+    """
+    names = {label: class_name(label) for label in set(labels.labels)}
+    unique = np.array([names[label] for label in labels.labels], object)
+    return replace(labels, labels=unique)
 
 
 def labelling_of(segments: Columns) -> Labelling:

@@ -39,7 +39,7 @@ def usual(values: Sequence[Value | None]) -> Usual | None:
 
 
 def compared(value: Value, baseline: Usual) -> int:
-    """Compare a figure, as far as it is sure, with what is usual.
+    """Compare a figure, as labelled, with what is usual.
 
     Parameters
     ----------
@@ -52,6 +52,6 @@ def compared(value: Value, baseline: Usual) -> int:
     int
         1: more than on any of those days, or later; -1: less, or earlier; 0: as usual.
     """
-    if whole(value.low) > whole(baseline.highest):
+    if whole(value.middle) > whole(baseline.highest):
         return 1
-    return -1 if whole(value.high) < whole(baseline.lowest) else 0
+    return -1 if whole(value.middle) < whole(baseline.lowest) else 0

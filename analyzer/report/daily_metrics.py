@@ -1,70 +1,47 @@
 """The figures of a day: what was heard, for how long, how often, when."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.accuracy.count_range import CheckedRates, strata_of
+from hearthlog.analyzer.accuracy.events import (
+    MINUTE,
+    SET_APART,
+    events_by_minute,
+    events_of,
+    sounding_minutes,
+    television_minutes,
+)
+from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
     NONE,
     Spans,
     common,
     cut,
-    first_of_groups,
     joined,
     lengths,
     one,
     without,
 )
 from hearthlog.analyzer.report.read_home import HomeData
-from hearthlog.analyzer.report.segments import Segments
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 EVENING, MORNING = 22, 7  # of the clock: between them is the night
 _RISING = 4  # of the clock: what is heard before is of the night
-_MINUTE = 60 * NANOSECONDS
-HOUR = 60 * _MINUTE
-_EVENT_PAUSE = 10 * NANOSECONDS
-_STRETCH_PAUSE, _STRETCH = 10 * _MINUTE, 30 * NANOSECONDS
+HOUR = 60 * MINUTE
+_STRETCH_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 MOST = 0.75  # of a day and of its night, for its figures to be compared
-_BIN, _BUSY = 10 * _MINUTE, _MINUTE
-
-
-class CountedEvents(NamedTuple):
-    """What happened, by when it began."""
-
-    starts: Int64  # shape (n,), in nanoseconds of UTC; they ascend
-    chances: NDArray[np.float64]  # shape (n,), of each that it happened
-
-    def between(self, spans: Spans) -> "CountedEvents":
-        """Return the events that began in some spans of time.
-
-        Parameters
-        ----------
-        spans : Spans
-            In nanoseconds of UTC.
-        """
-        of = np.searchsorted(spans.starts, self.starts, side="right") - 1
-        inside = of >= 0
-        inside[inside] = self.starts[inside] < spans.ends[of[inside]]
-        return CountedEvents(self.starts[inside], self.chances[inside])
-
-    @property
-    def number(self) -> Count:
-        """How many events there were, by the chances that they happened.
-
-        The mean and the variance are those of a Poisson binomial distribution.
-        """
-        p = self.chances
-        variance = float((p * (1 - p)).sum())
-        return Count(float(p.sum()), variance, int((p == 1).sum()), len(p))
+_BIN, _BUSY = 10 * MINUTE, MINUTE
 
 
 @dataclass(frozen=True)
@@ -76,9 +53,11 @@ class HomeMetrics:
     listened: dict[str, Spans]  # by class: when at least one of them heard whose model knows it
     sound: Spans  # when at least one of them heard something else than silence
     spans: dict[str, Spans]  # by class: when at least one of them heard it
-    # by class, but silence; spans with no more than ten seconds between them are one event, and
-    # so are those of two microphones at one time
-    events: dict[str, CountedEvents]
+    # by class, but silence: when events began; spans with no more than ten seconds between them are
+    # one event, and so are those of two microphones at one time
+    events: dict[str, Int64]
+    minutes: "HomeMinutes"
+    rates: dict[str, CheckedRates]  # by class, of the minutes that were checked
 
     def between(self, start: int, end: int) -> "HomeMetrics":
         """Return what was heard in a span of time.
@@ -94,17 +73,105 @@ class HomeMetrics:
             {name: cut(spans, start, end) for name, spans in self.listened.items()},
             cut(self.sound, start, end),
             {name: cut(spans, start, end) for name, spans in self.spans.items()},
-            {name: events.between(one(start, end)) for name, events in self.events.items()},
+            {name: _within(starts, one(start, end)) for name, starts in self.events.items()},
+            self.minutes.between(one(start, end)),
+            self.rates,
         )
 
 
-def whole_home(data: HomeData) -> HomeMetrics:
+@dataclass(frozen=True)
+class HomeMinutes:
+    """The minutes in which at least one microphone heard.
+
+    Attributes
+    ----------
+    starts : np.ndarray [shape=(n,)], int64
+        In nanoseconds of UTC.
+    sounding, television, gone_through : np.ndarray [shape=(n,)], bool
+        Whether anything sounds, and like a television, by the labels; whether a person has gone
+        through all of the minute.
+    said, corrected : dict of str to np.ndarray [shape=(n,)], int64
+        By class but silence, the events that begin in each minute: as labelled, and with what a
+        person says in the place of labels.
+    """
+
+    starts: Int64
+    sounding: Bool
+    television: Bool
+    gone_through: Bool
+    said: dict[str, Int64]
+    corrected: dict[str, Int64]
+
+    def between(self, spans: Spans) -> "HomeMinutes":
+        """Return the minutes that begin in some spans of time.
+
+        Parameters
+        ----------
+        spans : Spans
+            In nanoseconds of UTC.
+        """
+        of = np.searchsorted(spans.starts, self.starts, side="right") - 1
+        return self.rows((of >= 0) & (self.starts < spans.ends[of]))
+
+    def count(self, name: str, rates: CheckedRates | None) -> Count:
+        """Count the events of a class; those of `SET_APART` only where no television sounds.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        rates : CheckedRates or None
+            Of the class.
+        """
+        own = self.rows(~self.television) if name in SET_APART else self
+        if name not in own.said:
+            return Count(rates=rates)
+        certain, rest = own.gone_through, ~own.gone_through
+        return Count(
+            int(own.corrected[name].sum()),
+            int(own.corrected[name][certain].sum()),
+            strata_of(own.said[name][rest], own.sounding[rest]),
+            rates,
+        )
+
+    def beside_television(self, name: str) -> int:
+        """Count the labelled events of a class where something sounds like a television.
+
+        Parameters
+        ----------
+        name : str
+            Of the class; 0 for one that is not set apart.
+        """
+        if name not in SET_APART or name not in self.said:
+            return 0
+        return int(self.corrected[name][self.television].sum())
+
+    def rows(self, rows: Bool) -> "HomeMinutes":
+        """Return some of the minutes.
+
+        Parameters
+        ----------
+        rows : np.ndarray [shape=(n,)], bool
+        """
+        return HomeMinutes(
+            self.starts[rows],
+            self.sounding[rows],
+            self.television[rows],
+            self.gone_through[rows],
+            {name: counts[rows] for name, counts in self.said.items()},
+            {name: counts[rows] for name, counts in self.corrected.items()},
+        )
+
+
+def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
     """Put together what the microphones of a home heard.
 
     Parameters
     ----------
     data : HomeData
         With the segments and classes of at least one microphone.
+    checks : CheckedMinutes, optional
+        Minutes of the home that were drawn at random, and checked.
 
     Returns
     -------
@@ -112,37 +179,67 @@ def whole_home(data: HomeData) -> HomeMetrics:
         A span is silent where no microphone heard anything else; segments of a class that are at
         most ten seconds apart, of whichever microphones, are one event.
     """
-    parts = list(data.segments.values())
-    starts, ends, labels, chances = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in Segments._fields
-    )
-    everything = joined(starts, ends)
-    loud = labels != SILENCE
-    sound = joined(starts[loud], ends[loud])
+    labels = _together(data.segments.values())
+    everything = joined(labels.starts, labels.ends)
+    loud = labels.labels != SILENCE
+    sound = joined(labels.starts[loud], labels.ends[loud])
     classes = list(dict.fromkeys(chain.from_iterable(data.classes.values())))
     listened, spans, events = {}, {}, {}
     for name in classes:
-        own = labels == name
-        knowing = [
-            part.spans for source, part in data.segments.items() if name in data.classes[source]
-        ]
-        begun, ended = (np.concatenate(edges) for edges in zip(*knowing, strict=True))
-        listened[name] = joined(begun, ended)
-        spans[name] = joined(starts[own], ends[own])
-        events[name] = _events(starts[own], ends[own], chances[own])
+        own = labels.labels == name
+        knowing = [part for source, part in data.segments.items() if name in data.classes[source]]
+        listened[name] = _spans(_together(knowing))
+        spans[name] = joined(labels.starts[own], labels.ends[own])
+        events[name] = events_of(labels, name).starts
     if SILENCE in spans:
         spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
         del events[SILENCE]
-    return HomeMetrics(classes, everything, listened, sound, spans, events)
+    minutes = _minutes(data, everything, events)
+    return HomeMetrics(
+        classes, everything, listened, sound, spans, events, minutes, _rates(minutes, checks)
+    )
 
 
-def _events(starts: Int64, ends: Int64, chances: NDArray[np.float64]) -> CountedEvents:
-    """Make events of segments; of each the surest segment counts."""
+def _together(parts: Iterable[Labelling]) -> Labelling:
+    """Put labels of microphones in the order of time; they may overlap."""
+    parts = list(parts)
+    starts, ends, labels = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("starts", "ends", "labels")
+    )
     order = np.argsort(starts, kind="stable")
-    starts, ends, chances = starts[order], ends[order], chances[order]
-    firsts = first_of_groups(starts, ends, _EVENT_PAUSE)
-    best = np.maximum.reduceat(chances, firsts) if len(firsts) else chances
-    return CountedEvents(starts[firsts], best)
+    return Labelling(starts[order], ends[order], labels[order])
+
+
+def _spans(labels: Labelling) -> Spans:
+    return joined(labels.starts, labels.ends)
+
+
+def _minutes(data: HomeData, coverage: Spans, events: Mapping[str, Int64]) -> HomeMinutes:
+    """Count what begins in each minute that was heard, at least in part."""
+    first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
+    edges = np.arange(first, last + 1) * MINUTE
+    labels = _together(data.labelled.values())
+    through = [data.gone_through.get(source, NONE) for source in data.segments]
+    whole = [lengths(spans, edges) == MINUTE for spans in through]
+    minutes = HomeMinutes(
+        edges[:-1],
+        sounding_minutes(labels, edges),
+        television_minutes(labels, edges),
+        np.logical_and.reduce(whole),
+        {name: events_by_minute(events_of(labels, name), edges) for name in events},
+        {name: np.diff(np.searchsorted(starts, edges)) for name, starts in events.items()},
+    )
+    return minutes.rows(lengths(coverage, edges) > 0)
+
+
+def _rates(minutes: HomeMinutes, checks: CheckedMinutes | None) -> dict[str, CheckedRates]:
+    if checks is None:
+        return {}
+    amounts = {name: int(counts.sum()) + 1 for name, counts in minutes.said.items()}
+    whole = sum(amounts.values())
+    drawn = {name: checks.rates(name, amount / whole) for name, amount in amounts.items()}
+    return {name: rates for name, rates in drawn.items() if rates is not None}
 
 
 @dataclass(frozen=True)
@@ -200,27 +297,37 @@ class Day:
         """
         if not self.share_of(name):
             return None
-        return _minutes(common(self.home.spans.get(name, NONE), self.span))
+        return _length(common(self.home.spans.get(name, NONE), self.span))
 
-    def events(self, name: str) -> CountedEvents:
-        """Return the events of a class that began on this day.
-
-        Parameters
-        ----------
-        name : str
-            Of the class; one without events, such as silence, has none.
-        """
-        return _of(self.home, name).between(self.span)
-
-    def night_events(self, name: str) -> CountedEvents:
-        """Return the events of a class that began in the night.
+    def events(self, name: str) -> Int64:
+        """Return when the events of a class began on this day.
 
         Parameters
         ----------
         name : str
             Of the class; one without events, such as silence, has none.
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
         """
-        return _of(self.home, name).between(self.night)
+        return _within(self.home.events.get(name, NONE.starts), self.span)
+
+    def night_events(self, name: str) -> Int64:
+        """Return when the events of a class began in the night.
+
+        Parameters
+        ----------
+        name : str
+            Of the class; one without events, such as silence, has none.
+
+        Returns
+        -------
+        np.ndarray [shape=(n,)], int64
+            In nanoseconds of UTC.
+        """
+        return _within(self.home.events.get(name, NONE.starts), self.night)
 
     def count(self, name: str) -> Count | None:
         """Return how often a class was heard on this day; None if it could not be.
@@ -230,7 +337,7 @@ class Day:
         name : str
             Of the class.
         """
-        return self.events(name).number if self.share_of(name) else None
+        return self._count(name, self.span) if self.share_of(name) else None
 
     def night_count(self, name: str) -> Count | None:
         """Return how often a class was heard in the night; None if it could not be.
@@ -241,17 +348,30 @@ class Day:
             Of the class.
         """
         listened = common(self.home.listened.get(name, NONE), self.night).length > 0
-        return self.night_events(name).number if listened else None
+        return self._count(name, self.night) if listened else None
+
+    def beside_television(self, name: str) -> int:
+        """Return how many events of a class were not counted, because of a television.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        """
+        return self.home.minutes.between(self.span).beside_television(name)
+
+    def _count(self, name: str, span: Spans) -> Count:
+        return self.home.minutes.between(span).count(name, self.home.rates.get(name))
 
     @property
     def sound(self) -> Minutes:
         """How long there was any sound on this day."""
-        return _minutes(common(self.home.sound, self.span))
+        return _length(common(self.home.sound, self.span))
 
     @property
     def night_sound(self) -> Minutes:
         """How long there was any sound in the night."""
-        return _minutes(common(self.home.sound, self.night))
+        return _length(common(self.home.sound, self.night))
 
     @property
     def night_stretches(self) -> Count:
@@ -275,7 +395,7 @@ class Day:
     @property
     def sound_by_hour(self) -> NDArray[np.float64]:
         """Minutes with sound between each two successive edges of `hours`."""
-        return lengths(self.home.sound, self.hours) / _MINUTE
+        return lengths(self.home.sound, self.hours) / MINUTE
 
     @property
     def longest_quiet(self) -> Spans:
@@ -290,7 +410,7 @@ class Day:
     @property
     def quiet(self) -> Minutes | None:
         """Length of `longest_quiet`; None if nothing of the day was heard."""
-        return _minutes(self.longest_quiet) if self.coverage.length else None
+        return _length(self.longest_quiet) if self.coverage.length else None
 
     @property
     def active(self) -> Int64:
@@ -309,7 +429,7 @@ class Day:
     @property
     def last(self) -> Clock | None:
         """Last minute of the last of the `active` blocks; None if there are none."""
-        return self._clock(self.active[-1:] + _BIN - _MINUTE)
+        return self._clock(self.active[-1:] + _BIN - MINUTE)
 
     def _clock(self, times: Int64) -> Clock | None:
         if not len(times):
@@ -336,9 +456,9 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
     return Day(day, near, zone, span, night, common(near.coverage, span))
 
 
-def _of(home: HomeMetrics, name: str) -> CountedEvents:
-    return home.events.get(name, CountedEvents(NONE.starts, np.empty(0)))
+def _within(starts: Int64, span: Spans) -> Int64:
+    return starts[(starts >= span.starts[0]) & (starts < span.ends[0])]
 
 
-def _minutes(spans: Spans) -> Minutes:
-    return Minutes(spans.length / _MINUTE)
+def _length(spans: Spans) -> Minutes:
+    return Minutes(spans.length / MINUTE)

@@ -119,6 +119,7 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         microphones=listed([plain(name) for name in account.microphones], "and"),
         alerts=[*not_heard(account), *not_well(account)],
         absent=listed([in_words(name).lower() for name in absent], "and"),
+        television=_television(account),
         days_before=DAYS,
         interrai=_interrai(account, days),
         interrai_days=interrai.DAYS,
@@ -127,11 +128,20 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
     )
 
 
+def _television(account: Account) -> str:
+    """Say what was labelled while a television sounded, and is not counted."""
+    amounts = {
+        name: sum(day.beside_television(name) for day in account.days) for name in account.classes
+    }
+    several = (f"{several_in_words(name).lower()} {n}" for name, n in amounts.items() if n)
+    return listed(list(several), "and")
+
+
 def _sounds(account: Account, day: Day) -> PageTable:
     """Tell minutes and events of each class but those that were not heard at all."""
-    tested = any(name in account.precisions for name in account.classes)
     usually = ["Usually"] * account.comparable
-    heads = ["Sound", "How long", *usually, "How often", *usually, *["Right in tests"] * tested]
+    often = "How often" if account.checked else "How often, as labelled"
+    heads = ["Sound", "How long", *usually, often, *usually, *["Right here"] * account.checked]
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     rows = []
     for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
@@ -141,7 +151,7 @@ def _sounds(account: Account, day: Day) -> PageTable:
             cells += [Cell("")] * (1 + account.comparable)
         else:
             cells += _cells(account, events_of(name), day)
-        rows.append(TableRow(cells + [Cell(_tenths(account.precisions.get(name)))] * tested))
+        rows.append(TableRow(cells + [Cell(account.rightness(name))] * account.checked))
     return PageTable(heads, rows)
 
 
@@ -150,7 +160,9 @@ def _was_heard(account: Account, name: str) -> bool:
     baseline = account.baseline(events_of(name))
     values = [day.count(name) for day in account.days]
     missing = all(value is None for value in values)
-    return missing or any(v and v.marked for v in values) or bool(baseline and baseline[0].highest)
+    apart = any(day.beside_television(name) for day in account.days)
+    now = any(value and value.labelled for value in values)
+    return missing or apart or now or bool(baseline and baseline[0].highest)
 
 
 def _cells(account: Account, figure: Figure, day: Day) -> list[Cell]:
@@ -177,7 +189,7 @@ def _remarks(section: FigureSection, day: Day) -> Iterator[str]:
         yield f"These sounds could be heard for {percent(share)} of the day only."
     if section.title == "Bathroom":
         for name in (FLUSHING_WATER, SHOWER):
-            starts = day.events(name).starts
+            starts = day.events(name)
             if len(starts):
                 yield f"{several_in_words(name)} at {times_in_words(starts, day.zone)}."
     elif section.title == "Night":
@@ -187,14 +199,14 @@ def _remarks(section: FigureSection, day: Day) -> Iterator[str]:
 
 
 def _coughing(day: Day) -> str:
-    """Say in which hours of the night there was coughing, as marked."""
-    events = day.night_events(COUGHING)
-    if not len(events.starts) or not day.night_hours:
+    """Say in which hours of the night there was coughing, as labelled."""
+    starts = day.night_events(COUGHING)
+    if not len(starts) or not day.night_hours:
         return ""
-    hours = [clock_text(time, day.zone)[:2] for time in events.starts.tolist()]
+    hours = [clock_text(time, day.zone)[:2] for time in starts.tolist()]
     each = [f"{hours.count(hour)} from {hour}:00" for hour in dict.fromkeys(hours)]
-    rate = events.number.middle / day.night_hours
-    return f"Coughing as marked: {', '.join(each)}. About {rate:.1f} an hour."
+    rate = len(starts) / day.night_hours
+    return f"Coughing as labelled: {', '.join(each)}. {rate:.1f} an hour."
 
 
 def _week(account: Account, figures: Sequence[Figure]) -> PageTable:
@@ -224,7 +236,7 @@ def _share(figures: Sequence[Figure], day: Day) -> float:
 
 def _short(value: Value | None) -> str:
     """Write a figure in little room, with a dash for `to`."""
-    return _NOTHING if value is None else _dense(value.text.removeprefix("about "))
+    return _NOTHING if value is None else _dense(value.text)
 
 
 def _dense(text: str) -> str:
@@ -254,7 +266,3 @@ def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
         text = _text(_sum(values)) if audible else "this model does not know the sound"
         rows.append(_row(item.topic, item.heard, text, item.limits))
     return PageTable(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
-
-
-def _tenths(share: float | None) -> str:
-    return _NOTHING if share is None else f"{share * 10:.0f} of 10"

@@ -1,25 +1,32 @@
 """Read the logs of a home for a report: segments, with what a reviewer says; gaps; trouble."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from hearthlog.analyzer.accuracy.checked_minutes import marks_of
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
-from hearthlog.analyzer.logs.labelling import MOST_CLASSES
-from hearthlog.analyzer.logs.recorder_info import attachments_of
+from hearthlog.analyzer.logs.labelling import (
+    MOST_CLASSES,
+    Labelling,
+    all_classes,
+    check_labelling,
+    labelling_of,
+    overlaid,
+    unified,
+)
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.spans import common, one
-from hearthlog.analyzer.marks.marks import Mark, read_marks
-from hearthlog.analyzer.report.segments import Segments, corrected, segments_of, segments_of_marks
+from hearthlog.analyzer.logs.spans import Spans, common, joined, one
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import class_name
-from hearthlog.models.classifiers.description import CLASS_NAME, class_metrics
-from hearthlog.models.modelfile.card import DESCRIPTION
+from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
@@ -35,7 +42,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
 _LATEST = 1 << 61
-_FIELDS = {"header.stamp", "duration", "label", "confidence"}
+_FIELDS = {"header.stamp", "duration", "label"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 Source = tuple[str, str]  # node, microphone
 
@@ -44,14 +51,15 @@ Source = tuple[str, str]  # node, microphone
 class HomeData:
     """What the logs of a home say."""
 
-    segments: dict[Source, Segments] = field(default_factory=dict)  # by node and microphone
+    # by node and microphone: what the labelling has, and with what a reviewer says in its place
+    labelled: dict[Source, Labelling] = field(default_factory=dict)
+    segments: dict[Source, Labelling] = field(default_factory=dict)
+    gone_through: dict[Source, Spans] = field(default_factory=dict)  # by a reviewer
     # by node and microphone: the classes that there may be
     classes: dict[Source, list[str]] = field(default_factory=dict)
     # in the part of time that was to be looked at closely
     gaps: list[Trouble] = field(default_factory=list)
     troubles: list[Trouble] = field(default_factory=list)
-    # how often the model was right with a class, by its own figures
-    precisions: dict[str, float] = field(default_factory=dict)
     nodes: list[str] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)  # what could not be read, and why
 
@@ -116,15 +124,16 @@ def read_home(
             parts.setdefault((entry.node, microphone_of(columns.topic)), []).append(columns)
         progress((i + 1) / len(labelled))
     for source in sorted(parts):
-        home.segments[source] = segments_of(parts[source])
-    marks = _marks(home, logs.between(since, close[1], REVIEW_LAYER))
-    for source, own in marks.items():
-        before = home.segments.get(source, segments_of_marks([]))
-        home.segments[source] = corrected(before, segments_of_marks(own))
+        home.labelled[source] = home.segments[source] = _labelling(parts[source])
+    marks, reviewed = _reviews(home, logs.between(since, close[1], REVIEW_LAYER), labelling)
+    for source in marks.keys() | reviewed.keys():
+        labels, own = home.labelled.setdefault(source, marks_of([])), marks.get(source, [])
+        home.segments[source] = overlaid(labels, marks_of(own))
+        through: list[Mark | ReviewedSpan] = [*own, *reviewed.get(source, [])]
+        starts, ends = np.array([(span.start, span.end) for span in through]).T
+        home.gone_through[source] = joined(starts, ends)
     _check(home, logs, labelling, close)
     _name_classes(home, logs.between(*close, layer), name)
-    if labelling == LIVE:
-        home.precisions = _precisions(near)
     return home
 
 
@@ -202,20 +211,38 @@ def _segments(
         home.lose(str(error))
 
 
-def _marks(home: HomeData, layers: Iterable[HomeLog]) -> dict[Source, list[Mark]]:
+def _labelling(parts: Sequence[Columns]) -> Labelling:
+    """Join the segments of a microphone; each class has one name, whatever logs call it."""
+    segments = join(parts)
+    labels = unified(labelling_of(segments))
+    classes = all_classes(segments.topic, (), labels.labels)
+    check_labelling(segments.topic, labels.starts, classes)
+    return labels
+
+
+def _reviews(
+    home: HomeData, layers: Iterable[HomeLog], labelling: str
+) -> tuple[dict[Source, list[Mark]], dict[Source, list[ReviewedSpan]]]:
+    """Read marks, and what was looked at of a labelling."""
     marks: dict[Source, list[Mark]] = {}
+    reviewed: dict[Source, list[ReviewedSpan]] = {}
     for entry in layers:
         try:
-            for mark in read_marks(log_of_layer(entry.path)):
+            log = log_of_layer(entry.path)
+            for mark in read_marks(log):
                 marks.setdefault((entry.node, mark.microphone), []).append(mark)
+            for span in read_reviewed(log):
+                if span.corrects == labelling:
+                    reviewed.setdefault((entry.node, span.microphone), []).append(span)
         except LogError as error:
             home.lose(str(error))
-    return marks
+    return marks, reviewed
 
 
 def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
     """Raise DataError unless something was labelled in the days that are reported."""
-    if any(common(segments.spans, one(*close)).length for segments in home.segments.values()):
+    spans = [joined(labels.starts, labels.ends) for labels in home.segments.values()]
+    if any(common(each, one(*close)).length for each in spans):
         return
     if labelling != LIVE:
         advice = f"`hearthlog relabel LOGS --model {labelling}.safetensors` makes them"
@@ -244,23 +271,3 @@ def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) ->
         names[source] |= dict.fromkeys(sorted(set(segments.labels.tolist())))
         classes = [class_name(name) for name in names[source] if CLASS_NAME.fullmatch(name)]
         home.classes[source] = list(dict.fromkeys(classes))[:MOST_CLASSES]
-
-
-def _precisions(entries: Iterable[HomeLog]) -> dict[str, float]:
-    """Read from the models that logs name how often a class was right; the last log counts."""
-    precisions: dict[str, float] = {}
-    for entry in entries:
-        with suppress(LogError):  # it has been named
-            precisions |= _precisions_of(entry.path)
-    return precisions
-
-
-def _precisions_of(path: Path) -> dict[str, float]:
-    with LogFile(path) as file:
-        texts = [each.data for each in attachments_of(file) if each.name == DESCRIPTION]
-    precisions: dict[str, float] = {}
-    for text in texts:
-        for label, metrics in class_metrics(text).items():
-            name = class_name(label)
-            precisions[name] = min(precisions.get(name, 1.0), metrics.precision)
-    return precisions

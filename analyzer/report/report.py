@@ -6,10 +6,12 @@ from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.analyzer.accuracy.checked_minutes import read_checked_minutes
 from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day
+from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
-from hearthlog.analyzer.logs.spans import common, one
+from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
@@ -81,7 +83,27 @@ def make_report(
     earlier = [first - timedelta(days=number) for number in range(DAYS, 0, -1)]
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
     data = read_home(logs, labelling, since, close, progress)
-    account = _account(data, days, earlier, zone, labelling)
+    model = _model(logs, close) if labelling == LIVE else ""
+    checks = read_checked_minutes(logs, labelling, since, close[1], data.losses).of_model(model)
+    metrics = whole_home(data, checks)
+    past = [day_of(metrics, day, zone) for day in earlier]
+    shown = [day_of(metrics, day, zone) for day in days]
+    span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
+    account = Account(
+        nodes=data.nodes,
+        microphones=sorted({microphone for _, microphone in data.segments}),
+        labelling=labelling,
+        zone=zone,
+        days=shown,
+        before=past[-(ASSESSED - 1) :],
+        earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
+        unheard=_unheard(data, *span),
+        gaps=_within(data.gaps, span),
+        troubles=_within(data.troubles, span),
+        checks=checks,
+        model=model,
+        unread=len(data.losses),
+    )
     with new_file(page) as html, new_file(picture) as png:
         if count == 1:
             save_day(png, account.days[0], account.earlier)
@@ -93,27 +115,10 @@ def make_report(
     return WrittenReport(page, picture, data.losses)
 
 
-def _account(
-    data: HomeData, days: Sequence[date], earlier: Sequence[date], zone: tzinfo, labelling: str
-) -> Account:
-    home = whole_home(data)
-    past = {day: day_of(home, day, zone) for day in earlier}
-    shown = [day_of(home, day, zone) for day in days]
-    span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
-    return Account(
-        nodes=data.nodes,
-        microphones=sorted({microphone for _, microphone in data.segments}),
-        labelling=labelling,
-        zone=zone,
-        days=shown,
-        before=[past[day] for day in earlier[-(ASSESSED - 1) :]],
-        earlier=[day for day in past.values() if any(map(day.comparable, home.classes))],
-        unheard=_unheard(data, *span),
-        gaps=_within(data.gaps, span),
-        troubles=_within(data.troubles, span),
-        precisions=data.precisions,
-        unread=len(data.losses),
-    )
+def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
+    """Return the SHA-256 of the model that labelled the last of the days."""
+    records = latest_records(entry.path for entry in logs.between(*close))
+    return next(records, {}).get("model_sha256", "")
 
 
 def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
@@ -121,7 +126,7 @@ def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
     whole = end - start
     hours: dict[str, float] = {}
     for (_, microphone), segments in data.segments.items():
-        own = common(segments.spans, one(start, end)).length
+        own = common(joined(segments.starts, segments.ends), one(start, end)).length
         hours[microphone] = max(hours.get(microphone, 0.0), (whole - own) / HOUR)
     return hours
 

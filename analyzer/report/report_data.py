@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import tzinfo
 
+from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.accuracy.count_range import FEWEST as FEWEST_CHECKED
 from hearthlog.analyzer.logs.health import Trouble
 from hearthlog.analyzer.report.baseline import DAYS, FEWEST, Usual, compared, usual
 from hearthlog.analyzer.report.daily_metrics import Day
@@ -35,7 +37,8 @@ class Account:
     unheard: Mapping[str, float]  # by microphone: hours in which it heard nothing
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
-    precisions: Mapping[str, float]
+    checks: CheckedMinutes  # minutes of these weeks that were drawn at random, and gone through
+    model: str  # SHA-256 of the model that labelled the days; empty if it is not known
     unread: int  # how many logs could not be read, or only in part
 
     @property
@@ -47,6 +50,30 @@ class Account:
     def classes(self) -> list[str]:
         """The classes that can be heard."""
         return self.days[0].home.classes
+
+    @property
+    def checked(self) -> bool:
+        """Whether enough minutes were checked to say in which range counts lie."""
+        return len(self.checks) >= FEWEST_CHECKED
+
+    @property
+    def checked_elsewhere(self) -> int:
+        """How many of the checked minutes another model labelled."""
+        return sum(model != self.model for model in self.checks.models)
+
+    def rightness(self, name: str) -> str:
+        """Say how right the labels of a class were in the checked minutes: `3 of 4, missed 1`.
+
+        Parameters
+        ----------
+        name : str
+            Of the class.
+        """
+        check = self.checks.check(name)
+        if not (check.labelled or check.true):
+            return "\u2013"
+        missed = f", missed {check.missed}" if check.missed else ""
+        return f"{check.right} of {check.labelled}{missed}"
 
     @property
     def comparable(self) -> bool:

@@ -5,33 +5,23 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
+from hearthlog.analyzer.accuracy.count_range import NO_MINUTES, CheckedRates, Strata
+
 _MIN = " min"
-_WIDTH = 1.645  # standard deviations: nine times in ten the number is within
 
 
 class _Quantity(ABC):
-    """What is counted: a number, with an interval where it is not certain."""
+    """What is counted."""
 
     @property
     @abstractmethod
     def middle(self) -> float:
-        """The number, or what is expected of it."""
-
-    @property
-    def low(self) -> float:
-        """Lower end of the interval."""
-        return self.middle
-
-    @property
-    def high(self) -> float:
-        """Upper end of the interval."""
-        return self.middle
+        """The number, as it is compared with that of other days."""
 
     @property
     def text(self) -> str:
-        """In words: `about 5 (4 to 6)`; the number alone if that is all of the interval."""
-        low, middle, high = (self.show(x) for x in (self.low, self.middle, self.high))
-        return middle if low == high else f"about {middle} ({low} to {high})"
+        """The number in words."""
+        return self.show(self.middle)
 
     @staticmethod
     @abstractmethod
@@ -56,41 +46,43 @@ class _Quantity(ABC):
 
 @dataclass(frozen=True)
 class Count(_Quantity):
-    """A number of events, each of which may have been none."""
+    """A number of events."""
 
-    expected: float = 0.0  # sum of p: mean of a Poisson binomial distribution
-    variance: float = 0.0  # sum of p (1 - p)
-    certain: int = 0  # how many a person has confirmed
-    marked: int = 0
+    labelled: int = 0  # where a person has corrected labels, as corrected
+    certain: int = 0  # of those, the ones in minutes that a person has gone through
+    unchecked: Strata = NO_MINUTES  # the other ones
+    rates: CheckedRates | None = None  # None where too few minutes were checked
 
     def __add__(self, other: "Count") -> "Count":
         return Count(
-            self.expected + other.expected,
-            self.variance + other.variance,
+            self.labelled + other.labelled,
             self.certain + other.certain,
-            self.marked + other.marked,
+            self.unchecked.plus(other.unchecked),
+            self.rates or other.rates,
         )
 
     @property
     def middle(self) -> float:
-        """The expected number."""
-        return self.expected
+        """The number of labelled events."""
+        return self.labelled
 
     @property
-    def low(self) -> float:
-        """Lower end of the interval that the number lies in nine times in ten.
-
-        It is 1.645 standard deviations below the mean, but at least the number of certain events.
-        """
-        return max(self.certain, self.expected - _WIDTH * math.sqrt(self.variance))
+    def range(self) -> tuple[int, int] | None:
+        """Where the right number lies nine times in ten; None if nobody has checked."""
+        if not any(self.unchecked):
+            return self.certain, self.certain
+        if self.rates is None:
+            return None
+        low, high = self.rates.range_of(self.unchecked)
+        return self.certain + low, self.certain + high
 
     @property
-    def high(self) -> float:
-        """Upper end of the interval that the number lies in nine times in ten.
-
-        It is 1.645 standard deviations above the mean, but at most the number of marked events.
-        """
-        return min(self.marked, self.expected + _WIDTH * math.sqrt(self.variance))
+    def text(self) -> str:
+        """In words: `4 to 6 (7 labelled)`; the labelled number alone if nobody has checked."""
+        if self.range is None or self.range == (self.labelled, self.labelled):
+            return f"{self.labelled}"
+        low, high = self.range
+        return f"{low} to {high} ({self.labelled} labelled)"
 
     @staticmethod
     def show(number: float) -> str:
@@ -105,14 +97,14 @@ class Count(_Quantity):
 
 
 def exactly(number: int) -> Count:
-    """Return the count of events that happened for certain.
+    """Return a count that is certain.
 
     Parameters
     ----------
     number : int
         Of events.
     """
-    return Count(number, 0.0, number, number)
+    return Count(number, number)
 
 
 @dataclass(frozen=True)

@@ -242,31 +242,6 @@ def read_description(text: str) -> Description:
         raise ModelError(f"its description is no JSON ({one_line(error)})") from error
 
 
-class _WithMetrics(BaseModel):
-    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
-
-    metrics: Metrics
-
-
-def class_metrics(text: bytes) -> dict[str, ClassMetrics]:
-    """Read the scores of each class from a description in a log, which may be of any format.
-
-    Parameters
-    ----------
-    text : bytes
-        JSON in UTF-8.
-
-    Returns
-    -------
-    dict of str to ClassMetrics
-        By name of the class; empty where there are none that can be read.
-    """
-    try:
-        return _WithMetrics.model_validate_json(text).metrics.classes
-    except ValidationError:
-        return {}
-
-
 def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
     number = content.get("format")
     if isinstance(number, int) and number > FORMAT:

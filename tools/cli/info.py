@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.options import Json, Log
@@ -18,6 +19,7 @@ from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import Summary
+    from hearthlog.tools.cli.accuracy_text import Accuracy
 
 _LEVELS = ("ok", "warning", "error", "stale")  # of a diagnostic_msgs/DiagnosticStatus
 
@@ -47,15 +49,34 @@ def info(
         raise typer.Exit(1)
     for stream in summary.streams:
         stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
-    following = next_step(summary, path)
+    following, accuracy = next_step(summary, path), _accuracy(summary, path)
     if as_json:
-        print(json.dumps(_as_json(summary) | {"next": following}, indent=2))
+        checked = None if accuracy is None else accuracy.as_json()
+        print(json.dumps(_as_json(summary) | {"checked": checked, "next": following}, indent=2))
     else:
         _print(summary)
+        for line in () if accuracy is None else accuracy.lines():
+            print(printable(line))
         if following is not None:
             print(printable(f"next: {following}"))
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
+
+
+def _accuracy(summary: "Summary", path: Path) -> "Accuracy | None":
+    """Read how right the labels of a recorder are; None if there are none."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.tools.cli.accuracy_text import Accuracy
+
+    if not any(stream["model"] for stream in summary.streams):
+        return None
+    try:
+        accuracy = Accuracy(find_home_logs([path]))
+    except LogError:  # of no home
+        return None
+    for loss in accuracy.losses:
+        tell(loss)
+    return accuracy
 
 
 def _each(paths: Sequence[Path], progress: Progress) -> Iterator[Path]:

@@ -1,0 +1,213 @@
+"""How right labels are in a home, by minutes drawn at random: what is read and promised."""
+
+import re
+from datetime import date
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import HOUR, at, midnight, write_day
+from hypothesis import given
+from hypothesis import strategies as st
+from spliced import run
+
+from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
+from hearthlog.analyzer.accuracy.count_range import FEWEST, checked_rates, strata_of
+from hearthlog.analyzer.accuracy.events import MINUTE, television_minutes
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.local_time import day_span
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.report.read_home import read_home
+from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.cli.accuracy_text import Accuracy
+
+DAY = date(2026, 3, 1)
+START = midnight(DAY)
+UTC = ZoneInfo("UTC")
+EVER = 0, 1 << 61
+
+
+def log_at(logs: list[Path], second: float) -> Path:
+    return logs[int(second // HOUR)]
+
+
+def check(logs, second, marks=(), chosen=RANDOM, corrects="live"):
+    """Go through the minute that begins at a second of the day."""
+    begin = START + int(second) * NANOSECONDS
+    span = ReviewedSpan("mic", begin, begin + MINUTE, "Ann", 1, corrects, chosen)
+    made = [
+        Mark("mic", begin + int(a * NANOSECONDS), begin + int(b * NANOSECONDS), label)
+        for a, b, label in marks
+    ]
+    write_marks(log_at(logs, second), made, reviewed=[span])
+
+
+def checked(root, labelling="live"):
+    losses = []
+    minutes = read_checked_minutes(find_home_logs([root]), labelling, *EVER, losses)
+    assert losses == []
+    return minutes
+
+
+def test_a_checked_minute_has_what_is_right_wrong_and_missed(tmp_path):
+    coughs = [(at(t), 2, "coughing", 0.9) for t in ("10:00:05", "10:00:40", "11:30:59")]
+    logs = write_day(tmp_path, DAY, [*coughs, (at("10:00:20"), 3, "speech", 0.9)])
+    check(logs, at("10:00"), [(40, 42, "objects_activity"), (50, 55, "crying")])
+    check(logs, at("11:31"))  # the cough began in the minute before
+    check(logs, at("12:00"), [(10, 12, "coughing")])
+    check(logs, at("10:01"), chosen=QUEUE)
+    check(logs, at("10:02"), corrects="other")
+    minutes = checked(tmp_path)
+    assert len(minutes) == 3
+    assert minutes.check("coughing") == (2, 1, 2, 1)
+    assert minutes.check("speech") == (1, 1, 1, 0)
+    assert minutes.check("crying") == (0, 0, 1, 1)
+    assert minutes.check("objects_activity") == (0, 0, 1, 1)
+    assert minutes.check("music") == (0, 0, 0, 0)
+    assert minutes.sounding.tolist() == [True, True, False]
+    assert len(checked(tmp_path, "other")) == 0
+
+
+def test_a_mark_that_says_nothing_is_known_says_nothing(tmp_path):
+    logs = write_day(tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)])
+    check(logs, at("10:00"), [(5, 7, "unknown")])
+    assert checked(tmp_path).check("coughing") == (1, 1, 1, 0)
+
+
+def test_a_damaged_layer_is_a_loss_and_the_other_minutes_count(tmp_path):
+    logs = write_day(tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)])
+    check(logs, at("10:00"))
+    check(logs, at("12:00"))
+    next(tmp_path.rglob("*T120000Z.review.mcap")).write_bytes(b"no log")
+    losses: list[str] = []
+    minutes = read_checked_minutes(find_home_logs([tmp_path]), "live", *EVER, losses)
+    assert (len(minutes), len(losses)) == (1, 1)
+    assert "T120000Z.review.mcap" in losses[0]
+
+
+def test_fewer_than_five_minutes_promise_nothing():
+    few = np.ones(FEWEST - 1, np.int64)
+    assert checked_rates(few, few, few > 0, 1.0) is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=FEWEST, max_size=40))
+def test_a_range_is_in_order_the_same_each_time_and_grows_with_what_is_counted(minutes):
+    said, true = np.array(minutes).T
+    loud = said > 0
+    rates = checked_rates(said, true, loud, 0.3)
+    again = checked_rates(said, true, loud, 0.3)
+    strata = strata_of(np.tile(said, 3), np.tile(loud, 3))
+    low, high = rates.range_of(strata)
+    assert 0 <= low <= high
+    assert again.range_of(strata) == (low, high)
+    twice = rates.range_of(strata.plus(strata))
+    assert twice[1] >= high
+    assert twice[0] >= low
+
+
+def test_a_range_of_a_labelling_that_is_half_right_lies_around_the_half():
+    rng = np.random.default_rng(1)
+    said = rng.poisson(0.4, 400)
+    true = rng.binomial(said, 0.5)
+    rates = checked_rates(said, true, said > 0, 0.5)
+    low, high = rates.range_of(strata_of(said, said > 0))
+    assert low < true.sum() < high
+    assert high - low < said.sum() / 2
+
+
+@pytest.mark.parametrize("chance", [0.9, 0.3])
+def test_nine_ranges_of_ten_hold_where_minutes_are_drawn_from_other_days(chance):
+    rng = np.random.default_rng(2)
+    held = []
+    for _ in range(60):
+        loud = rng.random(1440) < 0.2
+        true = np.where(loud, rng.poisson(0.2, 1440), rng.poisson(0.001, 1440))
+        said = rng.binomial(true, chance) + np.where(loud, rng.poisson(0.1, 1440), 0)
+        loud |= said > 0
+        other, day = slice(0, 720), slice(720, 1440)
+        rows = np.concatenate(
+            [
+                rng.choice(np.flatnonzero(loud[other]), 9, replace=False),
+                rng.choice(np.flatnonzero(~loud[other]), 3, replace=False),
+            ]
+        )
+        rates = checked_rates(said[rows], true[rows], loud[rows], 0.5)
+        low, high = rates.range_of(strata_of(said[day], loud[day]))
+        held.append(low <= true[day].sum() <= high)
+    assert np.mean(held) >= 0.85
+
+
+def test_a_television_is_much_talking_music_and_laughing_for_long():
+    edges = START + np.arange(61) * MINUTE
+    starts = START + np.array([10, 30]) * MINUTE
+    names = np.array(["music", "speech"], object)
+    labels = Labelling(starts, starts + np.array([15, 1]) * MINUTE, names)
+    minutes = television_minutes(labels, edges)
+    assert minutes[10:25].all()
+    assert not minutes[36:].any()
+
+
+def report_day(root, checks=None):
+    data = read_home(find_home_logs([root]), "live", 0, day_span(DAY, UTC))
+    return day_of(whole_home(data, checks), DAY, UTC)
+
+
+def test_coughs_beside_a_television_are_counted_apart(tmp_path):
+    talking = [(at("10:00") + 20 * i, 15, "speech", 0.9) for i in range(60)]
+    coughs = [(at(t), 2, "coughing", 0.9) for t in ("10:05:16", "10:15:16", "15:00:00")]
+    write_day(tmp_path, DAY, [*talking, *coughs])
+    day = report_day(tmp_path)
+    assert day.count("coughing").labelled == 1
+    assert day.beside_television("coughing") == 2
+    assert day.beside_television("speech") == 0
+
+
+def test_minutes_that_were_gone_through_are_certain_and_others_have_a_range(tmp_path):
+    coughs = [(at(f"{h:02}:00:05"), 2, "coughing", 0.9) for h in range(8, 20)]
+    logs = write_day(tmp_path, DAY, coughs)
+    for hour in range(8, 14):
+        check(logs, at(f"{hour:02}:00"), [(5, 7, "objects_activity")] if hour % 2 else [])
+    count = report_day(tmp_path, checked(tmp_path)).count("coughing")
+    assert (count.labelled, count.certain) == (9, 3)
+    low, high = count.range
+    assert 3 <= low < high
+    assert report_day(tmp_path).count("coughing").range is None
+
+
+def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, capfd):
+    coughs = [(at(f"{h:02}:00:05"), 2, "coughing", 0.9) for h in range(8, 20)]
+    logs = write_day(tmp_path / "home", DAY, coughs)
+    page = tmp_path / "before.html"
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
+    assert "as labelled, not checked here" in page.read_text()
+    assert "nine times in ten" not in page.read_text()
+    for hour in range(8, 14):
+        check(logs, at(f"{hour:02}:00"), [(5, 7, "objects_activity")] if hour % 2 else [])
+    check(logs, at("15:00"), [(4, 60, "music")], chosen=QUEUE)
+    check(logs, at("16:00"), chosen=PERSON)
+    page = tmp_path / "after.html"
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
+    text = page.read_text()
+    assert "In 6 minutes of these weeks" in text
+    assert "3 of 6" in text
+    assert re.search(r"\d+ to \d+ \(8 labelled\)", text)
+    assert "not checked here" not in text
+    accuracy = Accuracy(find_home_logs([tmp_path / "home"]))
+    lines = list(accuracy.lines())
+    assert lines[0].startswith("checked here, 6 minutes drawn at random: coughing right in 3 of 6")
+    assert "of 2 spans that were asked for or chosen, 1 had the right label" in lines[1]
+    assert accuracy.as_json()["classes"]["coughing"]["labelled"] == 6
+    done = run(capfd, "info", log_at(logs, at("08:00")))
+    assert "not checked here" not in done.stdout, "no model labelled this log"
+
+
+def test_an_interval_of_few_checks_is_wide_and_of_many_narrow():
+    few, many = ClassCheck(4, 3, 4, 1), ClassCheck(400, 300, 400, 100)
+    assert few.precision[1] - few.precision[0] > 0.5
+    assert many.precision == pytest.approx((0.713, 0.784), abs=0.002)
+    assert ClassCheck(0, 0, 0, 0).precision is None
+    assert ClassCheck(0, 0, 3, 3).miss_rate[0] > 0.4

@@ -1,0 +1,79 @@
+"""How right labels are in this home, in words."""
+
+from collections.abc import Iterator
+
+from hearthlog.analyzer.accuracy.checked_minutes import (
+    CheckedMinutes,
+    ClassCheck,
+    read_checked_minutes,
+    read_looked_at,
+)
+from hearthlog.analyzer.accuracy.count_range import FEWEST
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.report.class_words import in_words
+from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.text import listed
+from hearthlog.tools.cli.text import number
+
+_EVER = 1 << 61
+
+
+class Accuracy:
+    """What reviews of a home say of the recorder's labels.
+
+    Parameters
+    ----------
+    logs : HomeLogs
+    """
+
+    def __init__(self, logs: HomeLogs) -> None:
+        self.losses: list[str] = []
+        self.minutes: CheckedMinutes = read_checked_minutes(logs, LIVE, 0, _EVER, self.losses)
+        self.right, self.looked_at = read_looked_at(logs, LIVE, self.losses)
+
+    def lines(self) -> Iterator[str]:
+        """Say what was checked, and how much of it was right."""
+        checked = number(len(self.minutes), "minute")
+        if not len(self.minutes):
+            yield "not checked here: how many of these labels are right in this home is not known"
+        else:
+            said = listed(list(self._classes()), "and") or "nothing in them"
+            yield f"checked here, {checked} drawn at random: {said}"
+        if 0 < len(self.minutes) < FEWEST:
+            yield (
+                f"{FEWEST - len(self.minutes)} more minutes, and the report says in which range "
+                "the right numbers lie"
+            )
+        if self.looked_at:
+            yield (
+                f"of {number(self.looked_at, 'span')} that were asked for or chosen, "
+                f"{self.right} had the right label (the queue asks for doubtful ones)"
+            )
+
+    def as_json(self) -> dict[str, object]:
+        """Return the same for a program."""
+        return {
+            "minutes": len(self.minutes),
+            "classes": {
+                name: check._asdict() | {"precision": check.precision, "miss_rate": check.miss_rate}
+                for name, check in self._checks()
+            },
+            "spans": self.looked_at,
+            "spans_right": self.right,
+        }
+
+    def _checks(self) -> Iterator[tuple[str, ClassCheck]]:
+        for name in self.minutes.said:
+            check = self.minutes.check(name)
+            if check.labelled or check.true:
+                yield name, check
+
+    def _classes(self) -> Iterator[str]:
+        for name, check in self._checks():
+            parts = []
+            if check.precision is not None:
+                low, high = (f"{100 * share:.0f}" for share in check.precision)
+                parts.append(f"right in {check.right} of {check.labelled} ({low} to {high} %)")
+            if check.missed:
+                parts.append(f"missed {check.missed} of {check.true}")
+            yield f"{in_words(name).lower()} {listed(parts, 'and')}"
