@@ -1,6 +1,7 @@
 """Two models are compared on what neither has learned from, and only a clear difference is one."""
 
 import json
+import shutil
 from dataclasses import replace
 from threading import Event as Flag
 
@@ -12,7 +13,7 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.compare_models import compare_models
 from hearthlog.analyzer.evaluation.evaluate_model import evaluate_model
-from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
 from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.training.home_data import home_recordings
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -22,6 +23,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 SECOND = 1_000_000_000
@@ -145,6 +147,51 @@ def test_the_champion_and_the_candidate_are_compared_on_reviewed_logs(folder, da
     assert found["difference"]["interval"][0] <= found["difference"]["macro_f1"] < 0
     assert found["a"]["scores"]["groups"] == 3
     assert (found["a"]["name"], found["b"]["name"]) == ("one", "broad")
+
+
+def keep_deaf(folder):
+    one = load_model(folder / "one.safetensors")
+    changes = {"gate": 0.0, "decision_bias": {"silence": -30.0}}
+    deaf = replace(one, description=one.description.model_copy(update=changes))
+    save_model(deaf, folder / "deaf.safetensors")
+
+
+def row_of(name, text):
+    return next(line for line in text.splitlines() if line.startswith(name)).split("  ")
+
+
+def test_silence_has_a_row_though_nobody_marked_it(folder, days, tmp_path, capfd):
+    logs = tmp_path / "logs"
+    shutil.copytree(days, logs)
+    for log in find_logs(logs):
+        silent = [mark for mark in read_marks(log) if mark.label == "silence"]
+        write_marks(log, [], deleted=[MarkedSpan(*mark[:3]) for mark in silent])
+    keep_deaf(folder)
+    command = ("models", "compare", "one", "deaf", "--logs", logs, "--folder", folder)
+    *_, before, after = row_of("silence", run(capfd, *command).stdout)
+    assert (before.strip() != "0.0 min", after.strip()) == (True, "0.0 min")
+    said = json.loads(run(capfd, *command, "--json").stdout)["said"]
+    assert said["silence"][0] > 0.1
+    assert said["silence"][1] == 0
+
+
+def test_without_marks_it_is_said_how_much_of_a_day_each_class_has(folder, days, tmp_path, capfd):
+    logs = tmp_path / "logs"
+    shutil.copytree(days, logs)
+    for layer in logs.rglob("*.review.mcap"):
+        layer.unlink()
+    keep_deaf(folder)
+    done = run(capfd, "models", "compare", "one", "deaf", "--logs", logs, "--folder", folder)
+    assert done.returncode == 0
+    assert "nothing is marked" in done.stderr
+    assert row_of("silence", done.stdout)[-1].strip() == "0.0 min"
+
+
+def test_of_clips_it_is_said_how_many_each_model_gives_to_a_class(folder, unheard, capfd):
+    keep_deaf(folder)
+    command = ("models", "compare", "one", "deaf", "--data", unheard, "--folder", folder)
+    *_, before, after = row_of("silence", run(capfd, *command).stdout)
+    assert (before.strip() != "0.0%", after.strip()) == (True, "0.0%")
 
 
 def test_one_source_tells_no_difference(folder, days, capfd):

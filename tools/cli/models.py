@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -27,6 +27,16 @@ models = typer.Typer(
 
 
 _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "size")
+
+
+class _Said(NamedTuple):
+    """How much of the sound each of two models gives to a class."""
+
+    name: str
+    a: float
+    b: float
+    a_text: str
+    b_text: str
 
 
 _Folder = Annotated[
@@ -81,7 +91,8 @@ def compare(
 ) -> None:
     """Run two models on the same sound, and say which is better, and how surely.
 
-    Sources that one of them has learned from are left out. Exit status 3: there are no others.
+    Sources that one of them has learned from are left out. Exit status 3: there are no others. Of
+    logs it is also said how much of a day each model gives to each class.
     """
     from hearthlog.analyzer.evaluation.compare_models import compare_models
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
@@ -93,11 +104,22 @@ def compare(
     first, second = _named(place, a), _named(place, b)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     features = feature_set(first.description.feature_set)
-    comparison = compare_models(first, second, _recordings(data, logs, chosen, features), chosen)
+    recordings = _recordings(data, logs, chosen, features)
+    if logs is not None and not recordings:
+        tell("nothing is marked: it is said how the models differ, not which is better")
+        said = _said_in_logs(first, second, logs)
+        if as_json:
+            print(json.dumps({"said": _said_json(said)}, indent=2))
+        else:
+            _print_said(first.name, second.name, said, None)
+        return
+    comparison = compare_models(first, second, recordings, chosen)
+    said = _said_of_segments(comparison) if logs is None else _said_in_logs(first, second, logs)
     if as_json:
-        print(json.dumps(asdict(comparison) | {"clear": comparison.clear}, indent=2))
+        more = {"clear": comparison.clear, "said": _said_json(said)}
+        print(json.dumps(asdict(comparison) | more, indent=2))
     else:
-        _print_comparison(comparison)
+        _print_comparison(comparison, said)
     if not comparison.held_out:
         tell(
             "every source is one that these models have learned from: this says nothing of how "
@@ -205,20 +227,67 @@ def _after(before: str | None) -> str:
     return "" if before is None else f", after {before}"
 
 
-def _print_comparison(comparison: "Comparison") -> None:
+def _said_of_segments(comparison: "Comparison") -> list["_Said"]:
+    """Return the share of the segments that each model gives to each class."""
+    sides = (comparison.a, comparison.b)
+    both = [[sum(column) for column in zip(*one.scores.confusion, strict=True)] for one in sides]
+    total = max(comparison.a.scores.segments, 1)
+    return [
+        _Said(name, a / total, b / total, f"{a / total:.1%}", f"{b / total:.1%}")
+        for name, a, b in zip(comparison.a.scores.classes, *both, strict=True)
+    ]
+
+
+def _said_in_logs(a: "Model", b: "Model", logs: Path) -> list["_Said"]:
+    """Return how many minutes of a mean day each model gives to each class."""
+    from hearthlog.analyzer.gate.changes import time_words
+    from hearthlog.analyzer.gate.evidence import gather_evidence
+    from hearthlog.analyzer.gate.recent_time import recent_logs
+    from hearthlog.tools.cli.progress import share_done
+
+    with share_done("listening to the logs with both") as report:
+        changes = gather_evidence(a, b, recent_logs([logs]), report).changes
+    times = zip(changes.classes, changes.before.tolist(), changes.after.tolist(), strict=True)
+    return [
+        _Said(name, before, after, time_words(before), time_words(after))
+        for name, before, after in times
+    ]
+
+
+def _said_json(said: list["_Said"]) -> dict[str, list[float]]:
+    return {one.name: [one.a, one.b] for one in said}
+
+
+def _print_comparison(comparison: "Comparison", said: list["_Said"]) -> None:
     a, b = comparison.a, comparison.b
     print(f"{a.scores.segments} segments from {a.scores.groups} sources", end="")
     print(f"; {comparison.sources_left_out} sources left out that a model has learned from")
     for reason, count in comparison.skipped.items():
         print(f"{count} recordings left out: {reason}")
-    rows = [(name, one.f1, b.scores.per_class[name].f1) for name, one in a.scores.per_class.items()]
-    rows += [
-        ("macro F1", a.scores.macro_f1, b.scores.macro_f1),
-        ("calibration error", a.expected_calibration_error, b.expected_calibration_error),
-    ]
     print()
-    print_table(("F1", a.name, b.name), [(name, *map(share, values)) for name, *values in rows])
+    _print_said(a.name, b.name, said, comparison)
     print(f"\n{_verdict(comparison)}")
+
+
+def _print_said(a: str, b: str, said: list["_Said"], comparison: "Comparison | None") -> None:
+    """Print a row for each class that either model says or that occurs."""
+    sides = () if comparison is None else (comparison.a, comparison.b)
+    f1 = [{name: one.f1 for name, one in side.scores.per_class.items()} for side in sides]
+    names = dict.fromkeys([*(name for one in f1 for name in one), *(one.name for one in said)])
+    times = {one.name: one for one in said}
+    rows = []
+    for name in names:
+        time = times.get(name, _Said(name, 0.0, 0.0, "", ""))
+        scores = [share(one[name]) if name in one else "" for one in f1]
+        if any(scores) or time.a or time.b:
+            rows.append((name, *scores, time.a_text, time.b_text))
+    if comparison is not None:
+        totals = [(one.scores.macro_f1, one.expected_calibration_error) for one in sides]
+        macro, calibration = zip(*totals, strict=True)
+        rows += [("macro F1", *map(share, macro), "", "")]
+        rows += [("calibration error", *map(share, calibration), "", "")]
+    head = () if comparison is None else (f"F1 {a}", f"F1 {b}")
+    print_table(("", *head, f"{a} says", f"{b} says"), rows)
 
 
 def _verdict(comparison: "Comparison") -> str:
