@@ -18,7 +18,12 @@ from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.home_sound import read_home_sound
 from hearthlog.analyzer.training.dataset import Recording, build_dataset, cut_recordings
-from hearthlog.analyzer.training.home_data import home_recordings, home_sequences
+from hearthlog.analyzer.training.home_data import (
+    HOME_WEIGHT,
+    home_recordings,
+    home_sequences,
+    lesson_recordings,
+)
 from hearthlog.analyzer.training.home_transitions import adapt_transitions
 from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare, softmax
@@ -139,7 +144,7 @@ def test_an_adapted_model_has_what_the_first_one_learned_and_nothing_twice(world
         np.testing.assert_array_equal(ours, expected)
     arrays = adapted.arrays
     assert 0 < len(arrays["base_vectors"]) < 0.3 * len(base.arrays["support_vectors"])
-    assert 0 < (arrays["support_base"] < 0).sum() <= len(arrays["home_vectors"])
+    assert 0 < (arrays["support_base"] < 0).sum() <= 3 * len(few)  # windows of a segment
 
 
 @pytest.mark.parametrize("twice", [False, True])
@@ -175,31 +180,36 @@ def test_a_model_keeps_its_training_windows_only_if_its_method_needs_them():
 
 def test_a_home_without_segments_is_refused(world):
     base, few, _ = world
-    with pytest.raises(DataError, match="nothing is marked"):
+    with pytest.raises(DataError, match="no segments of a class of the model"):
         adapt_model(base, rows(few, few.target < 0))
 
 
-def test_the_classifier_adds_the_votes_of_the_home_as_scikit_learn_would(world):
+def test_an_adapted_model_decides_as_scikit_learn_does(world):
     base, few, rest = world
     adapted = adapt_model(base, few)
     remembered, target = ROOM.remembered(base)
     examples = prepare(ROOM, few)._replace(more_inputs=remembered, more_target=target)
-    learned = ROOM.fit(examples, home=np.arange(len(few)))
     inputs = of_segments(DEFAULT.inputs[ROOM.inputs], rest.windows, rest.floor)
     inputs = inputs.reshape(-1, inputs.shape[-1])
-    decision = learned.decide(inputs, 4)
+    decision = ROOM.fit(examples).decide(inputs, 4)
     expected = softmax(adapted.description.inverse_temperature * decision)
     ours = Classifier(adapted).probabilities(inputs)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
 
 
-def test_what_is_near_to_the_home_is_drawn_to_its_class_and_nothing_else():
+def test_a_model_with_vectors_of_a_home_labels_as_it_did(world):
+    base, few, rest = world
+    home = of_segments(DEFAULT.inputs[ROOM.inputs], few.windows, few.floor)[:, 0]
+    old = with_arrays(base, home_vectors=home, home_target=few.target.astype(np.int64))
+    assert accuracy(old, rest) > accuracy(base, rest) + 0.2
+
+
+def test_what_is_near_to_the_vectors_of_a_home_is_drawn_to_its_class_and_nothing_else():
     home, others = np.array([[0.5, 0.0], [0.0, 0.0], [1e-9, 0.0]]), np.array([[0.0], [1.0], [1.0]])
     votes = home_votes(home, others)
     assert votes[0].tolist() == [HOME_VOTE, 0.0]
     assert votes[1].tolist() == [0.0, 0.0]
     assert 0.0 < votes[2, 0] < 1e-6
-    assert HOME_VOTE > 1.0  # more than the decision of a pair at its margin
 
 
 def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorded):
@@ -225,7 +235,7 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     np.testing.assert_array_equal(found[1].floor, floors[behind + 293 : behind + 313])
     assert found[0].floor.all()
     data = cut_recordings(found, Scenario("x", {"speech": ("speech",), "coughing": ("coughing",)}))
-    assert data.weight.min() == 5.0
+    assert data.weight.min() == HOME_WEIGHT
 
 
 def test_marks_that_contradict_the_floor_of_the_room_are_left_out_and_counted(
@@ -346,19 +356,19 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     try:
         output = tmp_path / "home.safetensors"
         done = hearthlog("train", "--base", model_file, "--home", recorded, "-o", output, "--json")
-        marked = list(home_recordings(recorded))
+        marked = list(lesson_recordings(recorded))
     finally:
         layer.unlink()
     assert done.returncode == 0, done.stderr
-    about = json.loads(done.stdout)["training_data"]["home"]
-    assert about["speech"]["seconds"] == pytest.approx(6.0, abs=0.1)
-    assert about["silence"]["seconds"] == pytest.approx(4.0, abs=0.1)
+    about = json.loads(done.stdout)["training_data"]
+    learned, kept = about["home"], about["home_confirmed"]
+    assert learned["speech"]["seconds"] == pytest.approx(6.0, abs=0.1)
+    assert set(kept) == {"silence"}  # of which any is kept, and no review has left alone the rest
+    assert learned["silence"]["segments"] > kept["silence"] > 0
     adapted, base = load_model(output), load_model(model_file)
     assert adapted.classes == base.classes
     home = cut_recordings(marked, scenario_of(base))
-    assert len(home) == about["speech"]["segments"] + about["silence"]["segments"]
-    loud_enough = prepare(ROOM, home).usable[0]  # three windows of each segment
-    assert len(home) < loud_enough.sum() == len(adapted.arrays["home_vectors"])
+    assert learned["speech"]["segments"] == home.amounts["speech"].segments
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,9 @@
-"""What some corrected seconds of a new home are worth.
+"""What some corrected seconds of a new home are worth, and what they do to all other sounds.
 
 A collection that the machine has never heard stands for the home: it is adapted to segments from
-half of the collection's groups, and tried on those of the other half. Only classes count of which
-the home has ten segments from two groups.
+half of the collection's groups, and tried on those of the other half. Corrected are those that were
+labelled wrongly, but for silence; those that a reviewer passed by on the way to them, and left as
+they were, are kept so. Only classes count of which the home has ten segments from two groups.
 """
 
 from typing import Any, NamedTuple
@@ -12,17 +13,19 @@ from joblib import delayed
 from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.confirmed import MOST_CONFIRMED
+from hearthlog.analyzer.training.dataset import Dataset, spread
 from hearthlog.analyzer.training.home_data import HOME_WEIGHT
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.workers.parallel import in_parallel
-from hearthlog.models.classes import UNKNOWN
-from hearthlog.schemas.arrays import Indices
+from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.progress import Progress
 
 CORRECTED = (0, 10, 30, 60)  # segments
 _FEWEST_CLASSES = 2
 _FEWEST_SEGMENTS = 10  # of a class
+_RIGHT = 0.3  # F1 of a class that can be lost
 _SHUFFLES = 3
 
 
@@ -33,6 +36,9 @@ class AdaptationCurve(NamedTuple):
     # of each collection that was left out, over the classes that count
     collections: dict[str, list[float]]
     mean: list[float]
+    # the largest loss of F1, in any collection, of a class that had 0.3 or more, and of silence
+    worst: list[float]
+    worst_of_silence: list[float]
 
 
 def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> AdaptationCurve:
@@ -70,19 +76,28 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
             "segments from two source groups each: none can stand for a new home"
         )
     examples = prepare(method, data)
+    silence = data.classes.index(SILENCE) if SILENCE in data.classes else -1
     splits = [
-        _split(data, number, homes[number], shuffle)
+        _split(data, number, homes[number], shuffle)._replace(silence=silence)
         for number in chosen
         for shuffle in range(_SHUFFLES)
     ]
     calls = (delayed(_scores)(method, len(data.classes), split, *examples) for split in splits)
-    scores = np.empty((len(splits), len(CORRECTED)))
-    for place, row in enumerate(in_parallel(calls)):
-        scores[place] = row
+    scores = np.empty((len(splits), len(CORRECTED), len(data.classes)))
+    for place, rows in enumerate(in_parallel(calls)):
+        scores[place] = rows
         progress((place + 1) / len(splits))
-    each = scores.reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
+    each = np.nanmean(scores, axis=2).reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
     curves = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
-    return AdaptationCurve(CORRECTED, curves, each.mean(axis=0).tolist())
+    lost = np.where(scores[:, :1] >= _RIGHT, scores - scores[:, :1], 0.0)
+    of_silence = np.array([name == SILENCE for name in data.classes])
+    return AdaptationCurve(
+        CORRECTED,
+        curves,
+        each.mean(axis=0).tolist(),
+        worst=lost.min(axis=(0, 2)).tolist(),
+        worst_of_silence=lost[:, :, of_silence].min(axis=(0, 2), initial=0.0).tolist(),
+    )
 
 
 def _segments_of_home(data: Dataset, number: int) -> Indices:
@@ -97,11 +112,12 @@ def _segments_of_home(data: Dataset, number: int) -> Indices:
 
 
 class _Split(NamedTuple):
-    """Segments of other homes, those of this one to correct, in this order, and to be tried on."""
+    """Segments of other homes, those of this one to review, in this order, and to be tried on."""
 
     others: Indices
     pool: Indices
     test: Indices
+    silence: int = -1  # number of the class
 
 
 def _split(data: Dataset, number: int, rows: Indices, shuffle: int) -> _Split:
@@ -114,21 +130,37 @@ def _split(data: Dataset, number: int, rows: Indices, shuffle: int) -> _Split:
     return _Split(others, pool, rows[~mine])
 
 
-def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> list[float]:
+def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float64:
+    """Return the F1 of each class after each number of corrections; NaN for a class without any."""
     examples = Examples(*arrays)
     target = examples.target
-    right = target[split.test]
-    scores = []
-    for count in CORRECTED:
-        home = split.pool[:count]
+    base = method.fit(examples, split.others)
+    said = examples.decide(base, split.pool, classes).argmax(axis=1)
+    true = target[split.pool]
+    wrong = np.flatnonzero((said != true) & (true != split.silence))
+    scores = np.full((len(CORRECTED), classes), np.nan)
+    labels = np.unique(target[split.test])
+    for place, count in enumerate(CORRECTED):
+        marked = wrong[:count]
+        passed = np.flatnonzero((said == true)[: marked[-1]]) if len(marked) else marked
+        home = split.pool[np.concatenate([marked, _few_of_each(passed, true)])]
         weight = examples.weight.copy()
         weight[home] = HOME_WEIGHT
-        seen = np.concatenate([split.others, home])
-        learned = method.fit(examples._replace(weight=weight), seen, home)
-        decision = examples.decide(learned, split.test, classes)
-        predicted, labels = decision.argmax(axis=1), np.unique(right)
-        scores.append(f1_score(right, predicted, labels=labels, average="macro", zero_division=0))
+        learned = base
+        if len(home):
+            seen = np.concatenate([split.others, home])
+            learned = method.fit(examples._replace(weight=weight), seen)
+        predicted = examples.decide(learned, split.test, classes).argmax(axis=1)
+        scores[place, labels] = f1_score(
+            target[split.test], predicted, labels=labels, average=None, zero_division=0
+        )
     return scores
+
+
+def _few_of_each(rows: Indices, target: Indices) -> Indices:
+    """Choose as many rows of each class as are kept as they were."""
+    kept = [spread(rows[target[rows] == number], MOST_CONFIRMED) for number in np.unique(target)]
+    return np.concatenate(kept)
 
 
 def _turn_about(rows: Indices, target: Indices, rng: np.random.Generator) -> Indices:

@@ -114,6 +114,8 @@ def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
     float
         Inverse temperature.
     """
+    if not len(target):
+        return base
     share = len(target) / (len(target) + _BASE_SEGMENTS)
     here = inverse_temperature(decisions, target)
     return float(np.exp(share * np.log(here) + (1.0 - share) * np.log(base)))

@@ -3,7 +3,7 @@
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import NamedTuple
 
@@ -20,12 +20,13 @@ from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
-from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 from hearthlog.schemas.progress import Progress
 
 HOP_FRAMES = 10
 SEGMENTS_PER_GROUP = 24
+CONFIRMED = "this home, as it was labelled"  # a collection
 _BELOW_CLIP = 10 ** (-12 / 10)  # 12 dB
 _SEED = 20_261_122
 
@@ -45,6 +46,10 @@ class Recording(NamedTuple):
         Floor of the room at each frame; None for none, as in a clip that was cut out of it.
     copies : sequence of RoomCopy
         The same sound in other rooms.
+    most : int or None
+        Segments of it at most, evenly spaced; None for no limit.
+    span : (int, int) or None
+        Its start and end in nanoseconds of UTC, if that is known.
     """
 
     label: str
@@ -55,6 +60,8 @@ class Recording(NamedTuple):
     weight: float = 1.0
     floor: Float64 | None = None
     copies: Sequence[RoomCopy] = ()
+    most: int | None = None
+    span: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,8 @@ class Dataset:
         Number of recordings that were used.
     skipped : dict of str to int
         Number of recordings that gave no segment, by the reason.
+    spans : np.ndarray [shape=(k, 2)], int64
+        Starts and ends of the recordings that were used, in nanoseconds of UTC, if they are known.
     """
 
     windows: Float32
@@ -100,6 +109,7 @@ class Dataset:
     collection_names: tuple[str, ...]
     collections: Mapping[tuple[str, str], int]
     skipped: Mapping[str, int]
+    spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     def __len__(self) -> int:
         return len(self.target)
@@ -244,6 +254,7 @@ def cut_recordings(
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
     chosen: list[_Chosen] = []
+    spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
     weights = [np.empty(0)]
     for item in recordings:
@@ -256,6 +267,7 @@ def cut_recordings(
             skipped[reason] += 1
             continue
         used[item.collection, item.licence] += 1
+        spans += [item.span] if item.span else []
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
         chosen += [_Chosen(item, start) for start in starts.tolist()]
         weights.append(np.full(len(starts), item.weight))
@@ -280,6 +292,7 @@ def cut_recordings(
         collection_names=tuple(collections),
         collections=dict(used),
         skipped=dict(sorted(skipped.items())),
+        spans=np.array(spans, np.int64).reshape(-1, 2),
     )
 
 
@@ -367,12 +380,25 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]
         return f"shorter than {features.window_seconds:g} s", nothing
     starts = np.arange(0, len(values) - window + 1, HOP_FRAMES)
     if class_name(recording.label) == SILENCE:
-        return "", starts
+        return "", spread(starts, recording.most)
     power = features.power(values)
     windows = np.lib.stride_tricks.sliding_window_view(power, window)[starts]
     loudest = max(SILENCE_POWER, power.mean(dtype=np.float64) * _BELOW_CLIP)
     loud = starts[windows.mean(axis=1, dtype=np.float64) > loudest]
-    return ("" if len(loud) else "nowhere above -60 dBFS"), loud
+    return ("" if len(loud) else "nowhere above -60 dBFS"), spread(loud, recording.most)
+
+
+def spread(values: Indices, most: int | None) -> Indices:
+    """Choose values at even distances.
+
+    Parameters
+    ----------
+    values : np.ndarray [shape=(n,)], intp
+    most : int or None
+        How many at most; None for all.
+    """
+    count = len(values) if most is None else min(len(values), most)
+    return values[np.linspace(0, len(values) - 1, count).round().astype(np.intp)]
 
 
 def _thinned(key: Indices, weight: Float64) -> Indices:
@@ -380,6 +406,5 @@ def _thinned(key: Indices, weight: Float64) -> Indices:
     kept = [np.empty(0, np.intp)]
     for value in np.unique(key):
         rows = np.flatnonzero(key == value)
-        count = min(len(rows), int(SEGMENTS_PER_GROUP * weight[rows[0]]))
-        kept.append(rows[np.linspace(0, len(rows) - 1, count).round().astype(np.intp)])
+        kept.append(spread(rows, int(SEGMENTS_PER_GROUP * weight[rows[0]])))
     return np.sort(np.concatenate(kept))

@@ -1,32 +1,27 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.layers import find_chains
-from hearthlog.analyzer.logs.recorder_info import models_for
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.analyzer.training.dataset import Recording
-from hearthlog.models.classes import SILENCE, class_name, translation
+from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker, is_quiet
+from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.schemas.arrays import Float64, Int64
-from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.arrays import Indices, Int64
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import ENROLLED, find_logs
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
 
-_FIELDS = ("header.stamp", "frame", "values")
-HOME_WEIGHT = 5.0  # of a segment of the home; others have 1
+HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
+MOST_OF_MARK = 6  # segments, so that a mark of minutes is not more than a few of seconds
 HOME = "this home"
 
 
@@ -35,9 +30,6 @@ def home_recordings(
 ) -> Iterator[Recording]:
     """Read the features of all marks in the logs of a folder.
 
-    A mark shorter than a window is extended to one. All marks of a UTC day are of one group. An
-    enrolled sound is without a room, unless it is silence.
-
     Parameters
     ----------
     folder : Path
@@ -45,13 +37,12 @@ def home_recordings(
     features : FeatureSet, optional
         Marks in logs of another set give recordings without features.
     gate : float
-        A mark in which nothing is so many dB above the floor of the room is left out, unless it is
-        silence; a `HearthlogWarning` counts them. 0 for none.
+        As of `marked_recordings`.
 
     Yields
     ------
     Recording
-        A mark, or a part of one that lies between gaps; log by log.
+        As of `marked_recordings`.
 
     Raises
     ------
@@ -60,32 +51,43 @@ def home_recordings(
     DataError
         If there are marks, and all of them are in logs of other sets.
     """
-    other: tuple[Path, str] | None = None  # log and microphone of another set
-    usable, quiet = False, list[str]()
-    for log in find_logs(folder, enrolled=True):
-        marks = read_marks(log)
-        if not marks:
-            continue
-        topics = {topic(mark.microphone, "features") for mark in marks}
-        columns = read_columns([log], topics, fields=_FIELDS)
-        earlier = _columns_before(log, topics)
-        floors = {
-            name: _floors(recorded, earlier.get(name), features)
-            for name, recorded in columns.items()
-        }
-        for mark in marks:
-            name = topic(mark.microphone, "features")
-            if name not in columns or not len(columns[name]):
-                continue
-            if _is_of(columns[name], features):
-                usable = True
-            else:
-                other = log, mark.microphone
+    sounds = read_reviewed_sound(folder, features)
+    for recording in marked_recordings(sounds, folder, features, gate):
+        yield recording._replace(most=None)
+
+
+def marked_recordings(
+    sounds: Iterable[HomeSound], folder: Path, features: FeatureSet, gate: float
+) -> Iterator[Recording]:
+    """Cut marks out of the sound of a home.
+
+    A mark shorter than a second is extended to one. All marks of a UTC day are of one group. An
+    enrolled sound is without a room, unless it is silence.
+
+    Parameters
+    ----------
+    sounds : iterable of HomeSound
+    folder : Path
+        Where they are from, for the warning.
+    features : FeatureSet
+        Of the sounds.
+    gate : float
+        A mark in which nothing is so many dB above the floor of the room is left out, unless it is
+        silence; a `HearthlogWarning` counts them. 0 for none.
+
+    Yields
+    ------
+    Recording
+        A mark, or a part of one that lies between gaps; log by log.
+    """
+    quiet: list[str] = []
+    for sound in sounds:
+        for mark in sound.marks:
             silence = class_name(mark.label) == SILENCE
-            floor = floors[name] if silence or ENROLLED not in log.parts else None
-            pieces = list(_recordings(columns[name], floor, mark, features))
+            floored = silence or not sound.enrolled
+            pieces = list(_recordings(sound, mark, features, floored=floored))
             if gate and not silence and all(_is_quiet(piece, features, gate) for piece in pieces):
-                quiet.append(f"{mark.label} in {log.name}")
+                quiet.append(f"{mark.label} in {sound.log.name}")
             else:
                 yield from pieces
     if quiet:
@@ -94,12 +96,49 @@ def home_recordings(
             f"is {quiet[0]}: they are left out; mark what can be heard, or mark it as silence"
         )
         warnings.warn(HearthlogWarning(text, folder), stacklevel=2)
-    if other is not None and not usable:
-        name = _set_of(*other)
-        raise DataError(
-            f"{folder}: what is marked there has features of set {name}, and {features.name} is "
-            f"needed: {models_for(name)}"
-        )
+
+
+def lesson_recordings(
+    folder: Path, features: FeatureSet = DEFAULT, gate: float = 0.0
+) -> Iterator[Recording]:
+    """Read the marks in the logs of a folder that teach something; at most six segments of each.
+
+    Parameters
+    ----------
+    folder, features, gate
+        As of `home_recordings`.
+
+    Yields
+    ------
+    Recording
+
+    Raises
+    ------
+    LogError, DataError
+        As of `home_recordings`.
+    """
+    sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features))
+    yield from marked_recordings(sounds, folder, features, gate)
+
+
+def teaching(sound: HomeSound) -> HomeSound:
+    """Leave out the marks that teach nothing.
+
+    Those are the marks of what a reviewer could not tell, and those that touch a span that was
+    drawn at random.
+
+    Parameters
+    ----------
+    sound : HomeSound
+    """
+    drawn = sound.drawn
+    marks = [
+        mark
+        for mark in sound.marks
+        if class_name(mark.label) != UNKNOWN
+        and all(mark.end <= start or mark.start >= end for start, end in drawn)
+    ]
+    return replace(sound, marks=marks)
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
@@ -149,34 +188,6 @@ def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
     return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
-def _columns_before(log: Path, topics: Collection[str]) -> dict[str, Columns]:
-    """Read the log before another one, if there is one and it can be read."""
-    with suppress(LogError):
-        for chain in find_chains([log]):
-            for place in chain.asked:
-                return read_columns(chain.logs[max(place - 1, 0) : place], topics, fields=_FIELDS)
-    return {}
-
-
-def _floors(recorded: Columns, earlier: Columns | None, features: FeatureSet) -> Float64 | None:
-    """Return the floor of the room at each frame of a log, as a recorder tracks it.
-
-    What was recorded earlier is tracked before it, as far as it leads up to the log.
-    """
-    if features.band_powers is None or not _is_of(recorded, features) or not len(recorded):
-        return None
-    frames, values = recorded["frame"].astype(np.int64), recorded["values"]
-    if earlier is not None and len(earlier) and _is_of(earlier, features):
-        frames = np.concatenate([earlier["frame"].astype(np.int64), frames])
-        values = np.concatenate([earlier["values"], values])
-    floors = np.zeros((len(frames), features.bands))
-    breaks = np.flatnonzero(np.diff(frames) != 1) + 1
-    for piece in np.split(np.arange(len(frames)), breaks):
-        tracked = FloorTracker()(features.band_powers(values[piece]), int(frames[piece[0]])).powers
-        floors[piece[len(piece) - len(tracked) :]] = tracked
-    return floors[-len(recorded) :]
-
-
 def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
     """Tell whether no window of 0.4 s is above the floor of the room."""
     windows = len(recording.features) - BLOCK_FRAMES + 1
@@ -186,32 +197,44 @@ def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:
     return bool(is_quiet(powers, recording.floor[-windows:], BLOCK_FRAMES, gate).all())
 
 
-def _is_of(recorded: Columns, features: FeatureSet) -> bool:
-    names = array_names(recorded.metadata, "values")
-    return not names or tuple(names) == features.feature_names
-
-
-def _set_of(log: Path, microphone: str) -> str:
-    """Return the name of the feature set of a microphone in a log."""
-    name = topic(microphone, "info")
-    said = read_columns([log], {name}, fields={"feature_set"}).get(name)
-    return "unknown" if said is None or not len(said) else str(said["feature_set"][0])
-
-
 def _recordings(
-    recorded: Columns, floors: Float64 | None, mark: Mark, features: FeatureSet
+    sound: HomeSound, mark: Mark, features: FeatureSet, *, floored: bool
 ) -> Iterator[Recording]:
     """Yield the features of a mark, in pieces where there are gaps in it."""
-    window, values = features.window_frames, recorded["values"]
-    if not _is_of(recorded, features):
-        values = np.empty((len(values), 0), np.float32)
-    stamps, frames = recorded["header.stamp"], recorded["frame"].astype(np.int64)
-    first, last = np.searchsorted(stamps, [mark.start, mark.end]).tolist()
+    window = features.window_frames
+    first, last = np.searchsorted(sound.stamps, [mark.start, mark.end]).tolist()
     missing = max(window - (last - first), 0)
     first = max(first - missing // 2, 0)
-    last = min(max(last + missing - missing // 2, first + window), len(stamps))
-    day = np.datetime64(mark.start // NANOSECONDS, "s").astype("datetime64[D]")
-    breaks = np.flatnonzero(np.diff(frames[first:last]) != 1) + 1
+    last = min(max(last + missing - missing // 2, first + window), len(sound.stamps))
+    breaks = np.flatnonzero(np.diff(sound.frames[first:last]) != 1) + 1
     for piece in np.split(np.arange(first, last), breaks):
-        floor = None if floors is None else floors[piece]
-        yield Recording(mark.label, f"{HOME} {day}", HOME, "", values[piece], HOME_WEIGHT, floor)
+        yield recording_of(sound, mark.label, piece, floored=floored)
+
+
+def recording_of(
+    sound: HomeSound, label: str, frames: Indices, *, floored: bool = True
+) -> Recording:
+    """Cut successive frames out of the sound of a home.
+
+    Parameters
+    ----------
+    sound : HomeSound
+    label : str
+    frames : np.ndarray [shape=(n,)], intp
+        Places of the frames.
+    floored : bool
+        Whether it is in the room.
+    """
+    stamps = sound.stamps[frames]
+    day = np.datetime64(int(stamps[0]) // NANOSECONDS, "s").astype("datetime64[D]")
+    return Recording(
+        label,
+        f"{HOME} {day}",
+        HOME,
+        "",
+        sound.values[frames],
+        HOME_WEIGHT,
+        None if sound.floors is None or not floored else sound.floors[frames],
+        most=MOST_OF_MARK,
+        span=(int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS),
+    )

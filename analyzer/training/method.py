@@ -30,7 +30,6 @@ _EMPTY_ROOMS = 60
 _PLACES = (10, 50)  # frames at which windows of an empty room begin
 
 Fold = tuple[Indices, Indices]  # segments to learn from, and segments to test on
-NO_HOME: Indices = np.empty(0, np.intp)
 
 
 class Examples(NamedTuple):
@@ -166,9 +165,7 @@ class Method(ABC):
         return {}
 
     @abstractmethod
-    def fit(
-        self, examples: Examples, seen: Indices | slice = slice(None), home: Indices = NO_HOME
-    ) -> Learned:
+    def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> Learned:
         """Learn from some segments.
 
         Parameters
@@ -176,8 +173,6 @@ class Method(ABC):
         examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
             Indices of the segments to learn from; all by default.
-        home : np.ndarray [shape=(h,)], intp
-            Indices of those among them that belong to the home to which the classifier is adapted.
 
         Returns
         -------
@@ -311,18 +306,39 @@ def _usable(
 ) -> Bool:
     """Tell which windows of segments are loud enough to be learned from."""
     power = features.power(segments).astype(np.float64)
-    places = window_places(segments.shape[1], window_frames)
-    windows = [power[:, place : place + window_frames].mean(axis=1) for place in places]
-    if len(places) == 1:
-        return ~np.isnan(np.stack(windows, axis=1))
-    quietest = power.mean(axis=1) * _BELOW_SEGMENT
-    if floor.shape[1]:
-        quietest = np.maximum(quietest, _ABOVE_FLOOR * floor[:, -1])
-    loud = np.stack(windows, axis=1) > quietest[:, np.newaxis]
+    heard: Bool = ~np.isnan(power.sum(axis=1, keepdims=True))
+    if len(window_places(segments.shape[1], window_frames)) == 1:
+        return heard
+    least = _ABOVE_FLOOR * floor[:, -1:] if floor.shape[1] else None
+    loud = loud_windows(power, window_frames, least)
     if SILENCE in data.classes:
         loud |= (data.target == data.classes.index(SILENCE))[:, np.newaxis]
-    usable: Bool = loud & ~np.isnan(power).any(axis=1, keepdims=True)
+    usable: Bool = loud & heard
     return usable
+
+
+def loud_windows(power: Float64, window_frames: int, least: Float64 | None = None) -> Bool:
+    """Tell which windows are at most 6 dB below their segment.
+
+    Parameters
+    ----------
+    power : np.ndarray [shape=(n, f)], float64
+        Mean squares of the frames of each segment.
+    window_frames : int
+    least : np.ndarray [shape=(n, 1)], float64, optional
+        What they must be above besides.
+
+    Returns
+    -------
+    np.ndarray [shape=(n, places)], bool
+    """
+    places = window_places(power.shape[1], window_frames)
+    windows = [power[:, place : place + window_frames].mean(axis=1) for place in places]
+    quietest = power.mean(axis=1, keepdims=True) * _BELOW_SEGMENT
+    if least is not None:
+        quietest = np.maximum(quietest, least)
+    loud: Bool = np.stack(windows, axis=1) > quietest
+    return loud
 
 
 def _empty_rooms(features: FeatureSet, inputs: Inputs, rng: np.random.Generator) -> Float32:
@@ -334,13 +350,12 @@ def _empty_rooms(features: FeatureSet, inputs: Inputs, rng: np.random.Generator)
     return inputs.of_windows(windows, np.stack([room.floor for room in rooms * len(_PLACES)]))
 
 
-def cross_validate(  # noqa: PLR0913, PLR0917
+def cross_validate(
     methods: Sequence[Method],
     examples: Examples,
     classes: int,
     folds: Iterable[Fold],
     progress: Progress,
-    home: Indices = NO_HOME,
 ) -> Float64:
     """Classify segments by classifiers that have not seen them.
 
@@ -355,8 +370,6 @@ def cross_validate(  # noqa: PLR0913, PLR0917
         Indices of the segments to learn from, and of those to test on.
     progress : callable
         Is told the share of the fits that is done, 0 to 1.
-    home : np.ndarray [shape=(h,)], intp
-        Indices of segments of the home to which classifiers are adapted.
 
     Returns
     -------
@@ -367,8 +380,7 @@ def cross_validate(  # noqa: PLR0913, PLR0917
     decisions = np.full((len(methods), len(examples.target), classes), np.nan)
     tasks = list(product(range(len(methods)), folds))
     calls = (
-        delayed(_decide_unseen)(methods[number], classes, fold, home, *examples)
-        for number, fold in tasks
+        delayed(_decide_unseen)(methods[number], classes, fold, *examples) for number, fold in tasks
     )
     for done, decided in enumerate(in_parallel(calls)):
         number, (_, unseen) = tasks[done]
@@ -377,12 +389,10 @@ def cross_validate(  # noqa: PLR0913, PLR0917
     return decisions
 
 
-def _decide_unseen(
-    method: Method, classes: int, fold: Fold, home: Indices, *arrays: Any
-) -> Float64:
+def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Float64:
     """Classify the test segments of a fold; joblib sends each array, an argument, once."""
     examples, (seen, unseen) = Examples(*arrays), fold
-    learned = method.fit(examples, seen, np.intersect1d(seen, home))
+    learned = method.fit(examples, seen)
     return examples.decide(learned, unseen, classes)
 
 

@@ -7,16 +7,15 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.method import NO_HOME, Examples, Learned, Method
+from hearthlog.analyzer.training.method import Examples, Learned, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.svm_rbf import HOME_SHARPNESS, SVM_RBF, home_votes, weakest_pairs
+from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _SEED = 20_261_122
@@ -56,9 +55,7 @@ class SvmMethod(Method):
         """Cost and gamma."""
         return {"cost": self.cost, "gamma": self.gamma}
 
-    def fit(
-        self, examples: Examples, seen: Indices | slice = slice(None), home: Indices = NO_HOME
-    ) -> "LearnedSvm":
+    def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedSvm":
         """Learn from some segments.
 
         Parameters
@@ -66,9 +63,6 @@ class SvmMethod(Method):
         examples : Examples
         seen : np.ndarray [shape=(m,)], intp, or slice
             Indices of the segments to learn from; all by default.
-        home : np.ndarray [shape=(h,)], intp
-            Indices of those among them that belong to the home to which the classifier is adapted:
-            unchanged, they get votes of their own.
         """
         inputs, target, weight = examples.windows(seen)
         remembered = np.arange(-len(inputs), 0) + len(examples.more_target)
@@ -87,12 +81,7 @@ class SvmMethod(Method):
             inputs.astype(np.float64), target, svc__sample_weight=weight
         )
         support = machine.support_
-        return LearnedSvm(
-            fitted,
-            inputs[support],
-            np.maximum(remembered[support], -1),
-            *_home_windows(examples, home),
-        )
+        return LearnedSvm(fitted, inputs[support], np.maximum(remembered[support], -1))
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with another cost or gamma.
@@ -216,12 +205,6 @@ def rounded(inputs: Float32) -> Float32:
     return half if ((error <= _ROUNDING * spread) | (spread == 0.0)).all() else inputs
 
 
-def _home_windows(examples: Examples, home: Indices) -> tuple[Float32, Indices]:
-    """Return the unchanged windows of the segments of a home, and their classes."""
-    inputs, usable = examples.inputs[0, home], examples.usable[0, home]
-    return inputs[usable], np.broadcast_to(examples.target[home, np.newaxis], usable.shape)[usable]
-
-
 class LearnedSvm:
     """A fitted machine.
 
@@ -233,25 +216,12 @@ class LearnedSvm:
         Inputs that became support vectors, in the order of the `SVC`.
     remembered : np.ndarray [shape=(n,)], intp
         Their places in `Examples.more_inputs`; -1 for those of segments.
-    home : np.ndarray [shape=(h, width)], float32
-        Inputs of the home's segments.
-    home_target : np.ndarray [shape=(h,)], intp
-        Their classes.
     """
 
-    def __init__(
-        self,
-        machine: Pipeline,
-        support: Float32,
-        remembered: Indices,
-        home: Float32,
-        home_target: Indices,
-    ) -> None:
+    def __init__(self, machine: Pipeline, support: Float32, remembered: Indices) -> None:
         self.machine = machine
         self.remembered = remembered
         self._support = support
-        self._home = home
-        self._home_target = home_target
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
         """Return decision values, as `SvmMachine` gives them.
@@ -265,30 +235,21 @@ class LearnedSvm:
         Returns
         -------
         np.ndarray [shape=(n, C)], float64
-            That of the weakest pair of the class, plus the votes of the home's segments; -inf for
-            a class that was not learned.
+            That of the weakest pair of the class; -inf for a class that was not learned.
         """
         values = self.machine.decision_function(inputs.astype(np.float64))
         pairs = -values[:, np.newaxis] if values.ndim == 1 else values
         decision = np.full((len(inputs), classes), -np.inf)
         learned = self.machine.classes_
         decision[:, learned] = weakest_pairs(pairs, len(learned))
-        return decision + self._votes(inputs, classes) if len(self._home) else decision
-
-    def _votes(self, inputs: Float32, classes: int) -> Float64:
-        scaler, svc = self.machine
-        gamma, scaled = HOME_SHARPNESS * svc.gamma, scaler.transform(inputs.astype(np.float64))
-        home = scaler.transform(self._home.astype(np.float64))
-        near = rbf_kernel(scaled, home, gamma=gamma)
-        others = rbf_kernel(scaled, svc.support_vectors_, gamma=gamma).sum(axis=1, keepdims=True)
-        return home_votes(near @ np.eye(classes)[self._home_target], others)
+        return decision
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of `hearthlog.models.classifiers.svm_rbf.SvmKind`."""
         scaler, svc = self.machine
         # scikit-learn inverts the sign if there are two classes only; the file does not.
         sign = -1.0 if len(svc.classes_) == 2 else 1.0
-        arrays = {
+        return {
             "scaler_mean": scaler.mean_,
             "scaler_scale": scaler.scale_,
             "support_vectors": self._support,
@@ -296,10 +257,6 @@ class LearnedSvm:
             "dual_coefficients": sign * svc.dual_coef_,
             "intercepts": sign * svc.intercept_,
         }
-        if len(self._home):
-            arrays["home_vectors"] = self._home
-            arrays["home_target"] = self._home_target.astype(np.int64)
-        return arrays
 
     def parameters(self) -> dict[str, Any]:
         """Return `cost`, and as `gamma` that of the kernel itself."""

@@ -56,7 +56,9 @@ class TrainingData(_Record):
     Attributes
     ----------
     home : dict of str to Amount
-        What marks of a home added, by class, if the model was adapted.
+        What a home added, by class, if the model was adapted.
+    home_confirmed : dict of str to int
+        Segments among these that a reviewer has left as they were labelled; the others are marked.
     home_frames : int
         Frames of the home without marks, from which transitions are.
     home_spans : list of [start, end]
@@ -70,6 +72,7 @@ class TrainingData(_Record):
     classes: dict[_ClassName, Amount]
     collections: list[Collection]
     home: dict[_ClassName, Amount] = {}
+    home_confirmed: dict[_ClassName, _Count] = {}
     home_frames: _Count = 0
     home_spans: Annotated[list[_Span], Field(max_length=MOST_SPANS)] = []
     base_sha256: _Text = ""

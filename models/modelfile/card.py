@@ -63,12 +63,14 @@ def model_card(model: Model) -> str:
     ]
     for name in description.classes:
         amount, result = amounts[name], metrics.classes[name]
+        figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
+        if not amount.sources:  # a class of the home
+            figures = ("-" for _ in range(3))
         lines.append(
             f"| {name} | {', '.join(description.scenario[name])} | {amount.sources} | "
-            f"{amount.seconds:.0f} | {result.precision:.3f} | {result.recall:.3f} | "
-            f"{result.f1:.3f} |"
+            f"{amount.seconds:.0f} | {' | '.join(figures)} |"
         )
-    thin = [f"{name} ({one.sources})" for name, one in amounts.items() if one.sources < _FEW]
+    thin = [f"{name} ({one.sources})" for name, one in amounts.items() if 0 < one.sources < _FEW]
     if thin:
         lines += ["", f"Thin, by sources, and not to be trusted much: {', '.join(thin)}"]
     if description.training_data.home:
@@ -76,8 +78,10 @@ def model_card(model: Model) -> str:
             "",
             "Adapted to a home (the figures above are those before); learned besides:",
         ]
+        kept = description.training_data.home_confirmed
         lines += [""] + [
             f"- {name}: {amount.segments} segments from {amount.sources} sources"
+            + (f", {kept[name]} of them as they were labelled" if name in kept else "")
             for name, amount in description.training_data.home.items()
         ]
     if frames := description.training_data.home_frames:

@@ -280,6 +280,10 @@ def adaptation(
         ("collection left out", *map(str, curve.corrected)),
         [(name, *(f"{value:.3f}" for value in row)) for name, row in curves.items()],
     )
+    print(
+        f"\nlargest loss of a class in a home: {-min(curve.worst):.3f}, of silence "
+        f"{-min(curve.worst_of_silence):.3f}"
+    )
 
 
 @contextmanager

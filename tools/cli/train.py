@@ -199,25 +199,26 @@ def _learned(
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
-    from hearthlog.analyzer.training.dataset import cut_recordings
-    from hearthlog.analyzer.training.scenario import scenario_of
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.training.home_lessons import home_lessons
     from hearthlog.analyzer.training.train import adapt_model
-    from hearthlog.models.features.installed import feature_set
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = adapted = load_model(base)
-    features = feature_set(model.description.feature_set)
-    recordings = _home_recordings(home, features, model.description.gate)
-    segments = cut_recordings(recordings, scenario_of(model), features)
+    segments, notes, nothing = home_lessons(home, model)
+    for note in notes:
+        tell(note)
     what = f"learning from {len(segments)} segments of the home besides"
     if len(segments):
         with share_done(what, announce=True):
             adapted = adapt_model(model, segments)
     adapted = _with_home_transitions(adapted, home)
     if adapted is model:
-        return adapt_model(model, segments), segments  # which says why there are no segments
-    if not len(segments):
-        tell("nothing is marked: only what follows what is learned, not how the home sounds")
+        reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
+        why = "; ".join(reasons) or nothing
+        raise DataError(f"the home has no segments of a class of the model ({why})")
+    if nothing:
+        tell(f"{nothing}: only what follows what is learned, not how the home sounds")
     return adapted, segments
 
 
@@ -242,10 +243,10 @@ def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
 def _home_recordings(
     folders: list[Path], features: "FeatureSet", gate: float
 ) -> Iterator["Recording"]:
-    from hearthlog.analyzer.training.home_data import home_recordings
+    from hearthlog.analyzer.training.home_data import lesson_recordings
 
     for folder in folders:
-        yield from home_recordings(folder, features, gate)
+        yield from lesson_recordings(folder, features, gate)
 
 
 def _warn_of_few(segments: "Dataset") -> None:
@@ -265,8 +266,13 @@ def _print(model: "Model", segments: "Dataset") -> None:
     if data.home:
         home = "also learned from the home"
         print(home if adapted else f"\n{home} (the figures above are those without it)")
-        rows = [(name, *_amounts(one)) for name, one in data.home.items() if one.segments]
-        print_table(("class", *amounts), rows)
+        kept = data.home_confirmed
+        rows = [
+            (name, *_amounts(one), str(kept.get(name, 0)))
+            for name, one in data.home.items()
+            if one.segments
+        ]
+        print_table(("class", *amounts, "not marked"), rows)
     print_skipped(segments.skipped)
 
 

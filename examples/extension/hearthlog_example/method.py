@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.training.method import NO_HOME, Examples, Method
+from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.schemas.arrays import Indices
 from hearthlog_example.classifier import NEAREST_MEAN, NearestMeanMachine
 from hearthlog_example.features import OCTAVES
@@ -18,11 +18,8 @@ _LEAST_SPREAD = 1e-3
 class MeansMethod(Method):
     """Learns the mean of each class, and how far segments are from it."""
 
-    def fit(
-        self, examples: Examples, seen: Indices | slice = slice(None), home: Indices = NO_HOME
-    ) -> "LearnedMeans":
-        """Learn from some segments; those of a home count as all others do, by their weight."""
-        del home
+    def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedMeans":
+        """Learn from some segments, by their weight."""
         inputs, target, weight = examples.windows(seen)
         classes = np.unique(target)
         means = np.stack(

@@ -1,0 +1,228 @@
+"""What a reviewer has looked at and left alone, and a model is sure of: it is to stay so.
+
+Marks are of what was wrong. A model that learns from them alone forgets what was right, and silence
+first: the only windows with the floor of this room in them would be of other classes.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, labelling_of
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording, spread
+from hearthlog.analyzer.training.home_data import recording_of
+from hearthlog.analyzer.training.marked_sound import HomeSound
+from hearthlog.analyzer.training.method import loud_windows
+from hearthlog.models.classes import SILENCE, UNKNOWN, translation
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.floor import is_quiet
+from hearthlog.models.features.window_inputs import of_segments
+from hearthlog.schemas.arrays import Bool, Float64, Indices
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import relabel_path
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
+from hearthlog.schemas.times import NANOSECONDS
+
+MOST_CONFIRMED = 60  # segments of a class
+_SURE = 0.5
+_FEWEST = 20  # of a class: the surest, if there are not so many that are sure
+_ASIDE = NANOSECONDS // 2  # of marks
+SEGMENT_FRAMES = 20
+_MOST_TRIED = 240  # segments of a class in a log
+
+
+class Candidates(NamedTuple):
+    """Segments that may be as they were labelled.
+
+    Attributes
+    ----------
+    recordings : list of Recording
+        A second each, labelled with the name of the class.
+    target : np.ndarray [shape=(n,)], intp
+        Their classes.
+    """
+
+    recordings: list[Recording]
+    target: Indices
+
+
+def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
+    """Cut out what was looked at, and not marked.
+
+    Parameters
+    ----------
+    sound : HomeSound
+    classes : sequence of str
+        Of the model; what was labelled otherwise is left out.
+
+    Raises
+    ------
+    LogError
+        If the labelling that was looked at cannot be read.
+    """
+    found: list[Candidates] = []
+    seen = [span for span in sound.reviewed if span.chosen != RANDOM]
+    for name in sorted({span.corrects or LIVE for span in seen}):
+        labelling = _labelling(sound, name)
+        if labelling is not None and sound.values.shape[1]:
+            spans = [(span.start, span.end) for span in seen if (span.corrects or LIVE) == name]
+            target = _classes_of(sound, labelling, classes)
+            found.append(_cut(sound, np.where(sound.inside(spans), target, -1), classes))
+    return _joined(found)
+
+
+def silent_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
+    """Cut out what was labelled as silence, whether anyone has looked at it or not.
+
+    Parameters
+    ----------
+    sound : HomeSound
+    classes : sequence of str
+        Of the model, silence among them.
+
+    Raises
+    ------
+    LogError
+        If the labels cannot be read.
+    """
+    if not sound.values.shape[1]:
+        return _joined([])
+    silence = classes.index(SILENCE)
+    labelling = _labelling(sound, LIVE)
+    if labelling is None:  # the model will tell
+        target = np.full(len(sound.stamps), silence)
+    else:
+        target = _classes_of(sound, labelling, classes)
+    return _cut(sound, np.where(target == silence, silence, -1), classes)
+
+
+def chosen(found: Iterable[Candidates], model: Model) -> list[Recording]:
+    """Choose segments of each class of which a model is sure, as evenly spaced as can be.
+
+    Parameters
+    ----------
+    found : iterable of Candidates
+    model : Model
+
+    Returns
+    -------
+    list of Recording
+        At most 60 of a class: of those with a probability of one half, or else of the 20 surest, if
+        the model labels them so. Silence below the gate of the model, of which it need not be told,
+        is taken only where there is not enough of other silence.
+    """
+    recordings, target = _joined(found)
+    if not recordings:
+        return []
+    probabilities, quiet = _heard(recordings, model)
+    rows = np.arange(len(target))
+    sure = np.where(probabilities.argmax(axis=1) == target, probabilities[rows, target], 0.0)
+    kept: list[int] = []
+    for number in np.unique(target):
+        same = np.flatnonzero((target == number) & (sure > 0.0))
+        loud = same[~quiet[same]]
+        if model.classes[number] == SILENCE and len(loud) < _FEWEST:
+            same = np.sort(np.concatenate([loud, same[quiet[same]][: _FEWEST - len(loud)]]))
+        else:
+            same = loud
+        enough = same[sure[same] >= _SURE]
+        if len(enough) < _FEWEST:
+            enough = np.sort(same[np.argsort(-sure[same], kind="stable")[:_FEWEST]])
+        kept += spread(enough, MOST_CONFIRMED).tolist()
+    unknown = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]  # else it is as if not told
+    labels = [unknown if name == UNKNOWN else name for name in model.classes]
+    return [recordings[i]._replace(label=labels[target[i]]) for i in sorted(kept)]
+
+
+def _labelling(sound: HomeSound, name: str) -> Labelling | None:
+    path, labelled = sound.log, LIVE
+    if name != LIVE:
+        name = name.removeprefix(relabelling(""))
+        path, labelled = relabel_path(sound.log, name), relabelling(name)
+    topic = labelling_topic(sound.microphone, labelled, "segment")
+    if not path.exists():
+        return None
+    columns = read_columns([path], {topic}, fields=SEGMENT_FIELDS).get(topic)
+    return None if columns is None else labelling_of(columns)
+
+
+def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) -> Indices:
+    """Return the class of each frame, -1 for none of the classes and where there is no label."""
+    names = translation(set(labelling.labels), classes)
+    numbers = {name: number for number, name in enumerate(classes)}
+    own = np.array([numbers.get(names[label], -1) for label in labelling.labels], np.intp)
+    middle = sound.stamps + FRAME_NANOSECONDS // 2
+    row = np.maximum(np.searchsorted(labelling.starts, middle, "right") - 1, 0)
+    inside = (labelling.starts[row] <= middle) & (middle < labelling.ends[row])
+    return np.where(inside, own[row], -1)
+
+
+def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidates:
+    """Cut the frames of a class into segments, away from marks; -1 is no class.
+
+    A sound shorter than a segment is taken if there is silence around it.
+    """
+    marks = [(mark.start, mark.end) for mark in sound.marks]
+    away = ~sound.inside(marks, _ASIDE) & ~sound.inside(sound.drawn)
+    silent = target == classes.index(SILENCE) if SILENCE in classes else np.zeros(len(away), bool)
+    cut = np.flatnonzero(np.diff(target, prepend=-2, append=-2))
+    places = []
+    for begin, end in pairwise(cut.tolist()):
+        if end - begin >= SEGMENT_FRAMES:
+            places.append(np.arange(begin, end - SEGMENT_FRAMES + 1, HOP_FRAMES))
+        elif not silent[begin]:
+            places.append(np.array([(begin + end - SEGMENT_FRAMES) // 2]))
+    starts = np.concatenate([np.empty(0, np.intp), *places])
+    starts = starts[(starts >= 0) & (starts + SEGMENT_FRAMES <= len(target))]
+    frames = starts[:, np.newaxis] + np.arange(SEGMENT_FRAMES)
+    own = target[frames[:, SEGMENT_FRAMES // 2]]
+    fit = (own >= 0) & away[frames].all(axis=1)
+    fit &= ((target[frames] == own[:, np.newaxis]) | silent[frames]).all(axis=1)
+    fit &= sound.frames[frames[:, -1]] - sound.frames[frames[:, 0]] == SEGMENT_FRAMES - 1
+    frames, own = frames[fit], own[fit]
+    tried = [spread(np.flatnonzero(own == number), _MOST_TRIED) for number in np.unique(own)]
+    rows = np.sort(np.concatenate([np.empty(0, np.intp), *tried]))
+    recordings = [
+        recording_of(sound, classes[own[row]], frames[row])._replace(collection=CONFIRMED)
+        for row in rows.tolist()
+    ]
+    return Candidates(recordings, own[rows])
+
+
+def _joined(found: Iterable[Candidates]) -> Candidates:
+    """Join candidates in the order of time, each of them once."""
+    several = list(found)
+    recordings = [recording for one in several for recording in one.recordings]
+    target = np.concatenate([np.empty(0, np.intp), *(one.target for one in several)])
+    once = {recording.features.tobytes(): row for row, recording in enumerate(recordings)}
+    rows = sorted(once.values(), key=lambda row: recordings[row].span or (0, 0))
+    return Candidates([recordings[row] for row in rows], target[rows])
+
+
+def _heard(recordings: Sequence[Recording], model: Model) -> tuple[Float64, Bool]:
+    """Return the probabilities that a model gives to segments, and which are below its gate.
+
+    The probabilities are those of the windows that are at most 6 dB below the segment.
+    """
+    classifier = Classifier(model)
+    features, inputs, gate = classifier.feature_set, classifier.inputs, classifier.gate
+    segments = np.stack([recording.features for recording in recordings])
+    floors = np.zeros((len(segments), features.bands))
+    quiet = np.zeros(len(segments), bool)
+    for row, recording in enumerate(recordings):
+        if recording.floor is not None and features.band_powers is not None:
+            floors[row] = recording.floor[-1]
+            windows = len(recording.floor) - inputs.window_frames + 1
+            powers, floor = features.band_powers(recording.features), recording.floor[-windows:]
+            quiet[row] = gate > 0.0 and is_quiet(powers, floor, inputs.window_frames, gate).all()
+    of_each = of_segments(inputs, segments, floors)
+    said = classifier.probabilities(of_each.reshape(-1, inputs.width))
+    loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
+    loud |= ~loud.any(axis=1, keepdims=True)  # of digital silence
+    share = (loud / loud.sum(axis=1, keepdims=True))[:, :, np.newaxis]
+    return (said.reshape(*loud.shape, -1) * share).sum(axis=1), quiet

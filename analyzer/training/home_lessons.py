@@ -1,0 +1,202 @@
+"""What a home teaches a model: its marks, and what was right before and is to stay so."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.recorder_info import read_recorder_info
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.training.confirmed import (
+    Candidates,
+    chosen,
+    confirmed_segments,
+    silent_segments,
+)
+from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
+from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
+from hearthlog.analyzer.training.marked_sound import (
+    HomeSound,
+    read_reviewed_sound,
+    read_sound_of,
+)
+from hearthlog.analyzer.training.scenario import Scenario, scenario_of
+from hearthlog.analyzer.training.train import base_classes
+from hearthlog.models.classes import SILENCE, class_name, meant_by
+from hearthlog.models.classifiers.description import MOST_CLASSES
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.installed import feature_set
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.times import NANOSECONDS
+
+_RECENT = 14 * 86_400 * NANOSECONDS
+_SILENT_LOGS = 4  # that are read for silence
+_SILENT_PART = 900 * NANOSECONDS  # of each
+_FEWEST_SILENT = 20  # segments
+_FEWEST_DAYS = 2  # of a new class
+_FEWEST_SECONDS = 10.0
+_NO_SILENCE = (
+    "nowhere in the logs is it silent, as the model to be adapted hears it: by marks of other "
+    "sounds alone it would forget silence; mark some seconds in which nothing sounds as silence"
+)
+_NOT_LOOKED_AT = (
+    "no time of this home was looked at: only silence is kept as it is; what a review leaves "
+    "alone, such as `hearthlog review --queue`, keeps the other classes"
+)
+
+
+class Lessons(NamedTuple):
+    """What a home teaches.
+
+    Attributes
+    ----------
+    segments : Dataset
+        Of the classes of the model that was adapted first, and new ones behind them; none if there
+        is nothing to learn from marks.
+    notes : list of str
+        What could not be used, and what a reviewer could do.
+    nothing : str
+        Why there is nothing to learn from marks; empty if there is.
+    """
+
+    segments: Dataset
+    notes: list[str]
+    nothing: str
+
+
+def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
+    """Read what marks teach a model, and what it is to keep.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Folders of logs, with review layers beside them, and of enrolled sounds.
+    model : Model
+        Which is to be adapted.
+
+    Raises
+    ------
+    LogError
+        If there is no log, or if a log or a layer is damaged.
+    DataError
+        If there are marks, and all of them are in logs of other feature sets, or if there is no
+        silence to keep the model from forgetting it.
+    """
+    features = feature_set(model.description.feature_set)
+    marked: list[Recording] = []
+    found: list[Candidates] = []
+    counts = _Counts()
+    for folder in folders:
+        sounds = list(_counted(read_reviewed_sound(folder, features), counts))
+        marked += marked_recordings(sounds, folder, features, model.description.gate)
+        found += [confirmed_segments(sound, model.classes) for sound in sounds]
+    scenario, notes, unlearned = _with_new_classes(marked, model, features)
+    marked = [one for one in marked if one.label not in unlearned]
+    notes += counts.notes()
+    in_room = [one for one in marked if one.floor is not None]
+    kept: list[Recording] = []
+    if marked:
+        kept = chosen(found, model)
+        if in_room and SILENCE in model.classes and _silent(kept) < _FEWEST_SILENT:
+            kept = chosen([*found, *_silence_anywhere(folders, model)], model)
+            if not _silent([*kept, *in_room]):
+                raise DataError(_NO_SILENCE)
+        if in_room and not counts.looked_at:
+            notes.append(_NOT_LOOKED_AT)
+    segments = cut_recordings([*marked, *kept], scenario, features)
+    if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
+        segments = cut_recordings([], scenario, features)
+    nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
+    return Lessons(segments, notes, "" if len(segments) else nothing)
+
+
+class _Counts:
+    """What was seen of a home."""
+
+    def __init__(self) -> None:
+        self.marks = 0
+        self.left_out = 0  # as they teach nothing
+        self.looked_at = False
+
+    def notes(self) -> list[str]:
+        """Say what of the marks is not learned from."""
+        notes = []
+        if self.left_out:
+            notes.append(
+                f"{self.left_out} of {self.marks} marks are not learned from: they say `unknown`, "
+                "or lie in time that was drawn at random to measure how right the labels are"
+            )
+        return notes
+
+
+def _counted(sounds: Iterable[HomeSound], counts: _Counts) -> Iterator[HomeSound]:
+    """Leave out the marks that teach nothing, and count them."""
+    for sound in sounds:
+        taught = teaching(sound)
+        counts.marks += len(sound.marks)
+        counts.left_out += len(sound.marks) - len(taught.marks)
+        counts.looked_at |= any(span.chosen != RANDOM for span in sound.reviewed)
+        yield taught
+
+
+def _with_new_classes(
+    marked: Sequence[Recording], model: Model, features: FeatureSet
+) -> tuple[Scenario, list[str], set[str]]:
+    """Return a scenario with the classes of which marks tell enough.
+
+    Then what lacks of other classes, and the labels of those.
+    """
+    known = scenario_of(model)
+    names = base_classes(model)
+    known = Scenario(known.name, {name: known.classes[name] for name in names})
+    listed = {*known.classes, *known.class_of}
+    others = [one for one in marked if not meant_by(one.label, listed)]
+    labels: dict[str, set[str]] = {}
+    for one in others:
+        labels.setdefault(class_name(one.label), set()).add(one.label)
+    every = {name: tuple(sorted(same)) for name, same in sorted(labels.items())}
+    amounts = cut_recordings(others, Scenario(known.name, every), features).amounts if every else {}
+    notes: list[str] = []
+    learned: dict[str, tuple[str, ...]] = {}
+    for name, amount in amounts.items():
+        seconds = max(_FEWEST_SECONDS - amount.seconds, 0.0)
+        room = len(names) + len(learned) < MOST_CLASSES
+        if room and not seconds and amount.sources >= _FEWEST_DAYS:
+            learned[name] = every[name]
+            continue
+        count = sum(class_name(one.label) == name for one in others)
+        more = [f"{seconds:.0f} more seconds"] if seconds else []
+        more += ["on another day"] if amount.sources < _FEWEST_DAYS else []
+        what = "the model has no room for it"
+        if room:
+            what = f"{', '.join(more)}, and it can be learned"
+        notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")
+    unlearned = {label for name in every.keys() - learned.keys() for label in every[name]}
+    return Scenario(known.name, {**known.classes, **learned}), notes, unlearned
+
+
+def _silent(recordings: Iterable[Recording]) -> int:
+    return sum(class_name(one.label) == SILENCE for one in recordings)
+
+
+def _silence_anywhere(folders: Sequence[Path], model: Model) -> Iterator[Candidates]:
+    """Cut silence out of some logs of the last two weeks."""
+    features = feature_set(model.description.feature_set)
+    entries = find_home_logs(folders).between(0, 1 << 62)
+    newest = max((entry.start for entry in entries), default=0)
+    recent = [entry.path for entry in entries if newest - entry.start <= _RECENT]
+    for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
+        log = recent[int(place)]
+        with suppress(LogError):  # why it cannot be read is said when it is labelled
+            info = read_recorder_info(log, "features")
+            if info is None or info.first_frame is None:
+                continue
+            begin = info.first_frame[1]
+            part, names = (begin, begin + _SILENT_PART), {info.microphone}
+            for sound in read_sound_of(log, features, names, part):
+                yield silent_segments(sound, model.classes)

@@ -1,0 +1,206 @@
+"""A home teaches by its marks and by what a review left alone, not by what was drawn at random."""
+
+import json
+
+import numpy as np
+import pytest
+from spliced import run
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.training.confirmed import confirmed_segments, silent_segments
+from hearthlog.analyzer.training.dataset import CONFIRMED
+from hearthlog.analyzer.training.home_data import HOME, MOST_OF_MARK, lesson_recordings
+from hearthlog.analyzer.training.home_lessons import home_lessons
+from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.train import adapt_model
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
+
+SECOND = 10**9
+
+
+@pytest.fixture
+def home(day, tmp_path, model_file, capfd):
+    """A folder with a log of some minutes, labelled by a model."""
+    logs = tmp_path / "logs"
+    done = run(capfd, "record", day, "-o", logs, "--model", model_file, "--start", "2026-03-01T07")
+    assert done.returncode == 0, done.stderr
+    return logs
+
+
+def logs_in(folder):
+    return [log for log in find_logs(folder) if not is_layer(log)]
+
+
+def segments(logs):
+    """Start, end and label of what the recorder labelled, longest first."""
+    found = read_columns(logs_in(logs)[:1], ["/mic/segment"])["/mic/segment"]
+    starts, lengths = found["header.stamp"], found["duration"]
+    each = zip(starts.tolist(), (starts + lengths).tolist(), found["label"].tolist(), strict=True)
+    return sorted(each, key=lambda one: one[0] - one[1])
+
+
+def write(logs, marks=(), reviewed=()):
+    (log,) = logs_in(logs)
+    write_marks(log, [Mark("mic", *each) for each in marks], reviewed=reviewed)
+
+
+def whole(logs, **changed):
+    begin, end = min(one[0] for one in segments(logs)), max(one[1] for one in segments(logs))
+    return ReviewedSpan("mic", begin, end)._replace(**changed)
+
+
+def sound(logs):
+    (found,) = read_reviewed_sound(logs, DEFAULT)
+    return found
+
+
+def test_what_a_review_left_alone_is_to_stay_as_it_was_labelled(home, model_file):
+    model = load_model(model_file)
+    marked = next(one for one in segments(home) if one[2] != "silence")
+    write(home, [marked], [whole(home)])
+    found = confirmed_segments(sound(home), model.classes)
+    assert len({one.label for one in found.recordings}) > 2
+    for one in found.recordings:
+        begin, end = one.span
+        middle = (begin + end) // 2
+        (label,) = {said for a, b, said in segments(home) if a <= middle < b}
+        assert one.label == label
+        assert end + SECOND // 2 <= marked[0] or begin - SECOND // 2 >= marked[1]
+
+
+def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home, model_file):
+    model = load_model(model_file)
+    longest = next(one for one in segments(home) if one[2] != "silence")
+    drawn = ReviewedSpan("mic", longest[0] - SECOND, longest[1] + SECOND, chosen=RANDOM)
+    write(home, [longest], [drawn, whole(home)])
+    assert not list(lesson_recordings(home))
+    for find in (confirmed_segments, silent_segments):
+        spans = [one.span for one in find(sound(home), model.classes).recordings]
+        assert spans
+        assert all(end <= drawn.start or start >= drawn.end for start, end in spans)
+    lessons = home_lessons([home], model)
+    assert not len(lessons.segments)
+    assert lessons.nothing == "none of the marks can be learned from"
+    assert "1 of 1 marks are not learned from" in lessons.notes[0]
+
+
+def test_time_without_a_review_teaches_nothing_but_silence(home, model_file):
+    model = load_model(model_file)
+    write(home, [next(one for one in segments(home) if one[2] != "silence")])
+    segments_, notes, nothing = home_lessons([home], model)
+    assert not nothing
+    assert any(note.startswith("no time of this home was looked at") for note in notes)
+    kept = segments_.collection == segments_.collection_names.index(CONFIRMED)
+    assert {segments_.classes[number] for number in segments_.target[kept]} == {"silence"}
+    assert not kept.all()
+
+
+def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(home, model_file):
+    one, other = [each for each in segments(home) if each[2] != "silence"][:2]
+    write(home, [(*one[:2], "unknown"), other], [whole(home)])
+    assert [each.label for each in lesson_recordings(home)] == [other[2]]
+    found = confirmed_segments(sound(home), load_model(model_file).classes)
+    assert all(b <= one[0] or a >= one[1] for a, b in (each.span for each in found.recordings))
+
+
+def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
+    begin = min(one[0] for one in segments(home))
+    write(home, [(begin + 10 * SECOND, begin + 70 * SECOND, "speech")], [whole(home)])
+    segments_ = home_lessons([home], load_model(model_file)).segments
+    marked = segments_.collection == segments_.collection_names.index(HOME)
+    assert 0 < marked.sum() <= MOST_OF_MARK
+
+
+def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(
+    home, model_file, monkeypatch
+):
+    model = load_model(model_file)
+    quiet = next(one for one in segments(home) if one[2] == "silence")
+    loud = next(one for one in segments(home) if one[2] != "silence")
+    nowhere = "hearthlog.analyzer.training.home_lessons._silence_anywhere"
+    monkeypatch.setattr(nowhere, lambda *_: [])
+    write(home, [loud])
+    with pytest.raises(DataError, match="mark some seconds in which nothing sounds as silence"):
+        home_lessons([home], model)
+    (log,) = logs_in(home)
+    write_marks(log, [Mark("mic", *quiet)])
+    assert len(home_lessons([home], model).segments)
+
+
+def test_a_model_says_from_which_time_of_the_home_it_has_learned(home, model_file):
+    model = load_model(model_file)
+    write(home, [next(one for one in segments(home) if one[2] != "silence")], [whole(home)])
+    lessons = home_lessons([home], model)
+    training = adapt_model(model, lessons.segments).description.training_data
+    spans = np.array(training.home_spans)
+    for begin, end in lessons.segments.spans:
+        assert ((spans[:, 0] <= begin) & (end <= spans[:, 1])).any()
+    confirmed = lessons.segments.collection_names.index(CONFIRMED)
+    count = int((lessons.segments.collection == confirmed).sum())
+    assert sum(training.home_confirmed.values()) == count > 0
+
+
+@pytest.fixture
+def two_days(home, day, model_file, capfd):
+    """The same minutes on two days."""
+    done = run(capfd, "record", day, "-o", home, "--model", model_file, "--start", "2026-03-02T07")
+    assert done.returncode == 0, done.stderr
+    return home
+
+
+def kettle(logs, seconds):
+    """Mark so many seconds of the loudest sound of each log as a kettle."""
+    for log, length in zip(logs_in(logs), seconds, strict=True):
+        (found,) = read_columns([log], ["/mic/segment"]).values()
+        sounds = np.flatnonzero(found["label"] != "silence")
+        longest = sounds[found["duration"][sounds].argmax()]
+        begin = int(found["header.stamp"][longest])
+        if length:
+            write_marks(log, [Mark("mic", begin, begin + length * SECOND, "kettle")])
+
+
+def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its_marks(
+    two_days, model_file, tmp_path
+):
+    base = load_model(model_file)
+    kettle(two_days, (5, 5))
+    lessons = home_lessons([two_days], base)
+    assert lessons.segments.classes == (*base.classes, "kettle")
+    save_model(adapt_model(base, lessons.segments), tmp_path / "home.safetensors")
+    adapted = load_model(tmp_path / "home.safetensors")
+    assert adapted.classes[-1] == "kettle"
+    again = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    assert again.classes == adapted.classes
+    logs = logs_in(two_days)
+    for log in logs:
+        review_path(log).unlink()
+    write_marks(logs[0], [Mark("mic", *segments(two_days)[5])])
+    without = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    assert without.classes == base.classes
+    save_model(without, tmp_path / "without.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        ((5, 0), "1 mark of kettle: 5 more seconds, on another day, and it can be learned"),
+        ((3, 3), "2 marks of kettle: 4 more seconds, and it can be learned"),
+        ((12, 0), "1 mark of kettle: on another day, and it can be learned"),
+    ],
+)
+def test_what_lacks_of_a_new_class_is_said_before_learning(
+    two_days, model_file, capfd, seconds, said
+):
+    kettle(two_days, seconds)
+    output = two_days / "x.safetensors"
+    done = run(capfd, "train", "--base", model_file, "--home", two_days, "-o", output, "--json")
+    lines = done.stderr.splitlines()
+    assert lines[0] == f"hearthlog: {said}"
+    assert "none of the marks can be learned from" in done.stderr
+    assert "nothing is marked" not in done.stderr
+    if done.returncode == 0:
+        assert json.loads(done.stdout)["classes"] == list(load_model(model_file).classes)
