@@ -20,6 +20,7 @@ from hearthlog.analyzer.evaluation.event_scores import Events
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.spans import NONE
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans, other_labels
 from hearthlog.analyzer.review.queue.ranking import make_queue
@@ -340,7 +341,7 @@ def test_what_the_model_is_unsure_of_or_finds_new_comes_first(logs, uncertain, r
     write_layer(log, log, "odd", change=doubtful(start, end, own, uncertain=uncertain))
     sources = find_labellings(log)
     found = sources.read("mic", "relabel/odd")
-    queue = make_queue(sources, "mic", found, other=None, marks=None, count=5)
+    queue = make_queue(sources, "mic", found, other=None, reviewed=NONE, count=5)
     assert start <= queue.spans.starts[0] < queue.spans.ends[0] <= end
     assert REASONS[int(np.argmax(queue.weighted[:, 0]))] == reason
     assert queue.scores[0] == pytest.approx(1.0 if uncertain else 0.5)
@@ -385,7 +386,7 @@ def write_home(path, rows, probabilities):
 def queue_of(log, count):
     sources = find_labellings(log)
     live = sources.read("mic", "live")
-    return make_queue(sources, "mic", live, other=None, marks=None, count=count)
+    return make_queue(sources, "mic", live, other=None, reviewed=NONE, count=count)
 
 
 def test_another_name_for_a_class_is_no_reason_to_review_it(tmp_path):
@@ -398,7 +399,7 @@ def test_another_name_for_a_class_is_no_reason_to_review_it(tmp_path):
     other = side("relabel/two", said, ("cough", "laughter"))
     live = sources.read("mic", "live")
     queue = make_queue(
-        sources, "mic", live, other=other, marks=None, count=9, ranking="disagreeing"
+        sources, "mic", live, other=other, reviewed=NONE, count=9, ranking="disagreeing"
     )
     assert list(zip(queue.labels, queue.others, strict=True)) == [("speech", "laughter")]
 
@@ -425,7 +426,7 @@ def test_what_is_mostly_silence_is_not_uncertain(tmp_path):
     rows = [(0, 10, "speech"), (10, 20, "silence"), (20, 24, "speech"), (24, 28, "silence")]
     sources = find_labellings(write_home(tmp_path / "home.mcap", rows, probabilities))
     live = sources.read("mic", "live")
-    options = {"other": None, "marks": None, "count": 9, "ranking": "uncertain"}
+    options = {"other": None, "reviewed": NONE, "count": 9, "ranking": "uncertain"}
     queue = make_queue(sources, "mic", live, **options)
     assert sorted(queue.labels) == ["silence", "speech"]
     assert ((queue.spans.starts - MIDNIGHT) / NANOSECONDS).min() == 20.0

@@ -72,9 +72,9 @@ def test_a_person_marks_what_is_true_and_leaves_what_is_right(home):
 
 def test_a_person_stops_when_the_time_is_over_and_does_not_see_an_item_twice(home):
     logs, truth = home
-    first = Person(truth).review(logs, 1, SUNDAY)
-    assert 40 < first.seconds <= 60
-    second = Person(truth).review(logs, 1, SUNDAY)
+    first = Person(truth).review(logs, 4, SUNDAY)
+    assert 180 < first.seconds <= 240
+    second = Person(truth).review(logs, 4, SUNDAY)
     assert not {*first.marks} & {*second.marks}
 
 

@@ -26,7 +26,7 @@ from viewers import Window, browsing, display, free_port, patiently, reviewing, 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.queue.review_list import write_list
 from hearthlog.analyzer.review.session.marking import Marking
@@ -316,7 +316,7 @@ def test_a_key_names_the_span_that_is_marked_with_the_mouse(home):
     assert [(m.start, m.end, m.label) for m in layers(home)] == [(*span, "speech")]
     assert sitting.screen.lane == [(*span, "speech")]
     assert "speech" in sitting.said[1]
-    assert sitting.said[-1].startswith("1 span marked in")
+    assert sitting.said[-1].startswith("1 span reviewed in")
 
 
 def test_correct_is_what_the_recorder_said_in_the_span(home):
@@ -458,6 +458,70 @@ def test_in_a_queue_the_span_that_is_dragged_counts(home):
     assert [(m.start, m.end) for m in layers(home)] == [(START + SECOND, START + 2 * SECOND)]
 
 
+def minute_of(start):
+    return ReviewItem(start, start + 60 * SECOND, "speech", "a minute", RANDOM)
+
+
+def reviewed(folder):
+    """All spans that were looked at, as review layers say."""
+    return [s for log in find_logs(folder) if not is_layer(log) for s in read_reviewed(log)]
+
+
+def test_in_a_minute_one_marks_what_is_wrong_and_the_rest_is_right(home):
+    minute, wrong = START + 30 * SECOND, (START + 40 * SECOND, START + 42 * SECOND)
+    sitting = Sitting(home, [minute_of(minute), *items_of(1)])
+    sitting.run("")
+    sitting.screen.marked = wrong
+    sitting.session.press("2")
+    assert sitting.screen.shown[-1][0] == minute
+    assert reviewed(home) == []
+    sitting.session.press("\n")
+    assert sitting.screen.shown[-1][0] == START
+    assert [(m.start, m.end, m.label) for m in layers(home)] == [(*wrong, "speech")]
+    (looked,) = reviewed(home)
+    assert (looked.start, looked.end, looked.chosen) == (minute, minute + 60 * SECOND, "random")
+    assert (looked.reviewer, looked.corrects) == ("Ann", "live")
+    sitting.session.press("z")
+    assert (reviewed(home), len(layers(home))) == ([], 1)
+    sitting.session.press("z")
+    assert layers(home) == []
+
+
+def test_what_is_skipped_is_not_reviewed_and_what_is_judged_is(home):
+    items = items_of(4)
+    sitting = Sitting(home, [minute_of(START + 90 * SECOND), *items])
+    assert sitting.run("nn2a.") == 3
+    assert [(s.start, s.end, s.chosen) for s in reviewed(home)] == [
+        (*item[:2], "queue") for item in items[1:]
+    ]
+    assert [m.label for m in layers(home)] == ["speech", "music"]
+
+
+def test_a_span_that_a_person_looked_at_by_her_own_choice_says_so(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = span = (START + 10 * SECOND, START + 20 * SECOND)
+    assert sitting.run(".") == 1
+    (looked,) = reviewed(home)
+    assert (looked.start, looked.end, looked.chosen) == (*span, "person")
+    assert layers(home) == []
+
+
+def test_where_marks_are_deleted_nothing_counts_as_reviewed_and_undone_it_does(home):
+    marking = marking_of(home)
+    at = START + 35 * SECOND
+    marking.review(at, at + 20 * SECOND, "queue")
+    marking.review(at, at + 20 * SECOND, RANDOM)
+    marking.mark(at + SECOND, at + 3 * SECOND, "speech")
+    before = reviewed(home)
+    marking.delete(at, at + 5 * SECOND)
+    assert [(s.start, s.end, s.chosen) for s in reviewed(home)] == [
+        (at + 5 * SECOND, at + 20 * SECOND, "queue")
+    ]
+    marking.undo()
+    assert reviewed(home) == before
+    assert [mark.label for mark in layers(home)] == ["speech"]
+
+
 def test_a_session_ends_when_the_viewer_is_closed(home):
     sitting = Sitting(home, items_of(2))
     sitting.screen.open = False
@@ -492,7 +556,7 @@ def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
 # What is in the queue
 
 
-@pytest.mark.parametrize("ranking", ["uncertain", "novel", "disagreeing", "random"])
+@pytest.mark.parametrize("ranking", ["useful", "uncertain", "novel", "disagreeing"])
 def test_a_queue_has_spans_of_the_labelling_that_do_not_overlap(recorded_home, timeline, ranking):
     sources = find_labellings(recorded_home)
     found = queue_items(ranking, sources, ("mic", "live"), (None, None), 8)
@@ -562,15 +626,17 @@ def no_display(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_display")
-@pytest.mark.parametrize("words", [("--queue",), ("--queue", "uncertain", "--spans", "10")])
-def test_without_a_display_a_queue_is_a_label_file_to_correct(home, tmp_path, capfd, words):
+@pytest.mark.parametrize(
+    ("words", "count"), [(("--queue",), None), (("--queue", "useful", "--spans", "9"), 9)]
+)
+def test_without_a_display_a_queue_is_a_label_file_to_correct(home, tmp_path, capfd, words, count):
     path = tmp_path / "ten.txt"
     done = run(capfd, "review", home, *words, "--save", path)
     assert done.returncode == 0, done.stderr
     assert done.stderr.endswith(f"as marks: hearthlog annotate import {home} {path}\n")
-    items = queue_items("uncertain", find_labellings(home), ("mic", "live"), (None, None), None)
+    items = queue_items("useful", find_labellings(home), ("mic", "live"), (None, None), count)
     lines = path.read_text().splitlines()
-    assert len(lines) == len(done.stdout.splitlines()) - 1 == len(items) > 3
+    assert len(lines) == len(done.stdout.splitlines()) - 1 >= len(items) > 3
     path.write_text("".join(f"{line.rpartition(chr(9))[0]}\tyelling\n" for line in lines))
     assert run(capfd, "annotate", "import", home, path).returncode == 0
     marks = layers(home)  # one that reaches into the next log is two
@@ -579,7 +645,7 @@ def test_without_a_display_a_queue_is_a_label_file_to_correct(home, tmp_path, ca
 
 
 @pytest.mark.usefixtures("no_display")
-def test_a_queue_without_a_value_is_one_of_uncertain_spans(home, capfd):
+def test_a_queue_without_a_value_is_one_of_useful_spans(home, capfd):
     for words in (("--queue", home), (home, "--queue"), (home, "--queue", "--spans", "3")):
         done = run(capfd, "review", *words)
         assert (done.returncode, "no display" in done.stderr) == (1, True)
@@ -619,7 +685,7 @@ def test_a_port_that_is_in_use_is_said(recorded_home, capfd):
         (["--save", "none/a.rrd"], (1, "there is no folder")),
         (["--web", "--microphone", "cellar"], (2, "--microphone cellar: there is mic")),
         (["--web", "--labels", "nobody"], (1, "no labelling 'nobody'")),
-        (["--web", "--queue", "boring"], (1, "use uncertain, disagreeing, novel, random")),
+        (["--web", "--queue", "boring"], (1, "use useful, uncertain, disagreeing, novel, random")),
         (["--web", "--queue", "none.csv"], (1, "none.csv")),
         (["--web", "--reviewer", "a\nb"], (2, "")),
     ],
@@ -714,7 +780,7 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         review.press("3")
         assert one_mark(home)[1:4] == (*selected, "music")
         assert review.quit() == 0
-    assert review.lines[-1].startswith("1 span marked in")
+    assert review.lines[-1].startswith("1 span reviewed in")
 
 
 def shows_ruler(picture):
@@ -759,7 +825,7 @@ def test_a_review_that_is_ended_ends_its_viewer(home, number):
 
 
 def test_marks_of_a_review_that_is_killed_are_in_the_layer(home, display):
-    options = ("--port", free_port(), "--queue", "random", "--spans", "6")
+    options = ("--port", free_port(), "--queue", "uncertain", "--spans", "6")
     with reviewing(home, *options, DISPLAY=display) as review:
         review.wait_for("1/6")
         for number in (2, 3, 4):

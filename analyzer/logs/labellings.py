@@ -25,7 +25,6 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
     RELABEL,
-    REVIEW,
     TopicName,
     labelling_topic,
     parse_topic,
@@ -190,30 +189,6 @@ class Labellings:
         classes = all_classes(topic, named, labelling.labels)
         check_labelling(topic, labelling.starts, classes)
         return NamedLabelling(name, classes, labelling)
-
-    def marks(self, microphone: str, start: int | None, end: int | None) -> Labelling | None:
-        """Read the marks of a reviewer in a span of time.
-
-        Parameters
-        ----------
-        microphone : str
-            Its name.
-        start, end : int or None
-            Nanoseconds of UTC: what is before `start` and after `end` is cut off; None for no
-            limit.
-
-        Returns
-        -------
-        Labelling or None
-            None if there is no mark. What cannot be read is missing; `losses` then say so.
-
-        Raises
-        ------
-        LogError
-            If marks overlap.
-        """
-        topic = labelling_topic(microphone, REVIEW, "segment")
-        return self._labelling(topic, start, end, ignore_progress)
 
     def with_topic(
         self, topic: str, start: int | None = None, end: int | None = None

@@ -15,7 +15,7 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.marks.marks import Mark
+    from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 
 annotate = typer.Typer(
     no_args_is_help=True,
@@ -36,29 +36,49 @@ def import_labels(
 ) -> None:
     """Add the labels of a file as marks to review layers, one beside each log.
 
-    Where they overlap older marks, they win; labels that stand there already change nothing.
+    Where they overlap older marks, they win; labels that stand there already change nothing. If
+    `hearthlog review --queue --save` made the file, spans that still have a label were looked at.
     """
     from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.marks.formats.label_files import read_labels
-    from hearthlog.analyzer.marks.marks import read_marks, write_marks
+    from hearthlog.analyzer.marks.marks import RANDOM, read_marks, read_reviewed, write_marks
     from hearthlog.analyzer.marks.merge_marks import new_marks
+    from hearthlog.analyzer.review.queue.asked import asked_path, looked_at
+    from hearthlog.analyzer.review.queue.review_list import read_list
 
     _check_suffix(labels)
     name, now = reviewer_name(reviewer), time.time_ns()
-    by_log = read_labels(labels, find_coverage(log), microphone)
+    coverage = find_coverage(log)
+    by_log = read_labels(labels, coverage, microphone)
+    asked = asked_path(labels)
+    spans = read_list(asked) if asked.exists() else []
+    said = [mark for marks in by_log.values() for mark in marks]
+    looked = looked_at(spans, said, coverage, name, now)
     taken: list[Mark] = []
-    for path, marks in sorted(by_log.items()):
+    seen: list[ReviewedSpan] = []
+    for path in sorted(by_log.keys() | looked.keys()):
         new = [
             mark._replace(reviewer=mark.reviewer or name, made=mark.made or now)
-            for mark in new_marks(marks, read_marks(path))
+            for mark in new_marks(by_log.get(path, []), read_marks(path))
         ]
-        if new:
-            print(write_marks(path, new))
+        known = {span._replace(reviewer="", made=0) for span in read_reviewed(path)}
+        reviewed = [
+            span for span in looked.get(path, []) if span._replace(reviewer="", made=0) not in known
+        ]
+        if new or reviewed:
+            print(write_marks(path, new, reviewed=reviewed))
         taken += new
+        seen += reviewed
     _print_amounts(taken)
     existing = sum(map(len, by_log.values())) - len(taken)
     if existing:
         tell(f"{number(existing, 'mark')} stood there already")
+    if asked.exists():
+        minutes = sum(span.chosen == RANDOM for span in seen)
+        tell(
+            f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
+            f"{number(minutes, 'minute')} drawn at random"
+        )
 
 
 @annotate.command("export")

@@ -65,7 +65,7 @@ def diff(
     with share_done("reading segments") as progress:
         sides = [sources.read(name, each, *limits, progress) for each in chosen]
     if queue:
-        result = _queue(sources, name, sides, limits, spans or _QUEUED)
+        result = _queue(sources, name, sides, spans or _QUEUED)
     else:
         result = _difference(name, sides, spans or _SHOWN)
     if output is not None:
@@ -102,11 +102,11 @@ def _queue(
     sources: "Labellings",
     microphone: str,
     sides: "list[NamedLabelling]",
-    limits: tuple[int | None, int | None],
     count: int,
 ) -> _Result:
     from hearthlog.analyzer.review.queue.ranking import make_queue
     from hearthlog.analyzer.review.queue.review_list import queued
+    from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
     from hearthlog.schemas.messages.topics import REVIEW
 
     names = [side.name for side in sides]
@@ -118,7 +118,7 @@ def _queue(
             microphone,
             sides[0],
             other=sides[1] if len(sides) > 1 else None,
-            marks=sources.marks(microphone, *limits),
+            reviewed=reviewed_time(sources, microphone).spans,
             count=count,
             progress=progress,
         )

@@ -15,7 +15,15 @@ from hearthlog.schemas.text import printable
 from hearthlog.schemas.times import NANOSECONDS, time_text
 from hearthlog.tools.cli.browser import print_recording, show_page
 from hearthlog.tools.cli.keys import read_keys
-from hearthlog.tools.cli.options import End, Microphone, Start, Timezone, parse_span, reviewer_name
+from hearthlog.tools.cli.options import (
+    End,
+    Microphone,
+    Start,
+    Timezone,
+    models_folder,
+    parse_span,
+    reviewer_name,
+)
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
@@ -51,8 +59,9 @@ def review(
     queue: Annotated[
         str | None,
         typer.Option(
-            help="Go through spans that are uncertain (as without a value), novel, disagreeing or "
-            "random, or through a list of `hearthlog diff --list`."
+            help="Go through spans that are useful to learn from and minutes drawn at random (as "
+            "without a value), or uncertain, novel, disagreeing or random ones, or a list of "
+            "`hearthlog diff --list`."
         ),
     ] = None,
     spans: Annotated[
@@ -116,13 +125,13 @@ class ReviewCommand(TyperCommand):
         ctx : typer.Context
         args : list of str
         """
-        from hearthlog.analyzer.review.queue.ranking import UNCERTAIN
+        from hearthlog.analyzer.review.queue.ranking import USEFUL
 
         if _QUEUE in args:
             following = args.index(_QUEUE) + 1
             value = args[following] if following < len(args) else "-"
             if value.startswith("-") or Path(value).is_dir() or value.endswith(".mcap"):
-                args = [*args[:following], UNCERTAIN, *args[following:]]
+                args = [*args[:following], USEFUL, *args[following:]]
         return super().parse_args(ctx, args)
 
 
@@ -218,6 +227,7 @@ def _work(
 ) -> "tuple[list[ReviewItem], Marking]":
     """Find what is to be gone through, and what is corrected."""
     from hearthlog.analyzer.logs.labellings import find_labellings
+    from hearthlog.analyzer.review.queue.asked import corrected_name
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.queue_items import queue_items
     from hearthlog.analyzer.review.timeline.model import no_spans
@@ -229,14 +239,22 @@ def _work(
         sources = find_labellings(*logs)
         labelling = sources.find(microphone, choice.labels)
         if choice.queue is not None:
-            items = queue_items(
-                choice.queue, sources, (microphone, labelling), choice.limits, choice.spans
-            )
+            with share_done("choosing spans") as progress:
+                items = queue_items(
+                    choice.queue,
+                    sources,
+                    (microphone, labelling),
+                    choice.limits,
+                    choice.spans,
+                    models_folder(),
+                    progress,
+                )
+            _tell_fewer(len(items), choice)
     marking = Marking(
         microphone,
         timeline.coverage[microphone],
         choice.reviewer,
-        labelling.removeprefix("relabel/"),
+        corrected_name(labelling),
         segments.get(labelling, no_spans()),
     )
     return items, marking
@@ -247,20 +265,35 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
     from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.logs.labellings import find_labellings
     from hearthlog.analyzer.marks.formats.label_files import write_labels
-    from hearthlog.analyzer.marks.marks import Mark
-    from hearthlog.analyzer.review.session.queue_items import queue_items
+    from hearthlog.analyzer.review.queue.asked import asked_path, labels_of
+    from hearthlog.analyzer.review.queue.review_list import write_list
+    from hearthlog.analyzer.review.session.queue_items import queue_spans
+    from hearthlog.schemas.storage.new_files import check_new
 
     if find_format(path) is None:
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")
     if len(logs) > 1:
         wrong_use("--save --queue: name one log or folder, as `hearthlog annotate import` takes it")
+    asked = asked_path(path)
+    check_new(asked)
     sources = find_labellings(*logs)
     microphone = sources.microphone(choice.microphone)
     labelling = sources.find(microphone, choice.labels)
     assert choice.queue is not None
-    items = queue_items(choice.queue, sources, (microphone, labelling), choice.limits, choice.spans)
-    marks = sorted(Mark(microphone, item.start, item.end, item.label) for item in items)
+    with share_done("choosing spans") as progress:
+        spans = queue_spans(
+            choice.queue,
+            sources,
+            (microphone, labelling),
+            choice.limits,
+            choice.spans,
+            models_folder(),
+            progress,
+        )
+    segments = sources.read(microphone, labelling, *choice.limits).labelling
+    marks = sorted(mark for span in spans for mark in labels_of(span, segments))
     write_labels(path, marks, find_coverage(logs[0]))
+    write_list(asked, spans)
     print_table(
         ("from (UTC)", "seconds", "label"),
         [
@@ -268,11 +301,17 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
             for one in marks
         ],
     )
+    _tell_fewer(len(spans), choice)
     tell(
         f"{path}: correct the labels, delete the lines that you cannot judge, and take the rest as "
         f"marks: hearthlog annotate import {logs[0]} {path}"
     )
     end_with_warnings(sources.losses)
+
+
+def _tell_fewer(count: int, choice: _Choice) -> None:
+    if choice.spans is not None and count < choice.spans:
+        tell(f"{count} of the {choice.spans} that were asked for: no more is left to review")
 
 
 def _microphone(timeline: "Timeline", name: str | None) -> str:

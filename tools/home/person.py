@@ -1,5 +1,7 @@
 """A simulated person, who reviews what a home recorded and knows what is true of it."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +11,12 @@ from hearthlog.analyzer.logs.coverage import Coverage, find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
-from hearthlog.analyzer.marks.marks import QUEUE, Mark, ReviewedSpan, write_marks
-from hearthlog.analyzer.review.queue.ranking import UNCERTAIN
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.review.queue.ranking import USEFUL
 from hearthlog.analyzer.review.session.queue_items import queue_items
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
@@ -60,12 +63,15 @@ class Person:
         of the alphabet.
     seed : int
         Not negative; it draws those.
+    models : Path
+        Folder of models, in which the one of the labels is looked for.
     """
 
     truth: Labelling
     name: str = "Ann"
     wrong: float = 0.0
     seed: int = 0
+    models: Path = DEFAULT_FOLDER
 
     def review(
         self,
@@ -73,7 +79,7 @@ class Person:
         minutes: float,
         made: int,
         limits: tuple[int | None, int | None] = (None, None),
-        queue: str = UNCERTAIN,
+        queue: str = USEFUL,
     ) -> Review:
         """Go through the queue of a labelling of logs, and write marks beside them.
 
@@ -101,19 +107,40 @@ class Person:
             If logs or layers cannot be read, or marks cannot be written.
         """
         sources = find_labellings(logs)
+        labelled = sources.microphone(None), LIVE
+        items = queue_items(queue, sources, labelled, limits, _MOST_ITEMS, self.models)
+        return self.go_through(items, logs, made, minutes)
+
+    def go_through(
+        self, items: Iterable[ReviewItem], logs: Path, made: int, minutes: float = math.inf
+    ) -> Review:
+        """Go through some items in their order, as `review` does.
+
+        Parameters
+        ----------
+        items : iterable of ReviewItem
+        logs, made, minutes
+            As of `review`.
+
+        Raises
+        ------
+        LogError
+            If logs or layers cannot be read, or marks cannot be written.
+        """
+        sources = find_labellings(logs)
         microphone = sources.microphone(None)
-        said = sources.read(microphone, LIVE, *limits)
+        said = sources.read(microphone, LIVE)
         coverage = find_coverage(logs)[microphone]
         rng = generator(self.seed, made % (1 << 32))
         done = Review([], [], 0.0)
-        for item in queue_items(queue, sources, (microphone, LIVE), limits, _MOST_ITEMS):
+        for item in items:
             labels = self._corrections(item, said, rng)
             seconds = done.seconds + _seconds(item, len(labels))
             if seconds > 60.0 * minutes:
                 break
             about = (self.name, made, LIVE)
             marks = [Mark(microphone, *label, *about) for label in labels]
-            looked_at = ReviewedSpan(microphone, item.start, item.end, *about, QUEUE)
+            looked_at = ReviewedSpan(microphone, item.start, item.end, *about, item.chosen)
             _write(coverage, marks, looked_at)
             done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
         return done

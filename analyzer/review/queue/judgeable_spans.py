@@ -88,17 +88,16 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     return JudgeableSpans(begins, stops, segments.labels[longest][source], source)
 
 
-def without(segments: Events, starts: Int64, ends: Int64) -> Events:
-    """Return the parts of segments outside of some spans.
+def without(segments: Events, reviewed: Spans) -> Events:
+    """Return the parts of segments outside of some time.
 
     Parameters
     ----------
     segments : Events
         In the order of time, one label at a time.
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC; the spans ascend and do not overlap.
+    reviewed : Spans
     """
-    spans, rows = remains(segments, Spans(starts, ends))
+    spans, rows = remains(segments, reviewed)
     return Events(*spans, segments.labels[rows])
 
 

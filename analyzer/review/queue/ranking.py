@@ -1,38 +1,46 @@
-"""The queue of a review: the spans whose labels are the most likely to be wrong."""
+"""The queue of a review: the spans from which a model learns most, or that are likely wrong."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import DAY
 from hearthlog.analyzer.evaluation.event_scores import events_of
-from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import LABEL_FIELDS, Labellings, NamedLabelling
+from hearthlog.analyzer.logs.spans import Spans
+from hearthlog.analyzer.review.queue.coverage import cover, sample
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,
     judgeable_spans,
     other_labels,
     without,
 )
+from hearthlog.analyzer.review.queue.span_sounds import SpanSounds, labelling_model, span_sounds
 from hearthlog.analyzer.review.queue.uncertainty import ModelUncertainty
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.messages.topics import labelling_topic
 from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
 
 # Of two that differ one may be right, and what is new may be labelled well.
 _WEIGHTS = np.array([[1.0], [0.5], [0.5]])
 _MOSTLY = 0.5
-UNCERTAIN, RANDOM = "uncertain", "random"
-_ALONE = {UNCERTAIN: 0, "disagreeing": 1, "novel": 2}  # rows of what is weighed
-RANKINGS = (*_ALONE, RANDOM)
+USEFUL, UNCERTAIN, DISAGREEING = "useful", "uncertain", "disagreeing"
+_ALONE = {UNCERTAIN: 0, DISAGREEING: 1, "novel": 2}  # rows of what is weighed
+RANKINGS = (USEFUL, *_ALONE)
+_LONG_ENOUGH = 3 * NANOSECONDS // 2  # for whole windows of one sound
+_LONGEST_WEIGHED = 3 * NANOSECONDS
 
 
 @dataclass(frozen=True)
 class ReviewQueue:
-    """Spans to be reviewed, the most useful first.
+    """Spans to be reviewed, the best first.
 
     Attributes
     ----------
@@ -45,6 +53,8 @@ class ReviewQueue:
         The number of spans that these were chosen from.
     has_uncertainty : bool
         False if the logs have no probabilities.
+    useful : bool
+        Whether the spans are in the order in which they teach most, not in that of their scores.
     """
 
     spans: JudgeableSpans
@@ -55,6 +65,7 @@ class ReviewQueue:
     novelty: Float64
     candidates: int
     has_uncertainty: bool
+    useful: bool
 
     @property
     def weighted(self) -> Float64:
@@ -73,12 +84,13 @@ def make_queue(  # noqa: PLR0913
     side: NamedLabelling,
     *,
     other: NamedLabelling | None,
-    marks: Labelling | None,
+    reviewed: Spans,
     count: int,
     ranking: str | None = None,
+    models: Path = DEFAULT_FOLDER,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
-    """Choose the spans whose labels are the most likely to be wrong, of many days and classes.
+    """Choose the spans from which a model learns most, or whose labels are likely to be wrong.
 
     Parameters
     ----------
@@ -89,20 +101,24 @@ def make_queue(  # noqa: PLR0913
         The labelling to be reviewed.
     other : NamedLabelling or None
         Another one, to find disagreements; another name for a class is none.
-    marks : Labelling or None
-        What is reviewed already, and left out.
+    reviewed : Spans
+        Time that is left out.
     count : int
         Number of spans, at most.
     ranking : str, optional
-        One of `RANKINGS`, to rank by it alone; by default all but chance are weighed. What is
-        mostly silence is not `uncertain`, for there is nothing to judge.
+        One of `RANKINGS`, to rank by it alone; by default uncertainty, disagreement and novelty are
+        weighed. What is mostly silence is not `uncertain`, for there is nothing to judge. The most
+        `useful` spans are those that sound like most of what the model is uncertain of, those of
+        rare classes before others.
+    models : Path, optional
+        Folder of models, in which the one of the labels is looked for.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
 
     Returns
     -------
     ReviewQueue
-        At most one span of each segment.
+        At most one span of each segment, unless they are chosen as `useful`.
 
     Raises
     ------
@@ -113,14 +129,19 @@ def make_queue(  # noqa: PLR0913
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
     segments = events_of(side.labelling, classes)
-    if marks is not None:
-        segments = without(segments, marks.starts, marks.ends)
+    segments = without(segments, reviewed)
     spans = judgeable_spans(segments)
     if not len(spans):
         raise DataError(f"{side.name}: nothing is left to review")
     means = ModelUncertainty(spans, classes)
-    _add_frames(means, sources, labelling_topic(microphone, side.name, "label"), spans, progress)
-    if other is None and not (means.uncertainty.exist or means.novelty.exist):
+    steps = 2.0 if ranking == USEFUL else 1.0
+
+    def report(share: float) -> None:
+        progress(share / steps)
+
+    _add_frames(means, sources, labelling_topic(microphone, side.name, "label"), spans, report)
+    known = means.uncertainty.exist or means.novelty.exist
+    if other is None and ranking != USEFUL and not known:
         raise DataError(
             f"{side.name}: the logs do not say how sure the model was (no labels with "
             "probabilities); name a second labelling to compare it with"
@@ -129,15 +150,20 @@ def make_queue(  # noqa: PLR0913
     if other is not None:
         labels, differing = other_labels(spans, events_of(other.labelling, classes))
     parts = means.uncertainty.values(), differing, means.novelty.values()
-    scores = _scores(np.stack(parts), ranking)
-    if ranking == UNCERTAIN:
-        scores[means.silence.values() >= _MOSTLY] = 0.0
-    if not scores.any():
-        raise DataError(f"{side.name}: no span is {ranking}")
-    rows = _best_of_each(scores, spans.sources)
-    if ranking is not None:
-        rows = rows[scores[rows] > 0.0]
-    rows = rows[_spread(scores[rows], spans.take(rows), count)]
+    if ranking == USEFUL:
+        logs = sources.with_topic(labelling_topic(microphone, side.name, "segment"))
+        model = labelling_model(logs, models)
+
+        def sounds(some: JudgeableSpans) -> SpanSounds:
+            return span_sounds(
+                some, sources, microphone, model, lambda share: progress((1.0 + share) / 2.0)
+            )
+
+        rows = _useful(spans, parts[0], count, sounds)
+    else:
+        rows = _ranked(np.stack(parts), ranking, spans, means.silence.values(), count)
+        if not len(rows):
+            raise DataError(f"{side.name}: no span is {ranking}")
     return ReviewQueue(
         spans.take(rows),
         [classes[i] for i in spans.labels[rows].tolist()],
@@ -147,16 +173,44 @@ def make_queue(  # noqa: PLR0913
         novelty=parts[2][rows],
         candidates=len(spans),
         has_uncertainty=means.uncertainty.exist,
+        useful=ranking == USEFUL,
     )
 
 
-def _scores(parts: Float64, ranking: str | None) -> Float64:
-    """Return the score of each span; random ones are the same each time."""
-    if ranking == RANDOM:
-        return np.random.default_rng(0).random(parts.shape[1:])
+def _useful(
+    spans: JudgeableSpans,
+    uncertain: Float64,
+    count: int,
+    sounds: Callable[[JudgeableSpans], SpanSounds],
+) -> Int64:
+    """Choose spans that sound like most of what a model is uncertain of, in rare classes more."""
+    lengths = spans.ends - spans.starts
+    worth = np.minimum(lengths, _LONGEST_WEIGHED) / NANOSECONDS
+    of_class = np.bincount(spans.labels, worth)[spans.labels]
+    weights = worth * (uncertain if uncertain.any() else 1.0) / np.sqrt(of_class)
+    rows, shares = sample(weights)
+    some = spans.take(rows)
+    points, gamma = sounds(some)
+    eligible = lengths[rows] >= _LONG_ENOUGH
+    if not eligible.any():
+        eligible[:] = True
+    return rows[cover(points, gamma, shares, eligible, count)]
+
+
+def _ranked(
+    parts: Float64, ranking: str | None, spans: JudgeableSpans, silence: Float64, count: int
+) -> Int64:
+    """Choose the spans with the highest scores; none if all are 0."""
     weights = _WEIGHTS if ranking is None else np.eye(len(parts))[:, [_ALONE[ranking]]]
-    scored: Float64 = (weights * parts).sum(axis=0)
-    return scored
+    scores: Float64 = (weights * parts).sum(axis=0)
+    if ranking == UNCERTAIN:
+        scores[silence >= _MOSTLY] = 0.0
+    if not scores.any():
+        return np.empty(0, np.int64)
+    rows = _best_of_each(scores, spans.sources)
+    if ranking is not None:
+        rows = rows[scores[rows] > 0.0]
+    return rows[_spread(scores[rows], spans.take(rows), count)]
 
 
 def _add_frames(

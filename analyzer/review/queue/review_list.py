@@ -9,8 +9,11 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import Difference
+from hearthlog.analyzer.logs.labellings import NamedLabelling
+from hearthlog.analyzer.logs.spans import Spans, one, pieces
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.review.queue.ranking import ReviewQueue
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.review.queue.ranking import USEFUL, ReviewQueue
 from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.messages.topics import LABELLING, check_microphone_name
@@ -18,7 +21,8 @@ from hearthlog.schemas.storage.new_files import new_file
 from hearthlog.schemas.times import read_time, time_text
 
 MOST_SPANS = 100_000
-REASONS = ("uncertainty", "disagreement", "novelty")
+_PARTS = ("uncertainty", "disagreement", "novelty")
+REASONS = (*_PARTS, USEFUL, RANDOM)
 _SIZE_LIMIT = 64 << 20
 _LATEST = 1 << 62  # nanoseconds
 _NUMBER = re.compile(r"[0-9]{1,3}(\.[0-9]{1,20})?")
@@ -37,9 +41,9 @@ class ReviewSpan(NamedTuple):
     b, label_b : str
         Another one; both are empty if there is none, the label where it has none.
     score : float or None
-        None in lists of disagreements, which are not ranked.
+        None where spans are not ranked by one.
     reason : str
-        One of `REASONS`.
+        One of `REASONS`; `random` is a whole minute that was drawn at random.
     """
 
     microphone: str
@@ -95,17 +99,41 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
     Returns
     -------
     list of ReviewSpan
-        With the score, to three digits, and as the reason the part that weighs most in it.
+        With the score, to three digits, and as the reason the part that weighs most in it;
+        `useful` ones have no score.
     """
     most = np.argmax(queue.weighted, axis=0).tolist()
     columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
     rows = zip(
         *(column.tolist() for column in columns), queue.labels, queue.others, most, strict=True
     )
-    return [
-        ReviewSpan(microphone, start, end, a, label, b, other, score, REASONS[reason])
+    spans = [
+        ReviewSpan(microphone, start, end, a, label, b, other, score, _PARTS[reason])
         for start, end, score, label, other, reason in rows
     ]
+    if queue.useful:
+        return [span._replace(score=None, reason=USEFUL) for span in spans]
+    return spans
+
+
+def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> list[ReviewSpan]:
+    """List minutes that were drawn at random, in their order.
+
+    Parameters
+    ----------
+    minutes : Spans
+        In any order.
+    side : NamedLabelling
+        The labelling to be reviewed.
+    microphone : str
+    """
+    spans = []
+    for start, end in zip(minutes.starts.tolist(), minutes.ends.tolist(), strict=True):
+        parts, rows, _ = pieces(side.labelling, one(start, end))
+        labels, row = np.unique(side.labelling.labels[rows].astype(str), return_inverse=True)
+        label = str(labels[np.bincount(row, parts.ends - parts.starts).argmax()])
+        spans.append(ReviewSpan(microphone, start, end, side.name, label, "", "", None, RANDOM))
+    return spans
 
 
 def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:

@@ -9,17 +9,27 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import (
+    RANDOM,
+    Mark,
+    MarkedSpan,
+    ReviewedSpan,
+    read_marks,
+    read_reviewed,
+    write_marks,
+)
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 
 
 @dataclass
 class _Change:
-    """The marks of a layer before a change, to undo it."""
+    """The marks of a layer before a change, and what it said was looked at, to undo it."""
 
     log: Path
     span: MarkedSpan
     before: list[Mark]
+    reviewed: list[ReviewedSpan]  # that it added
+    not_reviewed: list[ReviewedSpan] = field(default_factory=list)  # that it took out
 
 
 @dataclass
@@ -46,7 +56,7 @@ class Marking:
     _done: list[list[_Change]] = field(default_factory=list)
     _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
 
-    def mark(self, start: int, end: int, label: str) -> list[Mark]:
+    def mark(self, start: int, end: int, label: str, chosen: str = "") -> list[Mark]:
         """Label a span of time, in place of the marks that it has.
 
         Parameters
@@ -55,6 +65,8 @@ class Marking:
             In nanoseconds of UTC; what lies before or after all logs is cut off.
         label : str
             A name of a class.
+        chosen : str, optional
+            As of `ReviewedSpan`, if the span counts as reviewed; else empty.
 
         Returns
         -------
@@ -68,7 +80,30 @@ class Marking:
         LogError
             If a layer is damaged or cannot be written; that layer is unchanged then.
         """
-        return self._write(start, end, [(start, end, label)])
+        return self._write(start, end, [(start, end, label)], chosen)
+
+    def review(self, start: int, end: int, chosen: str) -> None:
+        """Say that a span was looked at: what is not marked in it is right.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; what lies before or after all logs is cut off.
+        chosen : str
+            How the span was chosen, as of `ReviewedSpan`.
+
+        Raises
+        ------
+        DataError
+            If a part of the span was not recorded.
+        LogError
+            If a layer is damaged or cannot be written; that layer is unchanged then.
+        """
+        now = time.time_ns()
+        changes = [self._change(*piece, now, chosen) for piece in self._pieces(start, end)]
+        for change in changes:
+            write_marks(change.log, [], reviewed=change.reviewed)
+        self._done.append(changes)
 
     def confirm(self, start: int, end: int) -> list[Mark]:
         """Mark a span with the labels that it has, in place of its marks.
@@ -105,7 +140,7 @@ class Marking:
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
-        """Delete the marks of a span of time.
+        """Delete the marks of a span of time, which counts as reviewed no more.
 
         Parameters
         ----------
@@ -124,7 +159,7 @@ class Marking:
         LogError
             If a layer is damaged or cannot be written; that layer is unchanged then.
         """
-        return self._write(start, end, [])
+        return self._write(start, end, [], deleted=True)
 
     def undo(self) -> tuple[int, int] | None:
         """Undo the last change.
@@ -143,7 +178,7 @@ class Marking:
             return None
         changes = self._done[-1]
         for change in changes:
-            self._change_layer(change.log, change.before, change.span)
+            self._change_layer(change, change.before, change.not_reviewed, change.reviewed)
         self._done.pop()
         return changes[0].span.start, changes[-1].span.end
 
@@ -171,14 +206,26 @@ class Marking:
             np.array([mark.label for mark in own], object),
         )
 
-    def _write(self, start: int, end: int, labels: Iterable[tuple[int, int, str]]) -> list[Mark]:
-        """Replace the marks of a span by labels (start, end, label)."""
+    def _pieces(self, start: int, end: int) -> list[tuple[Path, int, int]]:
+        """Divide a span of time among the logs, each with its start and end."""
         start = max([start, *self.coverage.starts[:1]])
         end = min([end, *self.coverage.ends[-1:]])
         pieces = self.coverage.split(start, end) if start < end else []
         if not pieces:
             raise DataError("not all of this span was recorded: mark a part that was")
-        now = time.time_ns()
+        return pieces
+
+    def _write(
+        self,
+        start: int,
+        end: int,
+        labels: Iterable[tuple[int, int, str]],
+        chosen: str = "",
+        *,
+        deleted: bool = False,
+    ) -> list[Mark]:
+        """Replace the marks of a span by labels (start, end, label)."""
+        pieces, now = self._pieces(start, end), time.time_ns()
         made = [
             Mark(self.microphone, max(a, first), min(b, last), label, self.reviewer, now,
                  self.corrects)
@@ -186,18 +233,29 @@ class Marking:
             for _, first, last in pieces
             if max(a, first) < min(b, last)
         ]  # fmt: skip
-        changes = [self._change(log, first, last) for log, first, last in pieces]
-        for (log, first, last), _ in zip(pieces, changes, strict=True):
+        changes = [self._change(*piece, now, chosen, deleted=deleted) for piece in pieces]
+        for (_, first, last), change in zip(pieces, changes, strict=True):
             own = [mark for mark in made if first <= mark.start < last]
-            self._change_layer(log, own, MarkedSpan(self.microphone, first, last))
+            instead_of = MarkedSpan(self.microphone, first, last)
+            self._change_layer(change, own, change.reviewed, change.not_reviewed, instead_of)
         self._done.append(changes)
         return made
 
-    def _change_layer(self, log: Path, marks: Sequence[Mark], instead_of: MarkedSpan) -> None:
-        write_marks(log, marks, [instead_of])
-        self._marks[log] = read_marks(log)
+    def _change_layer(
+        self,
+        change: _Change,
+        marks: Sequence[Mark],
+        reviewed: Sequence[ReviewedSpan],
+        not_reviewed: Sequence[ReviewedSpan],
+        instead_of: MarkedSpan | None = None,
+    ) -> None:
+        span = instead_of or change.span
+        write_marks(change.log, marks, [span], reviewed=reviewed, not_reviewed=not_reviewed)
+        self._marks[change.log] = read_marks(change.log)
 
-    def _change(self, log: Path, start: int, end: int) -> _Change:
+    def _change(  # noqa: PLR0913
+        self, log: Path, start: int, end: int, now: int, chosen: str, *, deleted: bool = False
+    ) -> _Change:
         """Return the marks that a change will touch, and the span that they reach over."""
         touched = [
             mark
@@ -206,4 +264,23 @@ class Marking:
         ]
         first = min([start, *(mark.start for mark in touched)])
         last = max([end, *(mark.end for mark in touched)])
-        return _Change(log, MarkedSpan(self.microphone, first, last), touched)
+        span = MarkedSpan(self.microphone, first, last)
+        change = _Change(log, span, touched, self._looked_at(start, end, now, chosen))
+        if deleted:
+            for one in read_reviewed(log):
+                if one.microphone == self.microphone and one.start < end and one.end > start:
+                    change.not_reviewed.append(one)
+                    change.reviewed += _outside(one, start, end)
+        return change
+
+    def _looked_at(self, start: int, end: int, now: int, chosen: str) -> list[ReviewedSpan]:
+        about = self.reviewer, now, self.corrects, chosen
+        return [ReviewedSpan(self.microphone, start, end, *about)] if chosen else []
+
+
+def _outside(span: ReviewedSpan, start: int, end: int) -> list[ReviewedSpan]:
+    """Cut a reviewed span; a part of a minute is none that was drawn at random."""
+    if span.chosen == RANDOM:
+        return []
+    parts = span._replace(end=min(span.end, start)), span._replace(start=max(span.start, end))
+    return [part for part in parts if part.start < part.end]

@@ -1,28 +1,52 @@
 """The spans that a review goes through: of a queue, or of a list that `diff` made."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labellings import Labellings
-from hearthlog.analyzer.review.queue.ranking import RANKINGS, make_queue
-from hearthlog.analyzer.review.queue.review_list import ReviewSpan, queued, read_list
+from hearthlog.analyzer.logs.spans import Spans, joined
+from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.review.queue.asked import chosen_as
+from hearthlog.analyzer.review.queue.random_minutes import MINUTE, draw_minutes, whole_minutes
+from hearthlog.analyzer.review.queue.ranking import DISAGREEING, RANKINGS, USEFUL, make_queue
+from hearthlog.analyzer.review.queue.review_list import (
+    ReviewSpan,
+    queued,
+    random_minutes,
+    read_list,
+)
+from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
 from hearthlog.analyzer.review.session.session import ReviewItem
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.schemas.progress import Progress, ignore_progress
 
-_TEN = 10  # which takes a person a few minutes
+QUEUES = (*RANKINGS, RANDOM)
+_TEN = 10  # which takes a person ten minutes
+_MINUTE_EVERY = 5  # of the items of a queue of useful spans
+_MINUTES_LEFT = 10  # for each that is drawn, or a short log would have no useful span
 Limits = tuple[int | None, int | None]
 
 
-def queue_items(
-    queue: str, sources: Labellings, labelled: tuple[str, str], limits: Limits, count: int | None
+def queue_items(  # noqa: PLR0913, PLR0917
+    queue: str,
+    sources: Labellings,
+    labelled: tuple[str, str],
+    limits: Limits,
+    count: int | None,
+    models: Path = DEFAULT_FOLDER,
+    progress: Progress = ignore_progress,
 ) -> list[ReviewItem]:
     """Choose spans of a labelling for a review.
 
     Parameters
     ----------
     queue : str
-        One of `RANKINGS`, or the name of a list (`*.csv`) that `hearthlog diff` made.
+        One of `QUEUES`, or the name of a list (`*.csv`) that `hearthlog diff` made. Every fifth
+        item of a `useful` queue is a minute drawn at random, and every one of a `random` one.
     sources : Labellings
     labelled : (str, str)
         The microphone, and the labelling: `live`, or `relabel/` and a model.
@@ -30,6 +54,10 @@ def queue_items(
         Start and end in nanoseconds of UTC; None for all that there is.
     count : int or None
         How many, at most; None for ten of a ranking, all of a list.
+    models : Path, optional
+        Folder of models, in which the one of the labels is looked for.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
 
     Returns
     -------
@@ -43,28 +71,75 @@ def queue_items(
     LogError
         If the labelling has no segment in these limits, or its segments overlap or cannot be.
     """
+    return [
+        ReviewItem(span.start, span.end, span.label_a, _text(span), chosen_as(span))
+        for span in queue_spans(queue, sources, labelled, limits, count, models, progress)
+    ]
+
+
+def queue_spans(  # noqa: PLR0913, PLR0917
+    queue: str,
+    sources: Labellings,
+    labelled: tuple[str, str],
+    limits: Limits,
+    count: int | None,
+    models: Path = DEFAULT_FOLDER,
+    progress: Progress = ignore_progress,
+) -> list[ReviewSpan]:
+    """Choose spans of a labelling, as `queue_items` does, for a list.
+
+    Parameters
+    ----------
+    queue, sources, labelled, limits, count, models, progress
+        As of `queue_items`.
+
+    Raises
+    ------
+    DataError, LogError
+        As of `queue_items`.
+    """
     microphone, labelling = labelled
-    if queue not in RANKINGS:
+    if queue not in QUEUES:
         if not queue.endswith(".csv"):
             raise DataError(
-                f"--queue {queue[:64]}: use {', '.join(RANKINGS)}, or a list *.csv of `diff --list`"
+                f"--queue {queue[:64]}: use {', '.join(QUEUES)}, or a list *.csv of `diff --list`"
             )
-        return _items(_listed(Path(queue), microphone, limits)[:count])
+        return _listed(Path(queue), microphone, limits)[:count]
     side = sources.read(microphone, labelling, *limits)
     others = [name for name in sources.names(microphone) if name not in {labelling, REVIEW}]
-    if queue == "disagreeing" and not others:
+    if queue == DISAGREEING and not others:
         raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
     other = sources.read(microphone, others[0], *limits) if others else None
-    chosen = make_queue(
-        sources,
-        microphone,
-        side,
-        other=other,
-        marks=sources.marks(microphone, *limits),
-        count=count or _TEN,
-        ranking=queue,
-    )
-    return _items(queued(chosen, microphone, labelling, "" if other is None else other.name))
+    done, wanted = reviewed_time(sources, microphone), count or _TEN
+    minutes = Spans(*(np.empty(0, np.int64),) * 2)
+    if queue in {USEFUL, RANDOM}:
+        there = whole_minutes(side.labelling)
+        few = min(wanted // _MINUTE_EVERY, len(there.starts) // _MINUTES_LEFT)
+        drawn = draw_minutes(there, wanted if queue == RANDOM else few, done.random, done.spans)
+        minutes = Spans(drawn, drawn + MINUTE)
+    drawn_at_random = random_minutes(minutes, side, microphone)
+    if queue == RANDOM:
+        if not drawn_at_random:
+            raise DataError(f"{labelling}: no whole minute is left to draw")
+        return drawn_at_random
+    try:
+        chosen = make_queue(
+            sources,
+            microphone,
+            side,
+            other=other,
+            reviewed=joined(*np.concatenate([done.spans, minutes], axis=1)),
+            count=wanted - len(drawn_at_random),
+            ranking=queue,
+            models=models,
+            progress=progress,
+        )
+    except DataError:
+        if not drawn_at_random:
+            raise
+        return drawn_at_random
+    spans = queued(chosen, microphone, labelling, other.name if other else "")
+    return _mixed(spans, drawn_at_random)
 
 
 def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
@@ -81,10 +156,18 @@ def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
     return spans
 
 
-def _items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
-    return [ReviewItem(span.start, span.end, span.label_a, _text(span)) for span in spans]
+def _mixed(spans: Sequence[ReviewSpan], minutes: Sequence[ReviewSpan]) -> list[ReviewSpan]:
+    """Put a minute behind every four spans, and the rest at the end."""
+    mixed, left = list[ReviewSpan](), list(minutes)
+    for number, span in enumerate(spans, 1):
+        mixed.append(span)
+        if left and number % (_MINUTE_EVERY - 1) == 0:
+            mixed.append(left.pop(0))
+    return mixed + left
 
 
 def _text(span: ReviewSpan) -> str:
+    if span.reason == RANDOM:
+        return f"{span.a}: mostly {span.label_a} (a minute at random: mark what is wrong in it)"
     other = f", {span.b}: {span.label_b or 'nothing'}" if span.b else ""
     return f"{span.a}: {span.label_a}{other} ({span.reason})"

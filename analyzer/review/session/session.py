@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
 from hearthlog.models.classes import UNKNOWN
@@ -20,6 +20,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
 _AROUND = 600 * NANOSECONDS
+_RIGHT = "."
 _CLASS_KEYS = "1234567890eghijklmorstvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
@@ -35,12 +36,15 @@ class ReviewItem(NamedTuple):
         The label of most of it, which the key `a` accepts.
     text : str
         A line for the reviewer.
+    chosen : str
+        As of `ReviewedSpan`; one that was drawn at random is gone through until all of it is right.
     """
 
     start: int
     end: int
     label: str
     text: str
+    chosen: str = QUEUE
 
 
 class Screen(Protocol):
@@ -127,6 +131,7 @@ class Session:
         """Each key, and what it does."""
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
+        keys += [(_RIGHT, "or Enter: all else in the span is right")]
         keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
         keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
         keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
@@ -172,8 +177,8 @@ class Session:
         Parameters
         ----------
         key : str
-            One of `keys`; where there are items, a space skips one, too. For any other key the keys
-            are shown, unless it is white space.
+            One of `keys`, or Enter; where there are items, a space skips one, too. For any other
+            key the keys are shown, unless it is white space.
         """
         try:
             self._press(key)
@@ -188,12 +193,14 @@ class Session:
             "d": lambda: self._mark(self.marking.delete),
             "z": self._undo,
             "p": self._play,
+            _RIGHT: self._rest_is_right,
+            "\n": self._rest_is_right,
             "[": self._begin_here,
             "]": self._end_here,
         }
         if self.items:
             actions |= {
-                "a": lambda: self._mark_as(self.items[self._at].label),
+                "a": self._accept,
                 "n": lambda: self._go(1),
                 " ": lambda: self._go(1),
                 "b": lambda: self._go(-1),
@@ -208,17 +215,42 @@ class Session:
             self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
 
     def _mark_as(self, label: str) -> None:
-        self._mark(lambda start, end: self.marking.mark(start, end, label))
+        chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
+        self._mark(lambda start, end: self.marking.mark(start, end, label, chosen))
+
+    @property
+    def _in_minute(self) -> bool:
+        return bool(self.items) and self.items[self._at].chosen == RANDOM
+
+    def _accept(self) -> None:
+        if self._in_minute:
+            self._rest_is_right()
+        else:
+            self._mark_as(self.items[self._at].label)
+
+    def _rest_is_right(self) -> None:
+        if self.items:
+            item = self.items[self._at]
+            start, end, chosen = item.start, item.end, item.chosen
+        else:
+            start, end, chosen = *self._chosen(), PERSON
+        self.marking.review(start, end, chosen)
+        self._done(start, end, "all else is right")
+        if self.items:
+            self._go(1)
 
     def _mark(self, change: Callable[[int, int], list[Mark]]) -> None:
         start, end = self._chosen()
         made = change(start, end)
-        self._marked += 1
         labels = ", ".join(dict.fromkeys(mark.label for mark in made)) or "no mark"
-        self.say(f"{self._text(start, end)}  {labels}")
-        self._redraw()
-        if self.items:
+        self._done(start, end, labels)
+        if self.items and not self._in_minute:
             self._go(1)
+
+    def _done(self, start: int, end: int, text: str) -> None:
+        self._marked += 1
+        self.say(f"{self._text(start, end)}  {text}")
+        self._redraw()
 
     def _undo(self) -> None:
         span = self.marking.undo()
@@ -300,7 +332,7 @@ class Session:
     def _conclude(self) -> None:
         minutes = (time.monotonic() - self._began) / 60
         spans = "1 span" if self._marked == 1 else f"{self._marked} spans"
-        self.say(f"{spans} marked in {minutes:.1f} min, {self._marked / minutes:.1f} a minute")
+        self.say(f"{spans} reviewed in {minutes:.1f} min, {self._marked / minutes:.1f} a minute")
 
 
 def _margin(start: int, end: int) -> int:

@@ -1,0 +1,93 @@
+"""What a label file was made to ask, in a list beside it: so an import knows what was looked at."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import one, pieces
+from hearthlog.analyzer.marks.formats.formats import find_format
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
+from hearthlog.analyzer.review.queue.review_list import ReviewSpan
+from hearthlog.schemas.messages.topics import RELABEL
+
+_SUFFIX = ".queue.csv"
+
+
+def asked_path(labels: Path) -> Path:
+    """Return the path of the list beside a label file: `ten.queue.csv` beside `ten.txt`.
+
+    Parameters
+    ----------
+    labels : Path
+    """
+    format_ = find_format(labels)
+    suffix = "" if format_ is None else format_.suffix
+    return labels.with_name(labels.name.removesuffix(suffix) + _SUFFIX)
+
+
+def chosen_as(span: ReviewSpan) -> str:
+    """Return how a span was chosen, as `ReviewedSpan` says it."""
+    return RANDOM if span.reason == RANDOM else QUEUE
+
+
+def corrected_name(labelling: str) -> str:
+    """Return the name of a labelling, as marks say it: `live`, or the name of a model."""
+    return labelling.removeprefix(f"{RELABEL}/")
+
+
+def labels_of(span: ReviewSpan, said: Labelling) -> list[Mark]:
+    """Return the labels of a span for a label file: one, or of a whole minute all.
+
+    Parameters
+    ----------
+    span : ReviewSpan
+    said : Labelling
+        The one that is reviewed.
+    """
+    if span.reason != RANDOM:
+        return [Mark(span.microphone, span.start, span.end, span.label_a)]
+    parts, rows, _ = pieces(said, one(span.start, span.end))
+    times = zip(parts.starts.tolist(), parts.ends.tolist(), strict=True)
+    return [
+        Mark(span.microphone, *each, label)
+        for each, label in zip(times, said.labels[rows].tolist(), strict=True)
+    ]
+
+
+def looked_at(
+    asked: Iterable[ReviewSpan],
+    marks: Sequence[Mark],
+    coverage: Mapping[str, Coverage],
+    reviewer: str,
+    made: int,
+) -> dict[Path, list[ReviewedSpan]]:
+    """Return which of the spans that were asked a person has looked at: those with a label.
+
+    Parameters
+    ----------
+    asked : iterable of ReviewSpan
+    marks : sequence of Mark
+        All that the label file has.
+    coverage : mapping of str to Coverage
+        By microphone; spans of others are left out.
+    reviewer : str
+    made : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    dict of Path to list of ReviewedSpan
+        By log.
+    """
+    found: dict[Path, list[ReviewedSpan]] = {}
+    for span in asked:
+        answers = (
+            mark.microphone == span.microphone and mark.start < span.end and mark.end > span.start
+            for mark in marks
+        )
+        if span.microphone in coverage and any(answers):
+            about = reviewer, made, corrected_name(span.a), chosen_as(span)
+            for log, first, last in coverage[span.microphone].split(span.start, span.end):
+                found.setdefault(log, []).append(ReviewedSpan(span.microphone, first, last, *about))
+    return found

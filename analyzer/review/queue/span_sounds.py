@@ -1,0 +1,211 @@
+"""How spans sound: the inputs of the model that labelled them, in which alike sounds are near."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.labellings import Labellings, LogContents
+from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker
+from hearthlog.models.features.installed import feature_set
+from hearthlog.models.features.window_inputs import Inputs, WindowStatistics
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import find_model
+from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
+
+_FIELDS = ("header.stamp", "frame", "values")
+_BEFORE = 60 * NANOSECONDS  # in which the floor of the room is found
+_MOST_AT_ONCE = 1800 * NANOSECONDS
+_MOST_WINDOWS = 12  # of a span
+_GAMMA = 0.5  # over the number of inputs, as of the starter models
+
+
+class SpanSounds(NamedTuple):
+    """Points, one for each span.
+
+    Attributes
+    ----------
+    points : np.ndarray [shape=(n, width)], float64
+        Means of scaled inputs; NaN for a span without features.
+    gamma : float
+        The kernel of two points is exp(-gamma |x - y|^2).
+    """
+
+    points: Float64
+    gamma: float
+
+
+def labelling_model(logs: list[LogContents], models: Path) -> Model | None:
+    """Find the model of the latest of some logs or layers.
+
+    Parameters
+    ----------
+    logs : list of LogContents
+        In the order of time.
+    models : Path
+        Folder of model files; the starter models are known without.
+
+    Returns
+    -------
+    Model or None
+        None if its file is gone, or cannot be used.
+    """
+    with suppress(LogError, ModelError):
+        with LogFile(logs[-1].path) as file:
+            record = next(reversed(read_provenance(file)), {})
+        path = find_model(models, record.get("model_sha256", ""))
+        return None if path is None else load_model(path)
+    return None
+
+
+def span_sounds(
+    spans: JudgeableSpans,
+    sources: Labellings,
+    microphone: str,
+    model: Model | None,
+    progress: Progress = ignore_progress,
+) -> SpanSounds:
+    """Read what spans sound like.
+
+    Parameters
+    ----------
+    spans : JudgeableSpans
+        At least one.
+    sources : Labellings
+        Logs that cannot be read are added to its losses.
+    microphone : str
+    model : Model or None
+        The one that labelled them. Without one, or if its features are not those of the logs, the
+        points are means and standard deviations of the features, scaled by their own spread.
+    progress : callable, optional
+        Told the share of the spans that is read, 0 to 1.
+    """
+    name, points = topic(microphone, "features"), np.empty((len(spans), 0))
+    space = None if model is None else _space(model)
+    for first, last in _groups(spans):
+        start, end = int(spans.starts[first]), int(spans.ends[last - 1])
+        part = slice(first, last)
+        recorded = _read(sources, name, start - _BEFORE, end)
+        if recorded is not None:
+            if space is None or not space.is_of(recorded):
+                space = _space_of_features(recorded)
+            means = _means(recorded, spans.starts[part], spans.ends[part], space)
+            if means.shape[1] != points.shape[1]:
+                points = np.full((len(spans), means.shape[1]), np.nan)
+            points[part] = means
+        progress(last / len(spans))
+    if not points.shape[1]:
+        return SpanSounds(np.full((len(spans), 1), np.nan), 1.0)
+    if space is None or space.features is None:
+        spread = np.nanstd(points, axis=0)
+        return SpanSounds(points / np.where(spread > 0.0, spread, 1.0), _GAMMA / points.shape[1])
+    return SpanSounds((points - space.mean) / space.scale, space.gamma)
+
+
+class _Space(NamedTuple):
+    """Inputs of windows, and how they are scaled."""
+
+    features: FeatureSet | None
+    inputs: Inputs
+    mean: Float64 = np.empty(0)
+    scale: Float64 = np.empty(0)
+    gamma: float = 0.0
+
+    def is_of(self, recorded: Columns) -> bool:
+        """Tell whether these are inputs of recorded features."""
+        width = recorded["values"].shape[1]
+        if self.features is None:
+            return self.inputs.width == 2 * width
+        names = array_names(recorded.metadata, "values")
+        return (tuple(names) or self.features.feature_names) == self.features.feature_names
+
+
+def _space(model: Model) -> _Space | None:
+    """Return the space of a support vector machine; None for other models."""
+    description, arrays = model.description, model.arrays
+    gamma = description.parameters.get("gamma")
+    if gamma is None or not {"scaler_mean", "scaler_scale"} <= arrays.keys():
+        return None
+    try:
+        features = feature_set(description.feature_set)
+    except ModelError:
+        return None
+    inputs = features.inputs[description.inputs]
+    return _Space(features, inputs, arrays["scaler_mean"], arrays["scaler_scale"], gamma)
+
+
+def _space_of_features(recorded: Columns) -> _Space:
+    width = recorded["values"].shape[1]
+    return _Space(None, WindowStatistics(BLOCK_FRAMES, np.asarray, width))
+
+
+def _groups(spans: JudgeableSpans) -> Iterator[tuple[int, int]]:
+    """Yield rows of spans that are read at once: first, and behind the last one."""
+    first = 0
+    while first < len(spans):
+        last = int(np.searchsorted(spans.starts, spans.starts[first] + _MOST_AT_ONCE))
+        yield first, last
+        first = last
+
+
+def _read(sources: Labellings, name: str, start: int, end: int) -> Columns | None:
+    near = [log.path for log in sources.logs if log.last >= start and log.first < end]
+    try:
+        recorded = read_columns(near, {name}, start, end, fields=_FIELDS).get(name)
+    except LogError as error:
+        sources.lose(error)
+        return None
+    return recorded if recorded is not None and len(recorded) else None
+
+
+def _means(recorded: Columns, starts: Int64, ends: Int64, space: _Space) -> Float64:
+    """Return the mean inputs of the windows of each span; NaN where there is none."""
+    stamps, values = recorded["header.stamp"], recorded["values"]
+    means = np.full((len(starts), space.inputs.width), np.nan)
+    length = space.inputs.window_frames
+    first, last = (np.searchsorted(stamps, times) for times in (starts, ends))
+    there = np.flatnonzero((last > first) & (len(stamps) >= length))
+    if not len(there):
+        return means
+    first = np.minimum(first[there], len(stamps) - length)
+    room = np.maximum(last[there] - length - first, 0)
+    counts = np.minimum(1 + room // length, _MOST_WINDOWS)
+    row, number = ranges(np.zeros(len(there), np.int64), counts)
+    begin = first[row] + number * room[row] // np.maximum(counts - 1, 1)[row]
+    windows = values[begin[:, np.newaxis] + np.arange(length)]
+    floors = None
+    if space.inputs.needs_floor:
+        floors = _floors(recorded, space.features)[begin + length - 1]
+    sums = np.add.reduceat(
+        space.inputs.of_windows(windows, floors), np.cumsum(counts) - counts, dtype=np.float64
+    )
+    means[there] = sums / counts[:, np.newaxis]
+    return means
+
+
+def _floors(recorded: Columns, features: FeatureSet | None) -> Float64:
+    """Return the floor of the room at each frame, near to that of the recorder."""
+    assert features is not None
+    assert features.band_powers is not None
+    frames, powers = recorded["frame"].astype(np.int64), features.band_powers(recorded["values"])
+    for run in np.split(np.arange(len(frames)), np.flatnonzero(np.diff(frames) != 1) + 1):
+        tracked = FloorTracker()(powers[run], int(frames[run[0]])).powers
+        powers[run[len(run) - len(tracked) :]] = tracked
+        if len(tracked):
+            powers[run[: len(run) - len(tracked)]] = tracked[0]
+    return powers

@@ -1,0 +1,282 @@
+"""A queue that is worth a person's ten minutes: spans that teach, and minutes drawn at random."""
+
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from spliced import run
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.spans import NONE, joined, one, pieces
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, read_marks, read_reviewed
+from hearthlog.analyzer.review.queue.coverage import cover, sample
+from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
+from hearthlog.analyzer.review.queue.random_minutes import (
+    MINUTE,
+    Minutes,
+    draw_minutes,
+    whole_minutes,
+)
+from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
+from hearthlog.analyzer.review.session.marking import Marking
+from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.timeline.model import no_spans
+from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.recorder.config import Settings
+from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.home.clips import ClipLibrary
+from hearthlog.tools.home.composition import Composition
+from hearthlog.tools.home.record import record_composition
+from hearthlog.tools.home.rooms import Rooms
+from hearthlog.tools.home.short_day import plan_short_day
+
+START = 1_772_323_200 * NANOSECONDS
+LENGTH = 24  # minutes
+LIVE = ("mic", "live")
+EVER = (None, None)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Twenty-four minutes as the starter labels them."""
+    library = ClipLibrary()
+    composition = Composition(plan_short_day(LENGTH, library, 3), library, Rooms("living_room", 3))
+    logs = tmp_path_factory.mktemp("home") / "logs"
+    settings = Settings(output=logs, model=starter_file(GENERAL), timezone="UTC")
+    record_composition(composition, settings, START)
+    return logs
+
+
+@pytest.fixture
+def home(recorded, tmp_path):
+    return shutil.copytree(recorded, tmp_path / "home")
+
+
+def items(home, queue="useful", count=10, models="none"):
+    return queue_items(queue, find_labellings(home), LIVE, EVER, count, home / models)
+
+
+def written(home, read):
+    return [row for log in find_logs(home) if not is_layer(log) for row in read(log)]
+
+
+def marking(home):
+    return Marking("mic", find_coverage(home)["mic"], "Ann", "live", no_spans())
+
+
+# Minutes
+
+
+def labelled(*spans):
+    starts, ends, labels = zip(*spans, strict=True)
+    times = (np.array(each) * NANOSECONDS for each in (starts, ends))
+    return Labelling(*times, np.array(labels, object))
+
+
+def test_a_minute_is_one_of_the_clock_that_is_labelled_from_start_to_end():
+    found = whole_minutes(
+        labelled(
+            (30, 200, "silence"),
+            (200, 240, "speech"),
+            (300, 359, "speech"),
+            (370, 480, "silence"),
+        )
+    )
+    assert (found.starts // NANOSECONDS).tolist() == [60, 120, 180, 420]
+    assert found.has_sound.tolist() == [False, False, True, False]
+
+
+def test_three_of_four_minutes_that_are_drawn_have_a_sound():
+    night = Minutes(np.arange(1000) * MINUTE, np.arange(1000) % 20 == 0)
+    drawn = draw_minutes(night, 20)
+    assert night.has_sound[drawn // MINUTE].sum() == 15
+    assert len(draw_minutes(night, 2000)) == 1000
+
+
+def test_no_minute_is_drawn_twice_nor_one_that_is_reviewed_and_the_draw_repeats_itself():
+    minutes = Minutes(np.arange(60) * MINUTE, np.arange(60) % 3 > 0)
+    seen = []
+    for _ in range(10):
+        taken = joined(np.array([*seen, 5 * MINUTE + 7]), np.array([*seen, 5 * MINUTE]) + MINUTE)
+        drawn = draw_minutes(minutes, 4, seen, taken).tolist()
+        assert drawn == draw_minutes(minutes, 4, seen, taken).tolist()
+        seen += drawn
+    assert len(set(seen)) == len(seen) == 40
+    assert 5 * MINUTE not in seen
+    assert minutes.has_sound[np.array(seen) // MINUTE].sum() == 30
+
+
+def test_every_minute_of_a_kind_is_as_likely():
+    minutes = Minutes(np.arange(40) * MINUTE, np.ones(40, bool))
+    first = [int(draw_minutes(minutes, 1, range(k))[0]) // MINUTE for k in range(400)]
+    assert np.bincount(first, minlength=40).max() <= 24
+    assert len(set(first)) == 40
+
+
+# Spans that teach
+
+
+def test_one_of_each_group_of_alike_points_is_chosen_the_heaviest_group_first():
+    rng = np.random.default_rng(0)
+    group = np.repeat([0, 1, 2], [50, 30, 20])
+    points = 10.0 * np.eye(3)[group] + 0.1 * rng.standard_normal((100, 3))
+    everything = np.ones(100, bool)
+    assert group[cover(points, 1.0, np.ones(100), everything, 3)].tolist() == [0, 1, 2]
+    assert group[cover(points, 1.0, np.where(group == 2, 9.0, 1.0), everything, 1)].tolist() == [2]
+    assert group[cover(points, 1.0, np.ones(100), group > 0, 5)].min() == 1
+    unknown = np.where(group[:, np.newaxis] == 0, np.nan, points)
+    assert group[cover(unknown, 1.0, np.ones(100), everything, 2)].tolist() == [1, 2]
+
+
+def test_of_too_many_spans_those_that_weigh_more_are_kept_more_often():
+    weights = np.tile([0.0, 1.0, 3.0], 3000)
+    kept, shares = sample(weights, 1000)
+    assert len(kept) <= 1000
+    assert shares.sum() == pytest.approx(weights.sum())
+    share = np.bincount(kept % 3, shares, 3) / shares.sum()
+    assert share == pytest.approx([0.0, 0.25, 0.75], abs=0.03)
+    assert np.histogram(kept, 10, (0, 9000))[0] == pytest.approx(np.full(10, 98), abs=4)
+    rows, shares = sample(np.array([0.0, 2.0, 1.0]), 9)
+    assert (rows.tolist(), shares.tolist()) == ([1, 2], [2.0, 1.0])
+
+
+def test_alike_sounds_are_near_with_the_model_and_without_it(recorded):
+    sources = find_labellings(recorded)
+    said = sources.read(*LIVE).labelling
+    long = np.flatnonzero((said.ends - said.starts) > 3 * NANOSECONDS)
+    middles = (said.starts[long] + said.ends[long]) // 2
+    halves = np.sort(np.concatenate([middles - NANOSECONDS, middles]))
+    numbers = np.arange(len(halves))
+    spans = JudgeableSpans(halves, halves + NANOSECONDS, numbers, numbers)
+    model = labelling_model(sources.with_topic("/mic/segment"), recorded)
+    assert model is not None
+    for each in (model, None):
+        points, gamma = span_sounds(spans, sources, "mic", each)
+        assert np.isfinite(points).all()
+        distance = np.square(points[:, np.newaxis] - points).mean(axis=2)
+        own = np.mean([distance[i, i + 1] for i in range(0, len(halves), 2)])
+        assert own < 0.5 * distance[0::2, 1::2].mean()
+        assert gamma * points.shape[1] == pytest.approx(0.5, rel=0.1)
+
+
+def test_what_was_not_recorded_is_like_nothing(recorded):
+    start, zero = np.array([START + 9 * 3600 * NANOSECONDS]), np.zeros(1, int)
+    spans = JudgeableSpans(start, start + NANOSECONDS, zero, zero)
+    points, _ = span_sounds(spans, find_labellings(recorded), "mic", None)
+    assert np.isnan(points).all()
+
+
+@pytest.mark.parametrize("models", ["none", "file"])
+def test_a_queue_has_long_enough_spans_and_every_fifth_item_is_a_minute(home, models):
+    if models == "file":
+        for log in find_logs(home):
+            assert labelling_model(find_labellings(log).logs, home) is not None
+    found = items(home)
+    assert len(found) == 10
+    assert [item.chosen for item in found] == [*[QUEUE] * 4, RANDOM] * 2
+    spans = sorted(found)
+    assert all(a.end <= b.start for a, b in pairwise(spans))
+    for item in found:
+        length = item.end - item.start
+        if item.chosen == RANDOM:
+            assert (length, item.start % MINUTE) == (MINUTE, 0)
+        else:
+            assert 1.5 * NANOSECONDS <= length <= 10 * NANOSECONDS
+    assert items(home) == found
+
+
+def test_what_was_looked_at_is_not_asked_again_whether_it_was_right_or_not(home):
+    seen = []
+    for _ in range(2):
+        found = items(home, count=5)
+        assert all(b.end <= a.start or b.start >= a.end for a in found for b in seen)
+        for item in found:
+            marking(home).review(item.start, item.end, item.chosen)
+        seen += found
+    minutes = items(home, "random", 99)
+    assert {RANDOM} == {item.chosen for item in minutes}
+    assert len(minutes) + 2 <= LENGTH
+    assert not {item.start for item in minutes} & {item.start for item in seen}
+
+
+def test_in_a_short_log_most_is_left_for_spans(home):
+    limits = (START, START + 9 * MINUTE)
+    found = queue_items("useful", find_labellings(home), LIVE, limits, 10)
+    assert {item.chosen for item in found} == {QUEUE}
+
+
+def test_when_all_is_reviewed_that_is_said(home):
+    marking(home).review(START, START + LENGTH * MINUTE, QUEUE)
+    for queue in ("useful", "random"):
+        with pytest.raises(DataError, match=r"nothing is left to review|no whole minute is left"):
+            items(home, queue)
+
+
+# Without a display
+
+
+def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_was_chosen(
+    home, tmp_path, capfd
+):
+    path = tmp_path / "ten.txt"
+    done = run(capfd, "review", home, "--queue", "--save", path)
+    assert done.returncode == 0, done.stderr
+    asked = items(home)
+    zero = find_coverage(home)["mic"].starts[0]
+    cannot_judge = asked[0]
+
+    def keep(line):
+        start = zero + round(float(line.split("\t")[0]) * NANOSECONDS)
+        return not cannot_judge.start <= start < cannot_judge.end
+
+    lines = path.read_text().splitlines()
+    kept = [line for line in lines if keep(line)]
+    assert len(kept) == len(lines) - 1
+    path.write_text("\n".join(kept) + "\n")
+    done = run(capfd, "annotate", "import", home, path)
+    assert "7 spans of the queue, 2 minutes drawn at random" in done.stderr
+    looked = written(home, read_reviewed)
+    assert {(span.start, span.end, span.chosen) for span in looked} == {
+        (item.start, item.end, item.chosen) for item in asked[1:]
+    }
+    assert {(span.corrects, bool(span.reviewer), bool(span.made)) for span in looked} == {
+        ("live", True, True)
+    }
+    said = find_labellings(home).read(*LIVE).labelling
+    for item in asked:
+        if item.chosen == RANDOM:
+            parts, rows, _ = pieces(said, one(item.start, item.end))
+            marks = [m for m in written(home, read_marks) if item.start <= m.start < item.end]
+            assert [mark.label for mark in marks] == said.labels[rows].tolist()
+            assert [mark.start for mark in marks] == pytest.approx(parts.starts.tolist(), abs=1e6)
+    before = written(home, read_reviewed)
+    again = run(capfd, "annotate", "import", home, path)
+    assert (again.returncode, written(home, read_reviewed)) == (0, before)
+
+
+def test_a_list_of_a_saved_queue_is_gone_through_as_it_was_chosen(home, tmp_path, capfd):
+    run(capfd, "review", home, "--queue", "--save", tmp_path / "ten.csv")
+    listed = items(home, str(tmp_path / "ten.queue.csv"), None)
+    assert [(item[:2], item.chosen) for item in listed] == [
+        (item[:2], item.chosen) for item in items(home)
+    ]
+    done = run(capfd, "review", home, "--queue", "--save", tmp_path / "ten.txt")
+    assert done.returncode == 1
+    assert "ten.queue.csv" in done.stderr
+    assert not (tmp_path / "ten.txt").exists()
+
+
+def test_fewer_spans_than_asked_are_said(home, tmp_path, capfd):
+    path = tmp_path / "many.txt"
+    done = run(capfd, "review", home, "--queue", "random", "--spans", "99", "--save", path)
+    assert f"{len(items(home, 'random', 99))} of the 99 that were asked for" in done.stderr
+
+
+def test_of_no_minutes_none_is_drawn():
+    nothing = Minutes(np.empty(0, np.int64), np.empty(0, bool))
+    assert draw_minutes(nothing, 5, (), NONE).tolist() == []
