@@ -72,17 +72,17 @@ def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():
 
 
 def test_the_hours_of_a_week_are_those_in_which_the_most_is_heard():
-    library, two_hours = ClipLibrary(None), 2 * 3600 * 20
+    library, hour = ClipLibrary(None), 3600 * 20
     weeks = quarter.plan_quarter(2, library, 1)
     whole = plan_days(14, library, Habits(1))
     for number, ((first, one), (second, other)) in enumerate(weeks):
-        assert 0 <= first < second < 84 * two_hours
-        assert one.frames == other.frames == two_hours
-        begin = (number * 84) * two_hours
-        heard = {s.clip.label for s in whole.sounds if begin <= s.start < begin + 84 * two_hours}
+        assert 0 <= first < second < 168 * hour
+        assert one.frames == other.frames == hour
+        begin = number * 168 * hour
+        heard = {s.clip.label for s in whole.sounds if begin <= s.start < begin + 168 * hour}
         assert len(heard - {s.clip.label for s in (*one.sounds, *other.sounds)}) <= 1
         assert [s.frames for s in one.sounds] == [
             s.frames
             for s in whole.sounds
-            if begin + first <= s.start and s.end <= begin + first + two_hours
+            if begin + first <= s.start and s.end <= begin + first + hour
         ]

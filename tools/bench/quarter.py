@@ -48,7 +48,7 @@ from hearthlog.tools.home.truth import truth_of
 Part = tuple[int, Plan]  # of a week: its first frame, and what sounds
 _MINUTES = 10.0  # of review a week
 _DAY = DAY_FRAMES * FRAME_NANOSECONDS
-_STRETCH = DAY_FRAMES // 12
+_STRETCH = DAY_FRAMES // 24
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,7 @@ def live(home: Home) -> Iterator[Week]:
     Yields
     ------
     Week
-        As it ends.
-
-    Raises
-    ------
-    HearthlogError
-        If a command fails in another way than to refuse a model.
+        As it ends; what a command says that fails is in it.
     """
     (home.folder / "models").mkdir(parents=True)
     logs = home.folder / "logs"
@@ -103,7 +98,8 @@ def live(home: Home) -> Iterator[Week]:
         microphone = sources.microphone(None)
         said = sources.read(microphone, LIVE, begin, end).labelling
         starter = said if model == starter_file(GENERAL) else _labelled(recorded)
-        person = Person(truth, wrong=float(number == WRONG_WEEK), seed=home.seed)
+        wrong, models = float(number == WRONG_WEEK), home.folder / "models"
+        person = Person(truth, wrong=wrong, seed=home.seed, models=models)
         done = person.review(logs, _MINUTES, end, (begin, end))
         trained, promoted, lines = _learn(home.folder)
         yield Week(
@@ -185,7 +181,7 @@ def _said(folder: Path, *arguments: str) -> list[str]:
 
 
 def plan_quarter(weeks: int, library: ClipLibrary, seed: int) -> list[list[Part]]:
-    """Plan a home, and choose what is recorded: each week those hours in which the most is heard.
+    """Plan a home, and choose what is recorded: each week two hours in which the most is heard.
 
     Parameters
     ----------
@@ -196,8 +192,8 @@ def plan_quarter(weeks: int, library: ClipLibrary, seed: int) -> list[list[Part]
     Returns
     -------
     list of list of (int, Plan)
-        For each week the first frame in it, and the plan, of each of two stretches of two hours:
-        together they have the most labels of all that begin at even hours.
+        For each week the first frame in it, and the plan, of each of two hours: together they have
+        the most labels of all.
 
     Raises
     ------

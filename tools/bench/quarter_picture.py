@@ -11,6 +11,7 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.tools.bench.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Scored, Week
 
 _INCHES = (9.0, 7.5)
+_BAD = (WRONG_WEEK, "wrong marks"), (MICROPHONE_WEEK, "another microphone")
 
 
 def line_of(week: Week) -> str:
@@ -50,8 +51,11 @@ def save_picture(path: Path, weeks: Sequence[Week]) -> None:
     figure = new_figure(_INCHES, "a quarter of a simulated home, ten minutes of review a week")
     f1, false, asked = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
     _draw_two(f1, weeks, lambda one: one.macro_f1(known))
-    f1.set(ylabel="macro F1 of frames")
+    f1.set(ylabel="macro F1 of frames", ylim=(0, 1))
     f1.legend(loc="lower right")
+    for number, name in _BAD:
+        if number <= len(weeks):
+            f1.text(number, 0.02, name, ha="center", va="bottom", rotation=90, color="tab:red")
     _draw_two(false, weeks, lambda one: sum(one.false_events.values()))
     false.set(ylabel="false events a day", ylim=(0, None))
     numbers = [week.number for week in weeks]
@@ -69,17 +73,20 @@ def _known() -> list[str]:
 
 
 def _draw_two(axes: Any, weeks: Sequence[Week], figure: Callable[[Scored], float]) -> None:
-    numbers = [week.number for week in weeks]
-    axes.plot(numbers, [figure(week.alone) for week in weeks], "s--", color="grey", label="starter")
-    values = [figure(week.circle) for week in weeks]
-    axes.plot(numbers, values, "-", color="tab:blue", label="circle")
-    for week, value in zip(weeks, values, strict=True):
-        face = "tab:blue" if week.promoted else "white"
-        axes.plot(week.number, value, "o", color="tab:blue", markerfacecolor=face)
+    numbers, alone = [week.number for week in weeks], [figure(week.alone) for week in weeks]
+    axes.plot(numbers, alone, "s--", color="grey", label="starter alone")
+    axes.plot(numbers, [figure(week.circle) for week in weeks], "-", color="tab:blue")
+    for promoted, face, name in (
+        (True, "tab:blue", "circle, its next model let label"),
+        (False, "white", "circle, its next model refused"),
+    ):
+        some = [week for week in weeks if week.promoted == promoted]
+        values = [figure(week.circle) for week in some]
+        places = [week.number for week in some]
+        axes.plot(places, values, "o", color="tab:blue", markerfacecolor=face, label=name)
 
 
 def _shade(axes: Any, weeks: int) -> None:
-    bad = (WRONG_WEEK, "wrong marks"), (MICROPHONE_WEEK, "another microphone")
-    for number, name in bad:
+    for number, _ in _BAD:
         if number <= weeks:
-            axes.axvspan(number - 0.5, number + 0.5, color="tab:red", alpha=0.1, label=name)
+            axes.axvspan(number - 0.5, number + 0.5, color="tab:red", alpha=0.1)
