@@ -19,9 +19,9 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 from hearthlog.models.starter import GENERAL
 
-_LOOK_SECONDS = 1.0
+LOOK_SECONDS = 1.0
 
-_Identity = tuple[int, int, int, int] | None
+FileIdentity = tuple[int, int, int, int] | None
 
 
 class Loaded(NamedTuple):
@@ -59,12 +59,12 @@ class ModelWatch:
     def __init__(self, path: Path, requests: SimpleQueue[None]) -> None:
         self._path = path
         self._requests = requests
-        self._seen = _identity(path)  # before it is loaded: a later file is another one
+        self._seen = file_identity(path)  # before it is loaded: a later file is another one
         self._starts_with_starter = path == DEFAULT_MODEL and self._seen is None
-        self.first = _load(Path(GENERAL) if self._starts_with_starter else path)
+        self.first = load_checked(Path(GENERAL) if self._starts_with_starter else path)
         self.ready: Loaded | None = None
         self._awaited: Path | None = None  # the judgement that the model in the file lacks
-        self._judged: _Identity = None
+        self._judged: FileIdentity = None
         self._last = self.first.model
         _warn_if_simulated(self._last)
         self._results: SimpleQueue[Loaded | str] = SimpleQueue()
@@ -97,20 +97,20 @@ class ModelWatch:
     def _watch(self) -> None:
         while not self._closed.is_set():
             requested = self._wait()
-            now = _identity(self._path)
+            now = file_identity(self._path)
             nothing_yet = self._starts_with_starter and now is None and self._seen is None
             changed = now != self._seen or self._awaited_judgement() != self._judged
             if (changed or requested) and not (nothing_yet or self._closed.is_set()):
                 self._seen = now
                 self._look()
 
-    def _awaited_judgement(self) -> _Identity:
-        return None if self._awaited is None else _identity(self._awaited)
+    def _awaited_judgement(self) -> FileIdentity:
+        return None if self._awaited is None else file_identity(self._awaited)
 
     def _wait(self) -> bool:
         """Wait for the next check; return whether it was requested."""
         try:
-            self._requests.get(timeout=_LOOK_SECONDS)
+            self._requests.get(timeout=LOOK_SECONDS)
         except Empty:
             return False
         while not self._requests.empty():
@@ -120,9 +120,9 @@ class ModelWatch:
     def _look(self) -> None:
         self._awaited = self._judged = None
         try:
-            loaded = _load(self._path)
+            loaded = load_checked(self._path)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
-            if _identity(self._path) == self._seen:  # else it is still being written
+            if file_identity(self._path) == self._seen:  # else it is still being written
                 self._refuse(str(error) or repr(error))
             return
         if loaded.classifier.feature_set != self.first.classifier.feature_set:
@@ -143,7 +143,7 @@ class ModelWatch:
         """Tell why a model may not label; empty if it may."""
         folder = self._path.parent
         awaited = judgement_path(folder, model.sha256)
-        judged = _identity(awaited)  # before it is read: a later one is another one
+        judged = file_identity(awaited)  # before it is read: a later one is another one
         judgement = read_judgement(folder, model.sha256)
         if judgement is not None and judgement.may_speak:
             return ""
@@ -157,30 +157,53 @@ class ModelWatch:
         name = name or self._path.stem
         text = f"model {name} refused: {reason}; going on with {self._last.name}"
         self._results.put(text)
-        _say(text)
+        say(text)
 
 
 def _warn_if_simulated(model: Model) -> None:
     if model.description.training_data.simulated:
-        _say(
+        say(
             f"model {model.name} has learned from simulated sounds alone and is mostly wrong about "
             "real ones, however sure it is; train one from recordings"
         )
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """Print a line on standard error.
+
+    Parameters
+    ----------
+    text : str
+    """
     with suppress(OSError):  # the log says it too
         sys.stderr.write(f"hearthlog: {text}\n")
         sys.stderr.flush()
 
 
-def _load(path: Path) -> Loaded:
+def load_checked(path: Path) -> Loaded:
+    """Load a model, and check that it can classify.
+
+    Parameters
+    ----------
+    path : Path
+        Model file, or the name of a starter model.
+
+    Raises
+    ------
+    ModelError
+        If it cannot be used.
+    """
     model = load_model(path)
     return Loaded(model, Classifier(model))
 
 
-def _identity(path: Path) -> _Identity:
-    """Return what differs between two files of one name; None if there is no file."""
+def file_identity(path: Path) -> FileIdentity:
+    """Return what differs between two files of one name; None if there is no file.
+
+    Parameters
+    ----------
+    path : Path
+    """
     try:
         status = path.stat()
     except OSError:

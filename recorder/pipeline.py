@@ -10,10 +10,10 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
-from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
-from hearthlog.models.labels.segments import Segment
+from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
+from hearthlog.recorder.label_stream import LabelStream
 from hearthlog.recorder.sound_watch import SoundWatch
 from hearthlog.recorder.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.recorder.stream_messages import EncodedMessage
@@ -22,7 +22,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
+from hearthlog.schemas.messages.topics import CANDIDATE, DIAGNOSTICS, LIVE, ROSOUT, topic
 
 
 class Pipeline:
@@ -38,15 +38,13 @@ class Pipeline:
         For this feature set. Without one there are no labels.
     statistics_every : int
         Frames from one statistics message to the next: those of the frames whose number it divides.
+    candidate : Classifier or None
+        Of a model on trial, which labels beside the other one.
 
     Attributes
     ----------
     microphone : str
     feature_set : FeatureSet
-    segments_converged : bool
-        Whether sound before the first frame would leave no trace in the segments to come.
-    last_labels : FrameLabels or None
-        Labels of the frames that were pushed last; None if they have none.
     """
 
     def __init__(
@@ -55,12 +53,12 @@ class Pipeline:
         features: FeatureSet,
         classifier: Classifier | None = None,
         statistics_every: int = LOGGED_EVERY,
+        candidate: Classifier | None = None,
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
-        self.segments_converged = False
-        self.last_labels: FrameLabels | None = None
-        self._labeller = None if classifier is None else Labeller(classifier)
+        self._live = self._stream(LIVE, classifier)
+        self._candidate = self._stream(CANDIDATE, candidate)
         self._statistics_every = statistics_every
         self._features = features.extractor()
         self._statistics = RollingStatistics(features.window_frames, features.width)
@@ -74,7 +72,17 @@ class Pipeline:
     @property
     def classes(self) -> tuple[str, ...] | None:
         """The classes of the model in use; None without one."""
-        return None if self._labeller is None else self._labeller.classes
+        return None if self._live is None else self._live.classes
+
+    @property
+    def segments_converged(self) -> bool:
+        """Whether sound before the first frame would leave no trace in the segments to come."""
+        return self._live is not None and self._live.segments_converged
+
+    @property
+    def last_labels(self) -> FrameLabels | None:
+        """Labels of the frames that were pushed last; None if they have none."""
+        return None if self._live is None else self._live.last
 
     def push(self, event: Event) -> list[EncodedMessage]:
         """Turn an event of a source into messages.
@@ -118,7 +126,7 @@ class Pipeline:
         messages = [
             *self._feature_messages("features", frames, stamps, {"values": features}),
             *self._feature_messages("statistics", frames[logged], stamps[logged], statistics),
-            *self._label(features, self._track_floor(features, first), first, stamps),
+            *self._labels(features, self._track_floor(features, first), first, stamps),
         ]
         messages.sort(key=attrgetter("log_time"))
         recent = np.concatenate([self._recent_stamps, stamps])
@@ -157,18 +165,47 @@ class Pipeline:
         opening : list of EncodedMessage
             First messages of the log of this model.
         """
-        closing, earlier = self._close(stamp), self._labeller
-        self._labeller = None if classifier is None else Labeller(classifier)
+        earlier, self._live = self._live, self._stream(LIVE, classifier)
+        closing = [] if earlier is None else earlier.close(stamp)
+        self._follow(self._live, frame, 0 if earlier is None else frame - earlier.delay)
+        return closing, self.report("model", stamp, _from_frame("model", model, frame))
+
+    def change_candidate(
+        self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
+    ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
+        """Use another candidate from a frame on; all else goes on.
+
+        Parameters
+        ----------
+        model : Model or None
+            For the same feature set; None for no candidate.
+        classifier : Classifier or None
+            Of that model.
+        frame, stamp : int
+            Number of the next frame, and its start in nanoseconds of UTC.
+
+        Returns
+        -------
+        closing, opening : list of EncodedMessage
+            As of `change_model`.
+        """
+        closing = [] if self._candidate is None else self._candidate.close(stamp)
+        self._candidate = self._stream(CANDIDATE, classifier)
+        self._follow(self._candidate, frame, 0)
+        return closing, self.report("model", stamp, _from_frame("candidate", model, frame))
+
+    def _stream(self, labelling: str, classifier: Classifier | None) -> LabelStream | None:
+        return None if classifier is None else LabelStream(self.microphone, labelling, classifier)
+
+    def _follow(self, stream: LabelStream | None, frame: int, unlabelled: int) -> None:
+        """Let a stream begin at a frame, with what is remembered of the frames before."""
         recent, floors = self._statistics.recent, self._recent_floors
-        if self._labeller is not None and recent is not None:
-            stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
-            if floors is not None:
-                floors = floors[max(len(floors) - len(recent), 0) :]
-            unlabelled = 0 if earlier is None else frame - earlier.timing.delay
-            self._labeller.follow(recent, floors, stamps, frame, unlabelled)
-        who = "no model" if model is None else f"model {model.name} ({model.sha256[:12]})"
-        notice = Notice(OK, f"{who} from frame {frame} on")
-        return closing, self.report("model", stamp, notice)
+        if stream is None or recent is None:
+            return
+        stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
+        if floors is not None:
+            floors = floors[max(len(floors) - len(recent), 0) :]
+        stream.follow(recent, floors, stamps, frame, unlabelled)
 
     def report(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Turn a notice into messages.
@@ -225,30 +262,17 @@ class Pipeline:
         self._recent_floors = np.concatenate(recent)[-self.feature_set.window_frames :]
         return floors
 
-    def _label(
+    def _labels(
         self, features: Float32, floors: Floors | None, first: int, stamps: Int64
     ) -> list[EncodedMessage]:
-        self.last_labels = None
-        if self._labeller is None:
-            return []
-        labels, segments = self._labeller.push(features, floors, first, stamps)
-        if not len(labels.frames):
-            return []
-        self.last_labels = labels
-        self.segments_converged |= self._labeller.segments_converged
-        columns = labels.columns(self.microphone)
-        return [
-            *self._segment_messages(segments),
-            *self._messages("label", message_types.LABEL, labels.known_at, columns),
-        ]
+        streams = [stream for stream in (self._live, self._candidate) if stream is not None]
+        return [one for stream in streams for one in stream.push(features, floors, first, stamps)]
 
     def _close(self, end: int) -> list[EncodedMessage]:
         """End the segments at `end`; the next frame begins anew."""
-        if self._labeller is None:
-            return []
-        segments = self._labeller.close(end)
-        self.segments_converged |= bool(segments)
-        return self._segment_messages(segments)
+        streams = [stream for stream in (self._live, self._candidate) if stream is not None]
+        messages = [message for stream in streams for message in stream.close(end)]
+        return sorted(messages, key=attrgetter("log_time"))
 
     def _feature_messages(
         self, kind: str, frames: Int64, stamps: Int64, arrays: Mapping[str, Float32]
@@ -271,20 +295,6 @@ class Pipeline:
             EncodedMessage(time, name, row)
             for time, row in zip(log_times.tolist(), rows, strict=True)
         ]
-
-    def _segment_messages(self, segments: list[Segment]) -> list[EncodedMessage]:
-        if self._labeller is None or not segments:
-            return []
-        classes = self._labeller.classes
-        times = np.array([segment.decided_at for segment in segments])
-        columns = segment_columns(segments, classes, self.microphone)
-        messages = []
-        for encoded, segment in zip(
-            self._messages("segment", message_types.SEGMENT, times, columns), segments, strict=True
-        ):
-            line = rosout.segment_line(self.microphone, segment, classes[segment.label])
-            messages += [encoded, EncodedMessage(segment.decided_at, ROSOUT, line)]
-        return messages
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         if health.level == OK and (problem := self._watch.problem()):
@@ -323,3 +333,8 @@ class Pipeline:
             )
         )
         return EncodedMessage(stamp, DIAGNOSTICS, data)
+
+
+def _from_frame(what: str, model: Model | None, frame: int) -> Notice:
+    who = f"no {what}" if model is None else f"{what} {model.name} ({model.sha256[:12]})"
+    return Notice(OK, f"{who} from frame {frame} on")

@@ -14,12 +14,14 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile.card import model_attachments
+from hearthlog.models.modelfile.modelfile import SUFFIX
+from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
 from hearthlog.recorder.log import LogDescription, RollingLog
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.model_watch import Loaded, ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recovery import Recovered, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -160,11 +162,15 @@ def record(
         As `record_files`.
     """
     with ExitStack() as stack:
-        watch = None
+        watch = candidates = None
         if settings.model is not None and settings.model != NO_MODEL:
             watch = ModelWatch(settings.model, reload_requests or SimpleQueue())
             stack.enter_context(closing(watch))
-        recording = RecordingSession(settings, microphone.name, source.device, watch)
+            if settings.model.suffix == SUFFIX:  # a starter has no folder
+                features = watch.first.classifier.feature_set
+                candidates = CandidateWatch(settings.model.parent, features)
+                stack.enter_context(closing(candidates))
+        recording = RecordingSession(settings, microphone.name, source.device, watch, candidates)
         try:
             for event in source.events(stop):
                 recording.add(event)
@@ -185,6 +191,8 @@ class RecordingSession:
         Name of the source.
     watch : ModelWatch or None
         Gives the models, one after the other; None for no labels.
+    candidates : CandidateWatch or None
+        Gives the models that label on trial beside them.
 
     Attributes
     ----------
@@ -200,21 +208,32 @@ class RecordingSession:
     """
 
     def __init__(
-        self, settings: Settings, microphone: str, device: str, watch: ModelWatch | None
+        self,
+        settings: Settings,
+        microphone: str,
+        device: str,
+        watch: ModelWatch | None,
+        candidates: CandidateWatch | None = None,
     ) -> None:
         self._settings = settings
         self._device = device
         self._watch = watch
-        model, classifier = (None, None) if watch is None else watch.first
+        self._candidates = candidates
+        self._model: Model | None
+        self._model, classifier = (None, None) if watch is None else watch.first
+        self._candidate, candidate = self._other(None if candidates is None else candidates.first)
         features = _configured_features(settings, classifier)
-        self._pipeline = Pipeline(microphone, features, classifier, settings.statistics_every)
+        self._pipeline = Pipeline(
+            microphone, features, classifier, settings.statistics_every, candidate
+        )
         self._log = RollingLog(
-            self._describe(model),
+            self._describe(),
             settings.max_bag_duration,
             settings.flush_seconds,
             settings.sync_seconds,
         )
         self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
+        self._news: list[Loaded | None] = []  # candidates that no log has begun for yet
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
 
@@ -231,6 +250,8 @@ class RecordingSession:
             self.summary.frames_lost += event.frames_lost
         if isinstance(event, Frames) and self._watch is not None:
             self._look_for_model(self._watch, event)
+        if isinstance(event, Frames) and self._candidates is not None:
+            self._look_for_candidate(self._candidates, event)
         notices = self._clips.before(event)
         self._log.write(self._pipeline.push(event))
         notices += self._clips.after(event, self._pipeline.last_labels)
@@ -266,16 +287,41 @@ class RecordingSession:
             self.summary.models_refused += 1
             self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, text)))
         if watch.ready is not None and self._log.may_begin(stamp):
-            model, classifier = watch.ready
+            self._model, classifier = watch.ready
             watch.ready = None
-            closing, opening = self._pipeline.change_model(model, classifier, frames.first, stamp)
-            self._log.begin_anew(self._describe(model), closing)
-            self._log.write(opening)
+            messages = self._pipeline.change_model(self._model, classifier, frames.first, stamp)
+            self._begin_log(*messages)
 
-    def _describe(self, model: Model | None) -> LogDescription:
+    def _look_for_candidate(self, candidates: CandidateWatch, frames: Frames) -> None:
+        """Report candidates that were refused, and let another one label from these frames on."""
+        stamp = int(frames.stamps[0])
+        self._news += candidates.news()
+        for text in candidates.refusals():
+            self.summary.models_refused += 1
+            self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, text)))
+        if self._news and self._log.may_begin(stamp):
+            model, classifier = self._other(self._news[-1])
+            self._news.clear()
+            if model is not self._candidate:
+                self._candidate = model
+                messages = self._pipeline.change_candidate(model, classifier, frames.first, stamp)
+                self._begin_log(*messages)
+
+    def _other(self, candidate: Loaded | None) -> tuple[Model | None, Classifier | None]:
+        """Return a candidate, unless it is the model in use."""
+        in_use = "" if self._model is None else self._model.sha256
+        return (None, None) if candidate is None or candidate.model.sha256 == in_use else candidate
+
+    def _begin_log(
+        self, closing: Sequence[EncodedMessage], opening: Sequence[EncodedMessage]
+    ) -> None:
+        self._log.begin_anew(self._describe(), closing)
+        self._log.write(opening)
+
+    def _describe(self) -> LogDescription:
         features = self._pipeline.feature_set
-        info = stream_info(self._pipeline.microphone, self._device, features, model)
-        return describe_log(self._settings, info, features, model)
+        info = stream_info(self._pipeline.microphone, self._device, features, self._model)
+        return describe_log(self._settings, info, features, self._model, self._candidate)
 
 
 def _configured_features(settings: Settings, classifier: Classifier | None) -> FeatureSet:
@@ -292,7 +338,11 @@ def _configured_features(settings: Settings, classifier: Classifier | None) -> F
 
 
 def describe_log(
-    settings: Settings, info: Any, features: FeatureSet, model: Model | None
+    settings: Settings,
+    info: Any,
+    features: FeatureSet,
+    model: Model | None,
+    candidate: Model | None = None,
 ) -> LogDescription:
     """Return the description of the logs of a recording.
 
@@ -304,6 +354,8 @@ def describe_log(
     features : FeatureSet
     model : Model or None
         The model that labels the sound; None for no labels.
+    candidate : Model or None
+        A model on trial that labels beside it.
     """
     configuration = settings.model_dump_json(indent=2, exclude={"output", "model"}).encode()
     classes = None if model is None else list(model.classes)
@@ -317,10 +369,17 @@ def describe_log(
         model_sha256=info.model_sha256,
         timezone=settings.timezone,
     )
+    if candidate is not None:
+        metadata |= {"candidate": candidate.name, "candidate_sha256": candidate.sha256}
     return LogDescription(
         root=settings.output,
         node=settings.node,
-        topics=topics_of(info.header.frame_id, features.feature_names, classes),
+        topics=topics_of(
+            info.header.frame_id,
+            features.feature_names,
+            classes,
+            None if candidate is None else list(candidate.classes),
+        ),
         infos=[info],
         metadata=metadata,
         attachments=attachments if model is None else [*attachments, *model_attachments(model)],

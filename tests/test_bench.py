@@ -11,11 +11,14 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
 
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.bench import features, history, reading, timing, writing
+from hearthlog.tools.bench import features, history, queue, reading, timing, writing
 from hearthlog.tools.bench.labmic import make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.workload import Workload
+from hearthlog.tools.home.clips import SHIPPED
 from hearthlog.tools.home.simulate import write_training_set
 
 
@@ -184,3 +187,32 @@ def test_a_run_is_recorded_where_it_is_asked_for(tmp_path):
     (run,) = map(json.loads, runs.read_text("utf-8").splitlines())
     assert run["sound"] == "sound"
     assert run["figures"]["recording: hearthlog record"]["value"] > 0
+
+
+def test_the_queue_is_compared_with_chance_run_by_run():
+    def of(run, chosen, macro):
+        return [queue.Outcome(run, count, chosen, 80.0, macro, 0.9) for count in (20, 60)]
+
+    results = [
+        *of("a", "queue", 0.7),
+        *of("a", "random", 0.6),
+        *of("a", "random", 0.64),
+        *of("b", "queue", 0.5),
+        *of("b", "random", 0.55),
+        *of("b", "random", 0.51),
+    ]
+    rows = queue.table_of(results).rows[:6]
+    assert [row.value for row in rows] == pytest.approx([0.6, 0.025, 1, 1, 80.0, 0.9])
+    assert [row.verdict for row in rows] == ["", "MISSED", "", "MISSED", "", ""]
+
+
+def test_scenes_of_which_the_truth_is_known_are_asked_by_the_queue_and_by_chance(tmp_path):
+    conditions = queue.Conditions(starter_file(GENERAL), SHIPPED, 1.5, 1)
+    scene = queue.recorded(tmp_path / "scene", conditions, queue.ROOMS[0], 0)
+    for spans in (queue.by_queue(scene.logs, 5), queue.by_chance(scene.logs, 5, [0])):
+        assert len(spans) == 5
+        assert all(scene.truth.starts[0] <= s.start < s.end <= scene.truth.ends[-1] for s in spans)
+    heard = queue.heard(scene, load_model(conditions.model))
+    assert len(heard.inputs) == len(heard.quiet) == len(heard.true) > 200
+    silent = heard.true[heard.quiet] == "silence"
+    assert silent.mean() > 0.8  # the gate is silent where nothing sounds

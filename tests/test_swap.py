@@ -231,7 +231,7 @@ def test_a_file_that_is_written_over_in_its_place_is_taken_too(folder):
 
 
 def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 0.01)
     path = folder / "one.safetensors"
     watch = ModelWatch(path, SimpleQueue())
     (folder / "copy").write_bytes(path.read_bytes())
@@ -243,7 +243,7 @@ def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
 
 
 def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 3600)
+    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 3600)
     asked = SimpleQueue()
     watch = ModelWatch(folder / "champion.safetensors", asked)
     promote(folder, "two")

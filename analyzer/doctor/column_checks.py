@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import Findings
-from hearthlog.analyzer.doctor.topic_types import GAP, LABEL, SEGMENT
+from hearthlog.analyzer.doctor.topic_types import (
+    CANDIDATE_LABEL,
+    CANDIDATE_SEGMENT,
+    GAP,
+    LABEL,
+    SEGMENT,
+)
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -15,7 +21,12 @@ from hearthlog.schemas.messages.topics import ROSOUT
 STAMP = "header.stamp"
 _CLOCK_SET = "the clock was set"
 _SUM_TOLERANCE = 1e-4
-_LATE = {SEGMENT: 75_000_000_000, LABEL: 1_010_000_000}  # ns, with what stamps may be off
+_LATE = {  # ns, with what stamps may be off
+    LABEL: 1_010_000_000,
+    CANDIDATE_LABEL: 1_010_000_000,
+    SEGMENT: 75_000_000_000,
+    CANDIDATE_SEGMENT: 75_000_000_000,
+}
 
 
 def check_stamps(
@@ -43,7 +54,7 @@ def check_stamps(
     """
     times = columns.log_times
     stamps = columns["stamp" if kind == ROSOUT else STAMP]
-    if kind in {SEGMENT, GAP}:
+    if kind in {SEGMENT, CANDIDATE_SEGMENT, GAP}:
         stamps = stamps + columns["duration"]
     late = times - stamps
     if kind == "info" and not named:

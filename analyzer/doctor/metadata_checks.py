@@ -13,7 +13,12 @@ from mcap.records import Channel, Schema
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
 from hearthlog.analyzer.doctor.message_checks import MessageChecks
-from hearthlog.analyzer.doctor.topic_types import LOG_NAME, split_topic, topic_type
+from hearthlog.analyzer.doctor.topic_types import (
+    CANDIDATE_LABEL,
+    LOG_NAME,
+    split_topic,
+    topic_type,
+)
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION
@@ -152,14 +157,18 @@ class MetadataChecks:
     def _check_topics(self) -> None:
         """Compare the channels with those that a recorder writes."""
         expected: dict[str, Topic] = {}
+        records = self._data.metadata.get(METADATA, [])
+        candidate = any(record.get("candidate") for record in records)
         for microphone, info in self._infos.items():
             classes = list(info["labels"]) or None
-            topics = topics_of(microphone, list(info["feature_names"]), classes)
+            topics = topics_of(
+                microphone, list(info["feature_names"]), classes, [] if candidate else None
+            )
             expected |= {topic.name: topic for topic in topics}
         for name, topic in expected.items():
             if name not in self._channels and split_topic(name)[0]:
                 self._error("topics", f"{name} is missing")
-            if name in self._channels:
+            if name in self._channels and split_topic(name)[1] != CANDIDATE_LABEL:
                 self._check_arrays(self._channels[name], topic)
         counts = Counter(c.topic for c in self._data.definitions.channels.values())
         for name, channel in self._channels.items():

@@ -3,9 +3,10 @@
 import re
 
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, ROSOUT, parse_topic
+from hearthlog.schemas.messages.topics import CANDIDATE, DIAGNOSTICS, LIVE, ROSOUT, parse_topic
 
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
+CANDIDATE_LABEL, CANDIDATE_SEGMENT = f"{CANDIDATE}/{LABEL}", f"{CANDIDATE}/{SEGMENT}"
 TYPES = {
     "info": message_types.STREAM_INFO,
     FEATURES: message_types.FEATURES,
@@ -13,6 +14,8 @@ TYPES = {
     LABEL: message_types.LABEL,
     SEGMENT: message_types.SEGMENT,
     GAP: message_types.GAP,
+    CANDIDATE_LABEL: message_types.LABEL,
+    CANDIDATE_SEGMENT: message_types.SEGMENT,
 }
 ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
 LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
@@ -33,9 +36,10 @@ def split_topic(topic: str) -> tuple[str, str]:
         Such as `mic` and `features`; nothing and the whole topic if it is none of a microphone.
     """
     name = parse_topic(topic)
-    if name is None or name.labelling != LIVE or name.kind not in TYPES:
+    if name is None:
         return "", topic
-    return name.microphone, name.kind
+    kind = name.kind if name.labelling == LIVE else f"{name.labelling}/{name.kind}"
+    return (name.microphone, kind) if kind in TYPES else ("", topic)
 
 
 def topic_type(topic: str) -> str | None:

@@ -14,8 +14,7 @@ from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.provenance import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import Topic, labelling_topic, relabelling
+from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 
 _TAIL = 1 << 16  # bytes
 _RUN = ("label", "start", "frames", "confidence")
@@ -60,12 +59,7 @@ def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[T
         `/<microphone>/relabel/<model>/label` and `…/segment`; what a topic cannot hold of the
         model's name is `_` there.
     """
-    labelling = relabelling(model)
-    label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
-    return (
-        Topic(label, message_types.LABEL, array_names={"probabilities": classes}),
-        Topic(segment, message_types.SEGMENT),
-    )
+    return label_topics(microphone, relabelling(model), classes)
 
 
 def log_digest(log: Path) -> str:

@@ -10,11 +10,13 @@ from hearthlog.schemas.messages import message_types
 
 DIAGNOSTICS = "/diagnostics"
 ROSOUT = "/rosout"
-LIVE, REVIEW, RELABEL = "live", "review", "relabel"  # labellings; `relabel/<model>` by its model
+# Labellings: the recorder's, that of a model on trial beside it, a reviewer's, and by its model
+# `relabel/<model>`.
+LIVE, CANDIDATE, REVIEW, RELABEL = "live", "candidate", "review", "relabel"
 _MICROPHONE = "[a-z](?:_?[a-z0-9])*"
-_OF_LAYER = rf"{REVIEW}|{RELABEL}/\w{{1,200}}"
-LABELLING = re.compile(f"{LIVE}|{_OF_LAYER}", re.ASCII)
-_TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_OF_LAYER})/)?(\w+)", re.ASCII)
+_NOT_LIVE = rf"{CANDIDATE}|{REVIEW}|{RELABEL}/\w{{1,200}}"
+LABELLING = re.compile(f"{LIVE}|{_NOT_LIVE}", re.ASCII)
+_TOPIC = re.compile(rf"/({_MICROPHONE})/(?:({_NOT_LIVE})/)?(\w+)", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class TopicName(NamedTuple):
     """The parts of the name of a topic."""
 
     microphone: str
-    labelling: str  # `live`, `review` or `relabel/<model>`
+    labelling: str  # `live`, `candidate`, `review` or `relabel/<model>`
     kind: str  # `features`, `label`, `segment` …
 
 
@@ -101,7 +103,7 @@ def labelling_topic(microphone: str, labelling: str, kind: str) -> str:
     microphone : str
         Its name.
     labelling : str
-        `live`, `review` or `relabel/<model>`.
+        `live`, `candidate`, `review` or `relabel/<model>`.
     kind : str
         `label`, `segment` or `mark`.
     """
@@ -148,8 +150,34 @@ def microphone_of(topic: str) -> str:
     return parts[1] if len(parts) > 2 else ""
 
 
+def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
+    """Return the topics of a labelling.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    labelling : str
+        `live`, `candidate` or `relabel/<model>`.
+    classes : sequence of str
+        Names of the classes, in the order of the probabilities.
+
+    Returns
+    -------
+    labels, segments : Topic
+    """
+    label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
+    return (
+        Topic(label, message_types.LABEL, array_names={"probabilities": classes}),
+        Topic(segment, message_types.SEGMENT),
+    )
+
+
 def topics_of(
-    microphone: str, feature_names: Sequence[str], classes: Sequence[str] | None
+    microphone: str,
+    feature_names: Sequence[str],
+    classes: Sequence[str] | None,
+    candidate_classes: Sequence[str] | None = None,
 ) -> list[Topic]:
     """List the topics that a recorder writes for a microphone.
 
@@ -162,6 +190,8 @@ def topics_of(
     classes : sequence of str or None
         Names of the classes, in the order of the probabilities; None for a recorder without a
         model, which writes no labels and no segments.
+    candidate_classes : sequence of str or None
+        Those of a candidate, which labels beside it; None without one.
     """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [
@@ -177,9 +207,9 @@ def topics_of(
         Topic(ROSOUT, message_types.LOG, _OF_ROSOUT),
     ]
     if classes is not None:
-        names = {"probabilities": classes}
-        topics.append(Topic(topic(microphone, "label"), message_types.LABEL, array_names=names))
-        topics.append(Topic(topic(microphone, "segment"), message_types.SEGMENT))
+        topics += label_topics(microphone, LIVE, classes)
+    if candidate_classes is not None:
+        topics += label_topics(microphone, CANDIDATE, candidate_classes)
     return topics
 
 

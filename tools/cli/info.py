@@ -55,12 +55,27 @@ def info(
         print(json.dumps(_as_json(summary) | {"checked": checked, "next": following}, indent=2))
     else:
         _print(summary)
+        if (candidate := _candidate(summary, path)) is not None:
+            print(printable(candidate))
         for line in () if accuracy is None else accuracy.lines():
             print(printable(line))
         if following is not None:
             print(printable(f"next: {following}"))
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
+
+
+def _candidate(summary: "Summary", path: Path) -> str | None:
+    """Name the model that labels beside the recorder's; None if none did."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.schemas.messages.topics import CANDIDATE
+
+    if not any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics):
+        return None
+    records = find_home_logs([path]).records()
+    record = next((one for one in records if one.get("candidate")), {})
+    name, sha256 = record.get("candidate", "unknown"), record.get("candidate_sha256", "")
+    return f"candidate: {name} ({sha256[:12]}), on trial: `hearthlog models compare --live`"
 
 
 def _accuracy(summary: "Summary", path: Path) -> "Accuracy | None":

@@ -86,6 +86,10 @@ def compare(
     logs: Annotated[
         Path | None, typer.Option(help="Folder of logs with review layers, or one log.")
     ] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Compare what champion and candidate said while recording."),
+    ] = False,
     scenario: OwnScenario = None,
     as_json: Json = False,
 ) -> None:
@@ -98,8 +102,13 @@ def compare(
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
 
+    if live:
+        if data or scenario or (a, b) != ("champion", "candidate"):
+            wrong_use("--live is of champion and candidate, and of --logs alone")
+        _compare_live(logs or _logs_folder(), as_json=as_json)
+        return
     if (data is None) == (logs is None):
-        wrong_use("give either --data or --logs")
+        wrong_use("give either --data or --logs, or --live")
     place = models_folder(folder)
     first, second = _named(place, a), _named(place, b)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
@@ -188,6 +197,18 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
         judgement = verdict.judgement
     if not judgement.may_speak:
         raise ModelError(refusal(judgement, model.name))
+
+
+def _compare_live(logs: Path, *, as_json: bool) -> None:
+    from hearthlog.analyzer.gate.on_trial import compare_on_trial
+    from hearthlog.tools.cli.trial import print_trial, trial_as_json
+
+    trial = compare_on_trial([logs])
+    if as_json:
+        print(json.dumps(trial_as_json(trial), indent=2))
+    else:
+        print_trial(trial)
+    end_with_warnings(trial.losses)
 
 
 def _logs_folder() -> Path:

@@ -1,0 +1,134 @@
+"""Labels and segments of one model, as messages."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.features.floor import Floors
+from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
+from hearthlog.models.labels.segments import Segment
+from hearthlog.recorder import rosout
+from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
+from hearthlog.schemas.messages.topics import LIVE, ROSOUT, labelling_topic
+
+
+class LabelStream:
+    """What one model says of a stream of frames.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    labelling : str
+        `live`, or `candidate`, whose segments are not told in `/rosout`.
+    classifier : Classifier
+
+    Attributes
+    ----------
+    classes : tuple of str
+        Names behind the columns of the probabilities.
+    segments_converged : bool
+        Whether sound before the first frame would leave no trace in the segments to come.
+    last : FrameLabels or None
+        Labels of the frames that were pushed last; None if they have none.
+    """
+
+    def __init__(self, microphone: str, labelling: str, classifier: Classifier) -> None:
+        self.classes = classifier.classes
+        self.segments_converged = False
+        self.last: FrameLabels | None = None
+        self._microphone = microphone
+        self._labelling = labelling
+        self._labeller = Labeller(classifier)
+
+    @property
+    def delay(self) -> int:
+        """Frames from one to that at which its label is known."""
+        return self._labeller.timing.delay
+
+    def follow(
+        self, features: Float32, floors: Float64 | None, stamps: Int64, frame: int, unlabelled: int
+    ) -> None:
+        """Take the place of another stream before a frame; as `Labeller.follow`.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+            Of the last frames before it.
+        floors : np.ndarray [shape=(m, b)], float64, or None
+        stamps : np.ndarray [shape=(n,)], int64
+        frame : int
+            Number of the frame.
+        unlabelled : int
+            Number of the first frame that has no label yet.
+        """
+        self._labeller.follow(features, floors, stamps, frame, unlabelled)
+
+    def push(
+        self, features: Float32, floors: Floors | None, first: int, stamps: Int64
+    ) -> list[EncodedMessage]:
+        """Turn successive frames into messages.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        floors : Floors or None
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+
+        Returns
+        -------
+        list of EncodedMessage
+            Segments, then labels; each in the order of their log times.
+        """
+        self.last = None
+        labels, segments = self._labeller.push(features, floors, first, stamps)
+        if not len(labels.frames):
+            return []
+        self.last = labels
+        self.segments_converged |= self._labeller.segments_converged
+        columns = labels.columns(self._microphone)
+        return [
+            *self._segment_messages(segments),
+            *self._messages("label", message_types.LABEL, labels.known_at, columns),
+        ]
+
+    def close(self, end: int) -> list[EncodedMessage]:
+        """End the segments of a sound; the next frame begins anew.
+
+        Parameters
+        ----------
+        end : int
+            End of the sound, in nanoseconds of UTC.
+        """
+        segments = self._labeller.close(end)
+        self.segments_converged |= bool(segments)
+        return self._segment_messages(segments)
+
+    def _segment_messages(self, segments: list[Segment]) -> list[EncodedMessage]:
+        times = np.array([segment.decided_at for segment in segments], np.int64)
+        columns = segment_columns(segments, self.classes, self._microphone)
+        encoded = self._messages("segment", message_types.SEGMENT, times, columns)
+        if self._labelling != LIVE:
+            return encoded
+        messages = []
+        for one, segment in zip(encoded, segments, strict=True):
+            line = rosout.segment_line(self._microphone, segment, self.classes[segment.label])
+            messages += [one, EncodedMessage(segment.decided_at, ROSOUT, line)]
+        return messages
+
+    def _messages(
+        self, kind: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
+    ) -> list[EncodedMessage]:
+        name = labelling_topic(self._microphone, self._labelling, kind)
+        rows = encode_rows(typename, columns, len(log_times)) if len(log_times) else []
+        return [
+            EncodedMessage(time, name, row)
+            for time, row in zip(log_times.tolist(), rows, strict=True)
+        ]

@@ -1,0 +1,214 @@
+"""A candidate labels beside the model in use: it comes, speaks, goes, and is only a candidate."""
+
+import json
+import signal
+from contextlib import suppress
+
+import pytest
+from kept import keep_models
+from logreader import LogReader
+from logs import read
+from spliced import run
+from test_swap import count, labels_by, recording, said, wait_for
+
+from hearthlog.analyzer.logs.coverage import find_coverage
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.registry import promote
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.messages.message_types import nanoseconds
+from hearthlog.schemas.times import NANOSECONDS
+
+OF_CANDIDATE = ["/mic/candidate/label", "/mic/candidate/segment"]
+
+
+@pytest.fixture
+def folder(tmp_path, model_file):
+    return keep_models(tmp_path / "models", model_file)
+
+
+@pytest.fixture
+def logs(folder, tmp_path, day, capfd):
+    """A log in which a candidate spoke from the first frame on."""
+    promote(folder, "one")
+    promote(folder, "two", "candidate")
+    record(folder, tmp_path / "logs", day, capfd)
+    return tmp_path / "logs"
+
+
+def record(folder, logs, day, capfd):
+    begin = ["--start", "2026-03-01T07:00:00", "--model", folder / "champion.safetensors"]
+    done = run(capfd, "record", day, "-o", logs, *begin)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def candidate_labels(log):
+    messages = list(LogReader(log).messages(OF_CANDIDATE[:1]))
+    return {item.decode().frame: item.data for item in messages}
+
+
+def test_a_candidate_speaks_beside_the_champion_as_it_would_alone(
+    folder, logs, day, tmp_path, capfd
+):
+    (log,) = find_logs(logs)
+    assert candidate_labels(log) == labels_by(folder / "two.safetensors", logs)
+    about = LogReader(log).metadata["hearthlog"]
+    assert (about["model"], about["candidate"]) == ("one", "two")
+    assert about["candidate_sha256"] == load_model(folder / "two.safetensors").sha256
+    assert [info.model for info in read(logs, "info")] == ["one"]
+    (folder / "candidate.safetensors").unlink()
+    record(folder, tmp_path / "alone", day, capfd)
+    (alone,) = find_logs(tmp_path / "alone")
+    rest = [m for m in LogReader(log).messages() if m.topic not in OF_CANDIDATE]
+    assert [(m.topic, m.log_time, m.data) for m in rest] == [
+        (m.topic, m.log_time, m.data) for m in LogReader(alone).messages()
+    ]
+
+
+def test_relabelling_with_the_candidate_gives_its_segments(folder, logs, capfd):
+    (log,) = find_logs(logs)
+    done = run(capfd, "relabel", logs, "--model", folder / "two.safetensors")
+    assert done.returncode == 0, done.stderr
+    layer = next(logs.rglob("*.relabel-two.mcap"))
+    spoken = [m.data for m in LogReader(log).messages(OF_CANDIDATE[1:])]
+    assert spoken == [m.data for m in LogReader(layer).messages(["/mic/relabel/two/segment"])]
+    assert spoken
+
+
+def test_a_candidate_comes_changes_and_goes_while_the_recorder_runs(folder, tmp_path, day):
+    promote(folder, "one")
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00") as process:
+        wait_for(lambda: count(logs, "label") > 20)
+        promote(folder, "two", "candidate")
+        wait_for(lambda: count(logs, "candidate/label") > 20)
+        (folder / "candidate.safetensors").unlink()
+        wait_for(lambda: count(logs, "info") == 3)
+        before = count(logs, "label")
+        wait_for(lambda: count(logs, "label") > before + 10)
+    assert (process.returncode, process.errors) == (0, "")
+    first, second, third = find_logs(logs)
+    assert [bool(candidate_labels(log)) for log in (first, second, third)] == [False, True, False]
+    found, wanted = candidate_labels(second), labels_by(folder / "two.safetensors", logs)
+    assert found == {frame: wanted[frame] for frame in found}
+    own = labels_by(folder / "one.safetensors", logs)
+    spoken = {m.decode().frame: m.data for log in find_logs(logs)
+              for m in LogReader(log).messages(["/mic/label"])}  # fmt: skip
+    assert spoken == {frame: own[frame] for frame in spoken}
+    assert len(spoken) == len(range(min(spoken), max(spoken) + 1)), "it was never interrupted"
+    digest = load_model(folder / "two.safetensors").sha256[:12]
+    assert any(line.startswith(f"candidate two ({digest}) from frame ") for line in said(logs))
+    assert any(line.startswith("no candidate from frame ") for line in said(logs))
+
+
+def test_a_candidate_that_cannot_be_used_is_refused_and_the_champion_goes_on(
+    folder, tmp_path, day, capfd
+):
+    promote(folder, "one")
+    (folder / "candidate.safetensors").write_bytes(b"no model")
+    begin = ["--start", "2026-03-01T07:00:00", "--model", folder / "champion.safetensors"]
+    done = run(capfd, "record", day, "-o", tmp_path / "logs", *begin)
+    assert done.returncode == 3
+    assert done.stderr.count("candidate refused: ") == 1
+    assert count(tmp_path / "logs", "label")
+    assert any(line.startswith("candidate refused: ") for line in said(tmp_path / "logs"))
+
+
+def test_the_champion_is_no_candidate(folder, tmp_path, day, capfd):
+    promote(folder, "one")
+    promote(folder, "one", "candidate")
+    record(folder, tmp_path / "logs", day, capfd)
+    assert count(tmp_path / "logs", "candidate/label") == 0
+
+
+def test_a_candidate_of_a_killed_recorder_is_recovered(folder, tmp_path, day, capfd):
+    promote(folder, "one")
+    promote(folder, "two", "candidate")
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00") as process:
+        wait_for(lambda: count(logs, "candidate/label") > 40)
+        with suppress(ProcessLookupError):
+            process.send_signal(signal.SIGKILL)
+        process.wait()
+    (active,) = logs.rglob("*.active")
+    assert run(capfd, "recover", active).returncode in {0, 3}
+    log = next(log for log in find_logs(logs) if log != active)
+    wanted = labels_by(folder / "two.safetensors", log)
+    found = candidate_labels(log)
+    assert len(found) > 20
+    assert found == {frame: wanted[frame] for frame in found}
+
+
+def test_a_candidate_is_shown_as_one_and_taken_for_nothing_else(logs, tmp_path, capfd):
+    (log,) = find_logs(logs)
+    info = json.loads(run(capfd, "info", logs, "--json").stdout)
+    assert info["streams"][-1]["model"] == "one"
+    assert "candidate: two" in run(capfd, "info", logs).stdout
+    assert set(info["segments"]) == {"mic", "mic/candidate"}
+    assert run(capfd, "doctor", logs).returncode == 0
+    apart = run(capfd, "diff", logs, "live", "candidate")
+    assert apart.returncode == 0, apart.stderr
+    for command in (
+        ["catalog", logs],
+        ["report", logs, "-o", tmp_path / "page.html"],
+        ["review", logs, "--save", tmp_path / "day.rrd"],
+        ["review", logs, "--labels", "candidate", "--queue", "--save", tmp_path / "ten.txt"],
+        ["cut", log, "-o", tmp_path / "part.mcap", "--start", "2026-03-01T07:00:10"],
+        ["export", log, "-o", tmp_path / "part.csv", "--topics", OF_CANDIDATE[1]],
+    ):
+        done = run(capfd, *command)
+        assert done.returncode in {0, 3}, (command, done.stderr)
+    assert LogReader(tmp_path / "part.mcap").messages(OF_CANDIDATE)
+
+
+def test_logs_with_a_candidate_are_replayed_as_they_were_without_it(folder, logs, tmp_path, capfd):
+    done = run(
+        capfd, "replay", logs, "-o", tmp_path / "again", "--model", folder / "one.safetensors"
+    )
+    assert done.returncode == 0, done.stderr
+    (log,), (again,) = find_logs(logs), find_logs(tmp_path / "again")
+    rest = [(m.topic, m.data) for m in LogReader(log).messages() if m.topic not in OF_CANDIDATE]
+    assert rest == [(m.topic, m.data) for m in LogReader(again).messages()]
+
+
+def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd):
+    first = json.loads(run(capfd, "models", "compare", "--live", "--logs", logs, "--json").stdout)
+    assert (first["champion"], first["candidate"]) == ("one", "two")
+    assert first["minutes"] > 0.5
+    assert sum(one[0] for one in first["minutes_a_day"].values()) == pytest.approx(
+        sum(one[1] for one in first["minutes_a_day"].values())
+    )
+    assert "cannot be told" in first["verdict"]
+    review_as_the_candidate_says(logs)
+    said = run(capfd, "models", "compare", "--live", "--logs", logs)
+    assert said.returncode == 0, said.stderr
+    assert "two is better: right where one is not" in said.stdout
+    assert "`hearthlog models promote two` makes it champion" in said.stdout
+
+
+def review_as_the_candidate_says(logs):
+    """Go through a minute in which the candidate is right about everything."""
+    (log,) = find_logs(logs)
+    start = find_coverage(log)["mic"].starts[0]
+    minute = ReviewedSpan("mic", start, start + 60 * NANOSECONDS, chosen=RANDOM)
+    segments = [
+        (nanoseconds(m.header.stamp), nanoseconds(m.duration), m.label)
+        for m in read(logs, "candidate/segment")
+    ]
+    marks = [
+        Mark("mic", begin, begin + length, label)
+        for begin, length, label in segments
+        if minute.start <= begin and begin + length <= minute.end
+    ]
+    write_marks(log, marks, reviewed=[minute])
+
+
+def test_logs_in_which_no_candidate_spoke_say_what_lets_one_speak(folder, tmp_path, day, capfd):
+    promote(folder, "one")
+    record(folder, tmp_path / "logs", day, capfd)
+    done = run(capfd, "models", "compare", "--live", "--logs", tmp_path / "logs")
+    assert done.returncode == 1
+    assert "`hearthlog models promote NAME --to candidate`" in done.stderr
+    wrong = run(capfd, "models", "compare", "one", "two", "--live")
+    assert wrong.returncode == 2

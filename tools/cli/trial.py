@@ -1,0 +1,80 @@
+"""A candidate on trial, in lines."""
+
+from typing import Any
+
+from hearthlog.analyzer.gate.changes import time_words
+from hearthlog.analyzer.gate.on_trial import Trial, gain_interval
+from hearthlog.schemas.text import printable
+from hearthlog.tools.cli.table import print_table
+
+_SHOWN = 8  # changes
+
+
+def trial_as_json(trial: Trial) -> dict[str, Any]:
+    """Return a trial for a program."""
+    changes = trial.changes
+    return {
+        "champion": trial.champion,
+        "candidate": trial.candidate,
+        "candidate_sha256": trial.candidate_sha256,
+        "minutes": trial.minutes,
+        "minutes_a_day": {
+            name: [before, after]
+            for name, before, after in zip(
+                changes.classes, changes.before.tolist(), changes.after.tolist(), strict=True
+            )
+        },
+        "changes": [change._asdict() for change in changes.pairs()],
+        "random": trial.random._asdict(),
+        "marks": trial.marks._asdict(),
+        "verdict": _verdict(trial),
+    }
+
+
+def print_trial(trial: Trial) -> None:
+    """Print how two models that label at the same time differ, and which is more often right."""
+    changes = trial.changes
+    print(
+        printable(
+            f"{trial.candidate}, a candidate, beside {trial.champion}: "
+            f"{time_words(trial.minutes)} in which both labelled"
+        )
+    )
+    for change in changes.pairs()[:_SHOWN]:
+        print(f"  {change}")
+    rows = [
+        (name, time_words(before), time_words(after))
+        for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True)
+        if before or after
+    ]
+    print()
+    print_table(("a day", trial.champion, trial.candidate), rows)
+    print()
+    for what, right in (
+        ("sounds of minutes drawn at random", trial.random),
+        ("other marked sounds (marks are where the champion was wrong)", trial.marks),
+    ):
+        if right.sounds:
+            print(
+                printable(
+                    f"of {right.sounds} {what} {trial.candidate} is right about {right.after}, "
+                    f"{trial.champion} about {right.before}"
+                )
+            )
+    print(printable(_verdict(trial)))
+
+
+def _verdict(trial: Trial) -> str:
+    random, name = trial.random, trial.candidate
+    if not random.sounds:
+        return (
+            "no minutes drawn at random are reviewed since: which is better cannot be told; "
+            "`hearthlog review LOGS --queue` asks for some"
+        )
+    low, high = gain_interval(random)
+    where = f"right where {trial.champion} is not {random.gained} times, the reverse {random.lost}"
+    if low > 0.5:
+        return f"{name} is better: {where}; `hearthlog models promote {name}` makes it champion"
+    if high < 0.5:
+        return f"{name} is worse: {where}"
+    return f"no clear difference: {where}"
