@@ -10,12 +10,18 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.confirmed import confirmed_segments, silent_segments
 from hearthlog.analyzer.training.dataset import CONFIRMED
-from hearthlog.analyzer.training.home_data import HOME, MOST_OF_MARK, lesson_recordings
+from hearthlog.analyzer.training.home_data import (
+    HOME,
+    MOST_OF_MARK,
+    home_sequences,
+    lesson_recordings,
+)
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.train import adapt_model
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 
@@ -76,8 +82,11 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     model = load_model(model_file)
     longest = next(one for one in segments(home) if one[2] != "silence")
     drawn = ReviewedSpan("mic", longest[0] - SECOND, longest[1] + SECOND, chosen=RANDOM)
-    write(home, [longest], [drawn, whole(home)])
+    middle = (longest[0] + longest[1]) // 2
+    halves = (longest[0], middle, "speech"), (middle, longest[1], "music")
+    write(home, halves, [drawn, whole(home)])
     assert not list(lesson_recordings(home))
+    assert not home_sequences(home, model.classes)
     for find in (confirmed_segments, silent_segments):
         spans = [one.span for one in find(sound(home), model.classes).recordings]
         assert spans
@@ -85,7 +94,7 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     lessons = home_lessons([home], model)
     assert not len(lessons.segments)
     assert lessons.nothing == "none of the marks can be learned from"
-    assert "1 of 1 marks are not learned from" in lessons.notes[0]
+    assert "2 of 2 marks are not learned from" in lessons.notes[0]
 
 
 def test_time_without_a_review_teaches_nothing_but_silence(home, model_file):
@@ -113,6 +122,15 @@ def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
     segments_ = home_lessons([home], load_model(model_file)).segments
     marked = segments_.collection == segments_.collection_names.index(HOME)
     assert 0 < marked.sum() <= MOST_OF_MARK
+
+
+def test_a_mark_of_time_that_was_not_recorded_is_left_out_and_counted(home):
+    loud = next(one for one in segments(home) if one[2] != "silence")
+    end = max(one[1] for one in segments(home))
+    write(home, [loud, (end + 10 * SECOND, end + 12 * SECOND, "speech")])
+    with pytest.warns(HearthlogWarning, match="^1 marks lie where nothing was recorded"):
+        (found,) = lesson_recordings(home)
+    assert found.label == loud[2]
 
 
 def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(

@@ -5,7 +5,6 @@ first: the only windows with the floor of this room in them would be of other cl
 """
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +15,11 @@ from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording
 from hearthlog.analyzer.training.home_data import recording_of
 from hearthlog.analyzer.training.marked_sound import HomeSound
 from hearthlog.analyzer.training.method import loud_windows
-from hearthlog.models.classes import SILENCE, UNKNOWN, translation
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import is_quiet
-from hearthlog.models.features.window_inputs import of_segments
+from hearthlog.models.features.window_inputs import of_segments, window_places
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -34,6 +33,7 @@ _FEWEST = 20  # of a class: the surest, if there are not so many that are sure
 _ASIDE = NANOSECONDS // 2  # of marks
 SEGMENT_FRAMES = 20
 _MOST_TRIED = 240  # segments of a class in a log
+_MOST_SILENT = 2000  # of silence, most of which is below the gate
 
 
 class Candidates(NamedTuple):
@@ -119,7 +119,8 @@ def chosen(found: Iterable[Candidates], model: Model) -> list[Recording]:
     recordings, target = _joined(found)
     if not recordings:
         return []
-    probabilities, quiet = _heard(recordings, model)
+    silent = np.array([class_name(recording.label) == SILENCE for recording in recordings])
+    probabilities, quiet = _heard(recordings, silent, model)
     rows = np.arange(len(target))
     sure = np.where(probabilities.argmax(axis=1) == target, probabilities[rows, target], 0.0)
     kept: list[int] = []
@@ -163,29 +164,24 @@ def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) 
 
 
 def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidates:
-    """Cut the frames of a class into segments, away from marks; -1 is no class.
+    """Cut segments by the class in their middle, silence by all of it; away from marks.
 
-    A sound shorter than a segment is taken if there is silence around it.
+    -1 is no class, and in no segment.
     """
     marks = [(mark.start, mark.end) for mark in sound.marks]
     away = ~sound.inside(marks, _ASIDE) & ~sound.inside(sound.drawn)
-    silent = target == classes.index(SILENCE) if SILENCE in classes else np.zeros(len(away), bool)
-    cut = np.flatnonzero(np.diff(target, prepend=-2, append=-2))
-    places = []
-    for begin, end in pairwise(cut.tolist()):
-        if end - begin >= SEGMENT_FRAMES:
-            places.append(np.arange(begin, end - SEGMENT_FRAMES + 1, HOP_FRAMES))
-        elif not silent[begin]:
-            places.append(np.array([(begin + end - SEGMENT_FRAMES) // 2]))
-    starts = np.concatenate([np.empty(0, np.intp), *places])
-    starts = starts[(starts >= 0) & (starts + SEGMENT_FRAMES <= len(target))]
+    silence = classes.index(SILENCE) if SILENCE in classes else -2
+    starts = np.arange(0, max(len(target) - SEGMENT_FRAMES + 1, 0), HOP_FRAMES)
     frames = starts[:, np.newaxis] + np.arange(SEGMENT_FRAMES)
     own = target[frames[:, SEGMENT_FRAMES // 2]]
-    fit = (own >= 0) & away[frames].all(axis=1)
-    fit &= ((target[frames] == own[:, np.newaxis]) | silent[frames]).all(axis=1)
+    fit = (away[frames] & (target[frames] >= 0)).all(axis=1)
+    fit &= (own != silence) | (target[frames] == silence).all(axis=1)
     fit &= sound.frames[frames[:, -1]] - sound.frames[frames[:, 0]] == SEGMENT_FRAMES - 1
     frames, own = frames[fit], own[fit]
-    tried = [spread(np.flatnonzero(own == number), _MOST_TRIED) for number in np.unique(own)]
+    tried = [
+        spread(np.flatnonzero(own == number), _MOST_SILENT if number == silence else _MOST_TRIED)
+        for number in np.unique(own)
+    ]
     rows = np.sort(np.concatenate([np.empty(0, np.intp), *tried]))
     recordings = [
         recording_of(sound, classes[own[row]], frames[row])._replace(collection=CONFIRMED)
@@ -204,25 +200,39 @@ def _joined(found: Iterable[Candidates]) -> Candidates:
     return Candidates([recordings[row] for row in rows], target[rows])
 
 
-def _heard(recordings: Sequence[Recording], model: Model) -> tuple[Float64, Bool]:
+def _heard(recordings: Sequence[Recording], silent: Bool, model: Model) -> tuple[Float64, Bool]:
     """Return the probabilities that a model gives to segments, and which are below its gate.
 
-    The probabilities are those of the windows that are at most 6 dB below the segment.
+    The probabilities are those of the windows from which would be learned: of silence all, else
+    those that are at most 6 dB below the segment.
     """
     classifier = Classifier(model)
-    features, inputs, gate = classifier.feature_set, classifier.inputs, classifier.gate
+    features, inputs = classifier.feature_set, classifier.inputs
     segments = np.stack([recording.features for recording in recordings])
     floors = np.zeros((len(segments), features.bands))
-    quiet = np.zeros(len(segments), bool)
+    places = window_places(SEGMENT_FRAMES, inputs.window_frames)
+    quiet = np.zeros((len(segments), len(places)), bool)
     for row, recording in enumerate(recordings):
-        if recording.floor is not None and features.band_powers is not None:
+        if recording.floor is not None:
             floors[row] = recording.floor[-1]
-            windows = len(recording.floor) - inputs.window_frames + 1
-            powers, floor = features.band_powers(recording.features), recording.floor[-windows:]
-            quiet[row] = gate > 0.0 and is_quiet(powers, floor, inputs.window_frames, gate).all()
+            quiet[row] = _quiet_windows(recording, recording.floor, classifier)
     of_each = of_segments(inputs, segments, floors)
-    said = classifier.probabilities(of_each.reshape(-1, inputs.width))
+    said = np.zeros((*quiet.shape, len(model.classes)))
+    said[~quiet] = classifier.probabilities(of_each[~quiet])
+    if quiet.any():
+        said[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
-    loud |= ~loud.any(axis=1, keepdims=True)  # of digital silence
+    loud |= ~loud.any(axis=1, keepdims=True) | silent[:, np.newaxis]
     share = (loud / loud.sum(axis=1, keepdims=True))[:, :, np.newaxis]
-    return (said.reshape(*loud.shape, -1) * share).sum(axis=1), quiet
+    probabilities: Float64 = (said * share).sum(axis=1)
+    return probabilities, quiet.min(axis=1)
+
+
+def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier) -> Bool:
+    """Tell which windows of a segment are below the gate of a classifier."""
+    length, powers_of = classifier.inputs.window_frames, classifier.feature_set.band_powers
+    places = np.array(window_places(len(recording.features), length))
+    if not classifier.gate or powers_of is None:
+        return np.zeros(len(places), bool)
+    quiet = is_quiet(powers_of(recording.features), floor[length - 1 :], length, classifier.gate)
+    return quiet[places]

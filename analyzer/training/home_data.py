@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.marks.marks import Mark, read_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
@@ -73,7 +73,7 @@ def marked_recordings(
         Of the sounds.
     gate : float
         A mark in which nothing is so many dB above the floor of the room is left out, unless it is
-        silence; a `HearthlogWarning` counts them. 0 for none.
+        silence; a `HearthlogWarning` counts them, and those of what was not recorded. 0 for none.
 
     Yields
     ------
@@ -81,8 +81,12 @@ def marked_recordings(
         A mark, or a part of one that lies between gaps; log by log.
     """
     quiet: list[str] = []
+    unheard: list[str] = []
     for sound in sounds:
         for mark in sound.marks:
+            if not sound.inside([(mark.start, mark.end)]).any():
+                unheard.append(f"{mark.label} in {sound.log.name}")
+                continue
             silence = class_name(mark.label) == SILENCE
             floored = silence or not sound.enrolled
             pieces = list(_recordings(sound, mark, features, floored=floored))
@@ -90,6 +94,12 @@ def marked_recordings(
                 quiet.append(f"{mark.label} in {sound.log.name}")
             else:
                 yield from pieces
+    if unheard:
+        text = (
+            f"{len(unheard)} marks lie where nothing was recorded, the first is {unheard[0]}: they "
+            "are left out"
+        )
+        warnings.warn(HearthlogWarning(text, folder), stacklevel=2)
     if quiet:
         text = (
             f"{len(quiet)} marks lie where nothing is louder than the floor of the room, the first "
@@ -131,14 +141,20 @@ def teaching(sound: HomeSound) -> HomeSound:
     ----------
     sound : HomeSound
     """
-    drawn = sound.drawn
-    marks = [
+    return replace(sound, marks=_teaching(sound.marks, sound.reviewed))
+
+
+def _teaching(marks: Iterable[Mark], reviewed: Iterable[ReviewedSpan]) -> list[Mark]:
+    drawn = [span for span in reviewed if span.chosen == RANDOM]
+    return [
         mark
-        for mark in sound.marks
+        for mark in marks
         if class_name(mark.label) != UNKNOWN
-        and all(mark.end <= start or mark.start >= end for start, end in drawn)
+        and not any(
+            mark.microphone == span.microphone and mark.start < span.end and span.start < mark.end
+            for span in drawn
+        )
     ]
-    return replace(sound, marks=marks)
 
 
 def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
@@ -165,7 +181,7 @@ def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
     sequences: list[Int64] = []
     for log in find_logs(folder, enrolled=True):
         runs: list[list[Mark]] = []
-        marks = read_marks(log)
+        marks = _teaching(read_marks(log), read_reviewed(log))
         names = translation({mark.label for mark in marks}, classes)
         for mark in sorted(mark._replace(label=names[mark.label]) for mark in marks):
             last = runs[-1][-1] if runs else None

@@ -12,6 +12,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.recorder_info import read_recorder_info
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.training.confirmed import (
+    MOST_CONFIRMED,
     Candidates,
     chosen,
     confirmed_segments,
@@ -37,7 +38,6 @@ from hearthlog.schemas.times import NANOSECONDS
 _RECENT = 14 * 86_400 * NANOSECONDS
 _SILENT_LOGS = 4  # that are read for silence
 _SILENT_PART = 900 * NANOSECONDS  # of each
-_FEWEST_SILENT = 20  # segments
 _FEWEST_DAYS = 2  # of a new class
 _FEWEST_SECONDS = 10.0
 _NO_SILENCE = (
@@ -102,7 +102,7 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     kept: list[Recording] = []
     if marked:
         kept = chosen(found, model)
-        if in_room and SILENCE in model.classes and _silent(kept) < _FEWEST_SILENT:
+        if in_room and SILENCE in model.classes and _silent(kept) < MOST_CONFIRMED:
             kept = chosen([*found, *_silence_anywhere(folders, model)], model)
             if not _silent([*kept, *in_room]):
                 raise DataError(_NO_SILENCE)
