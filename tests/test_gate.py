@@ -265,7 +265,7 @@ def refusals(watch, count=1):
 
 
 def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
-    monkeypatch.setattr("hearthlog.recorder.model_watch._LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 0.05)
     folder = place / "models"
     model = keep_deaf()
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())

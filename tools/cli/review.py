@@ -220,6 +220,18 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
         session.run(keys)
+    _say_how_right(logs)
+
+
+def _say_how_right(logs: list[Path]) -> None:
+    """Print what the minutes that were drawn at random tell by now."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.tools.cli.accuracy_text import Accuracy
+
+    accuracy = Accuracy(find_home_logs(logs))
+    if len(accuracy.minutes):
+        for line in accuracy.lines():
+            print(printable(line))
 
 
 def _work(
