@@ -1,0 +1,180 @@
+"""`python -m hearthlog.tools.bench.gate HOME --model FILE`: which models a home lets speak.
+
+Of a composed home (`python -m hearthlog.tools.home`, labelled by the model) the first day is
+learned from; minutes of the others are drawn at random and reviewed, all of it as it is true.
+Models that have learned so, and models that are harmful in known ways, are judged.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hearthlog.analyzer.gate.judge import Verdict, judge
+from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.spans import one, overlay, pieces
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.training.home_lessons import home_lessons
+from hearthlog.analyzer.training.train import adapt_model
+from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.home.person import true_labelling
+
+_DAY = 86_400 * NANOSECONDS
+_MINUTE = 60 * NANOSECONDS
+_LONGEST = 10 * NANOSECONDS  # of a mark
+_SHORTEST = NANOSECONDS // 2
+_MARKS = (30, 100)
+_SWAPS = (("speech", "music"), ("speech", "objects_activity"), ("objects_activity", SILENCE))
+
+
+def gate(
+    home: Annotated[Path, typer.Argument(help="Composed home of two days or more.")],
+    model: Annotated[Path, typer.Option(help="That labelled it.")],
+    minutes: Annotated[int, typer.Option(help="That are drawn at random.")] = 20,
+    other: Annotated[
+        list[Path] | None, typer.Option(help="Another model to judge; may be given again.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of what is drawn.")] = 0,
+) -> None:
+    """Judge models that have learned from a home, and harmful ones."""
+    with tempfile.TemporaryDirectory(prefix="hearthlog-gate-") as place:
+        folder, logs = Path(place) / "models", Path(place) / "logs"
+        folder.mkdir()
+        shutil.copytree(home / "logs", logs)
+        shutil.copy(model, folder / "champion.safetensors")
+        found = recent_logs([logs])
+        truth = _truth(home, found)
+        _review_at_random(found, truth, minutes, np.random.default_rng(seed))
+        champion = load_model(model)
+        models = [*_candidates(champion, found, truth, logs), *map(load_model, other or [])]
+        for number, candidate in enumerate(models):
+            path = folder / f"model-{number}.safetensors"
+            save_model(candidate, path)
+            print(_line(candidate.name, judge(folder, load_model(path), [logs])), flush=True)
+
+
+def _line(name: str, verdict: Verdict) -> str:
+    random = None if verdict.evidence is None else verdict.evidence.random
+    right = "" if random is None else f"{random.after} of {random.sounds}, not {random.before}"
+    says = "; ".join(verdict.judgement.reasons) or "may speak"
+    return f"{name:32} {right:20} {says}"
+
+
+def _truth(home: Path, logs: Sequence[RecentLog]) -> Labelling:
+    rows = (line.split("\t") for line in (home / "truth.txt").read_text().splitlines())
+    start = logs[0].start // _DAY * _DAY
+    return true_labelling([(float(a), float(b), label) for a, b, label in rows], start)
+
+
+def _review_at_random(
+    logs: Sequence[RecentLog], truth: Labelling, minutes: int, rng: np.random.Generator
+) -> None:
+    """Draw minutes behind the first day, three of four with sound; mark what is true in them."""
+    first = logs[0].start // _DAY * _DAY + _DAY
+    starts = np.arange(first, logs[-1].end - _MINUTE, _MINUTE)
+    sounds = Labelling(*(column[truth.labels != SILENCE] for column in vars(truth).values()))
+    low = np.searchsorted(sounds.ends, starts, side="right")
+    sounding = np.searchsorted(sounds.starts, starts + _MINUTE) > low
+    quiet = minutes // 4
+    drawn = [
+        *rng.permutation(starts[sounding])[: minutes - quiet],
+        *rng.permutation(starts[~sounding])[:quiet],
+    ]
+    for start in map(int, drawn):
+        for log in logs:
+            if log.start <= start and start + _MINUTE <= log.end:
+                span = ReviewedSpan(_microphone(log), start, start + _MINUTE, chosen=RANDOM)
+                write_marks(log.path, _marks(log, truth, start, start + _MINUTE), reviewed=[span])
+
+
+def _marks(log: RecentLog, truth: Labelling, start: int, end: int) -> list[Mark]:
+    inside, rows, _ = pieces(truth, one(start, end))
+    name = _microphone(log)
+    return [
+        Mark(name, int(a), int(b), _label(truth.labels[row]))
+        for a, b, row in zip(inside.starts, inside.ends, rows, strict=True)
+    ]
+
+
+def _candidates(
+    champion: Model, logs: Sequence[RecentLog], truth: Labelling, folder: Path
+) -> Iterator[Model]:
+    names = sorted({_label(label) for label in truth.labels} - {SILENCE})
+    others = {name: names[(i + 1) % len(names)] for i, name in enumerate(names)}
+    for count in _MARKS:
+        right = _spread(logs, truth, count)
+        yield replace(_learned(champion, right, folder), name=f"marks {count}")
+        wrong = [mark._replace(label=others.get(mark.label, mark.label)) for mark in right]
+        yield replace(_learned(champion, wrong, folder), name=f"shifted marks {count}")
+    for pair in _SWAPS:
+        if set(pair) <= set(champion.classes):
+            other = dict([pair, pair[::-1]])
+            yield _described(
+                champion,
+                f"swapped {' and '.join(pair)}",
+                classes=[other.get(name, name) for name in champion.classes],
+            )
+    yield _described(champion, "deaf to silence", gate=0.0, decision_bias={SILENCE: -10.0})
+
+
+def _described(model: Model, name: str, **changes: object) -> Model:
+    about = model.description.model_copy(update=changes)
+    return replace(model, name=name, description=about)
+
+
+def _spread(logs: Sequence[RecentLog], truth: Labelling, count: int) -> list[Mark]:
+    """Mark what the recorder labelled wrongly on the first day, and as much that it had right."""
+    end = logs[0].start // _DAY * _DAY + _DAY
+    first = [log for log in logs if log.end <= end]
+    sources = find_labellings(*[log.path for log in first])
+    said = sources.read(sources.microphone(None), LIVE).labelling
+    both = overlay([truth, said]).in_all()
+    true = np.array([_label(label) for label in truth.labels[both.rows[0]]], object)
+    wrong = true != said.labels[both.rows[1]]
+    long = both.ends - both.starts >= _SHORTEST
+    marks = []
+    for which in (wrong & long, ~wrong & long):
+        rows = np.flatnonzero(which)
+        for i in rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]:
+            start = int(both.starts[i])
+            stop = min(int(both.ends[i]), start + _LONGEST)
+            marks.append(Mark(_microphone(first[0]), start, stop, true[i]))
+    return marks
+
+
+def _learned(base: Model, marks: Sequence[Mark], logs: Path) -> Model:
+    """Adapt a model to marks, which are gone from the logs afterwards."""
+    by_log = [
+        (log, [mark for mark in marks if log.start <= mark.start and mark.end <= log.end])
+        for log in recent_logs([logs])
+    ]
+    with tempfile.TemporaryDirectory(prefix="hearthlog-gate-") as place:
+        for log, own in by_log:
+            if own:
+                copy = Path(place) / log.path.name
+                shutil.copy(log.path, copy)
+                write_marks(copy, own)
+        return adapt_model(base, home_lessons([Path(place)], base).segments)
+
+
+def _microphone(log: RecentLog) -> str:
+    return find_labellings(log.path).microphone(None)
+
+
+def _label(label: str) -> str:
+    return UNKNOWN if label == OTHER_NEGATIVE else label
+
+
+if __name__ == "__main__":
+    typer.run(gate)
