@@ -10,7 +10,6 @@ from hearthlog.analyzer.evaluation.difference import Difference
 from hearthlog.models.classes import SILENCE, find_class
 from hearthlog.schemas.arrays import Float64, Indices
 
-MINUTES_A_DAY = 1440.0
 _LEAST_MINUTES = 0.5  # of a change that is told
 
 

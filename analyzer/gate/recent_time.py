@@ -23,8 +23,8 @@ from hearthlog.schemas.times import NANOSECONDS
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY
 _NEVER = 1 << 62
-_LOUD = 48, 75 * NANOSECONDS  # number of spans that are heard, and their length
-_QUIET = 20, 180 * NANOSECONDS
+_LOUD = 36, 75 * NANOSECONDS  # number of spans that are heard, and their length
+_QUIET = 16, 120 * NANOSECONDS
 _AROUND = 10 * NANOSECONDS  # a sound
 _SHORTEST = 30 * NANOSECONDS  # time that is worth a look into a log
 _SEED = 7
@@ -131,7 +131,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
 
 
 def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
-    """Choose parts of the time to judge by: about an hour with sound, and about an hour without.
+    """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without.
 
     Parameters
     ----------

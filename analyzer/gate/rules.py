@@ -1,17 +1,24 @@
 """What counts as damage to a home."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from hearthlog.analyzer.gate.changes import class_words, time_words
 from hearthlog.analyzer.gate.evidence import Evidence, Right
 from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.arrays import Float64
 
 _LEAST_MINUTES = 10.0  # of sound to judge by
 _SILENCE_FALLS = 0.10  # of the time
-_OF_THE_TIME = 0.01  # a class of which the champion is sure for so long
-_KEPT = 0.75  # of what it is sure of
+_MUCH = 0.01  # of the time: a class that is worth a rule
+_MUCH_OF_SOUND = 0.10  # of the time that is not silence
+_KEPT = 0.75  # of what the champion is sure of
+_SOUND_LEFT = 0.5  # of the time that is not silence
+_MANY = 0.05  # of the time: a class that has become many times as much
+_TIMES = 4.0
+_CHANGED = 0.20  # of the time that is not silence
+_CHANGED_MINUTES = 10.0  # a day
 
 
 def damages(evidence: Evidence, champion: str) -> list[str]:
@@ -35,9 +42,9 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         loss = f" ({evidence.losses[0]})" if evidence.losses else ""
         text = f"only {time_words(evidence.minutes)} of the last two weeks are in the logs and not "
         return [f"{text}learned from{loss}: record for some hours more, then promote it"]
-    found = [*_silence_lost(evidence), *_fewer_right(evidence.random, champion)]
+    found = [*_silence_lost(evidence), *_not_better(evidence, champion)]
     if not clearly_better(evidence.random):
-        found += _classes_lost(evidence, champion)
+        found += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
     return found
 
 
@@ -55,23 +62,58 @@ def _silence_lost(evidence: Evidence) -> Iterator[str]:
             yield f"silence falls from {time_words(before)} a day to {time_words(after)}"
 
 
-def _fewer_right(right: Right, champion: str) -> Iterator[str]:
-    if right.after < right.before:
-        yield (
-            f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
-            f"{right.after}, {champion} about {right.before}"
-        )
+def _not_better(evidence: Evidence, champion: str) -> Iterator[str]:
+    """See whether it is right about fewer sounds, or about no more though it changes much."""
+    right, changes = evidence.random, evidence.changes
+    known = (
+        f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
+        f"{right.after}, {champion} about {right.before}"
+    )
+    changed = changes.minutes.sum() - np.trace(changes.minutes)
+    much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
+    if right.lost - right.gained > np.sqrt(right.lost + right.gained):
+        yield known
+    elif right.sounds and right.lost >= right.gained and changed > much:
+        yield f"{known}, and {time_words(changed)} a day would change"
 
 
-def _classes_lost(evidence: Evidence, champion: str) -> Iterator[str]:
-    total = evidence.changes.minutes.sum()
-    for i, name in enumerate(evidence.changes.classes):
+def _sound(evidence: Evidence) -> float:
+    """Return the minutes a day that are not silence for both models."""
+    changes = evidence.changes
+    silent = [changes.minutes[i, i] for i, name in enumerate(changes.classes) if name == SILENCE]
+    return float(changes.minutes.sum() - sum(silent))
+
+
+def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
+    changes = evidence.changes
+    total, sound = changes.minutes.sum(), _without_silence(changes.before, changes.classes)
+    for i, name in enumerate(changes.classes):
         sure, kept = float(evidence.sure[i].sum()), float(evidence.sure[i, i])
-        if sure >= _OF_THE_TIME * total and kept < _KEPT * sure:
+        much = sure >= min(_MUCH * total, _MUCH_OF_SOUND * sound)
+        if sure and much and kept < _KEPT * sure:
             others = evidence.sure[i].copy()
             others[i] = 0
-            most = class_words(evidence.changes.classes[int(others.argmax())])
+            most = class_words(changes.classes[int(others.argmax())])
             yield (
                 f"of {time_words(sure)} a day of {class_words(name)} of which {champion} is sure "
                 f"{time_words(kept)} are left, most becomes {most}"
             )
+
+
+def _out_of_proportion(evidence: Evidence) -> Iterator[str]:
+    """Find a class that becomes many times as much, and sound that becomes much less."""
+    changes = evidence.changes
+    total = changes.minutes.sum()
+    for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True):
+        if after >= _MANY * total and 0 < before < after / _TIMES:
+            times = f"from {time_words(before)} a day to {time_words(after)}"
+            yield f"{class_words(name)} rises {times}"
+    before, after = (
+        _without_silence(each, changes.classes) for each in (changes.before, changes.after)
+    )
+    if before >= _MUCH * total and after < _SOUND_LEFT * before:
+        yield f"what is not silence falls from {time_words(before)} a day to {time_words(after)}"
+
+
+def _without_silence(minutes: Float64, classes: Sequence[str]) -> float:
+    return float(sum(m for m, name in zip(minutes, classes, strict=True) if name != SILENCE))
