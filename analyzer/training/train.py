@@ -275,7 +275,7 @@ def _temperature_here(
 ) -> float:
     """Return the inverse temperature of a model adapted to a home, by parts of it left out.
 
-    It is that of the marks: the model is sure of what was confirmed, which was chosen so.
+    Marks alone, of what was hard, would make it unsure of all the rest.
     """
     before = description.base_inverse_temperature or description.inverse_temperature
     if marked.sum() < _FEWEST_OF_HOME:
@@ -287,7 +287,7 @@ def _temperature_here(
     classes = description.classes
     [decisions] = cross_validate([method], examples, len(classes), folds, ignore_progress)
     bias = np.array([description.decision_bias.get(name, 0.0) for name in classes])
-    tried = home[marked & np.isfinite(decisions[home]).all(axis=1)]
+    tried = home[np.isfinite(decisions[home]).all(axis=1)]
     return home_temperature(decisions[tried] + bias, examples.target[tried], before)
 
 
