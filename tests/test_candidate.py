@@ -172,6 +172,27 @@ def test_logs_with_a_candidate_are_replayed_as_they_were_without_it(folder, logs
     assert rest == [(m.topic, m.data) for m in LogReader(again).messages()]
 
 
+def test_the_champion_goes_on_in_a_replay_where_a_candidate_comes_and_goes(
+    folder, tmp_path, day, capfd
+):
+    logs, again = tmp_path / "logs", tmp_path / "again"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00"):
+        wait_for(lambda: count(logs, "label") > 20)
+        promote(folder, "two", "candidate")
+        wait_for(lambda: count(logs, "info") == 2)
+        (folder / "candidate.safetensors").unlink()
+        wait_for(lambda: count(logs, "info") == 3)
+    done = run(capfd, "replay", logs, "-o", again, "--model", folder / "one.safetensors")
+    assert done.returncode == 0, done.stderr
+    for kind in ("label", "segment"):
+        old, new = (
+            [m.data for log in find_logs(f) for m in LogReader(log).messages([f"/mic/{kind}"])]
+            for f in (logs, again)
+        )
+        assert old == new
+    assert all("candidate" not in LogReader(log).metadata["hearthlog"] for log in find_logs(again))
+
+
 def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd):
     first = json.loads(run(capfd, "models", "compare", "--live", "--logs", logs, "--json").stdout)
     assert (first["champion"], first["candidate"]) == ("one", "two")

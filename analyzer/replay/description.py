@@ -11,7 +11,7 @@ from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.log import LogDescription
 from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.topics import topics_of
+from hearthlog.schemas.messages.topics import CANDIDATE, topics_of
 
 
 def describe(
@@ -49,7 +49,7 @@ def describe(
         topics=topics_of(recorded.microphone, features.feature_names, classes),
         infos=[info],
         metadata={
-            **recorded.metadata,
+            **{k: v for k, v in recorded.metadata.items() if not k.startswith(CANDIDATE)},
             **provenance(recorded.node),
             "feature_set": features.name,
             "feature_set_version": str(features.version),

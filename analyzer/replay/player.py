@@ -20,11 +20,12 @@ from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages.topics import topic
+from hearthlog.schemas.messages.topics import CANDIDATE, topic
 from hearthlog.schemas.times import NANOSECONDS
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
+_MODELS = "model", CANDIDATE
 _LOST = "the log that was replayed does not have it"
 
 
@@ -199,7 +200,8 @@ class Player:
             return False
         first = info.first_frame[0]
         follows = first == self._next or (self._after_gap and first > self._next)
-        return self._next > 0 and follows and _without_model(info) == _without_model(self._info)
+        same = _without(info, *_MODELS) == _without(self._info, *_MODELS)
+        return self._next > 0 and follows and same
 
     def _change_model(self, info: RecorderInfo) -> None:
         """Change the model where the recorder did, if it is another one here too."""
@@ -324,11 +326,13 @@ def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool
     """Tell whether a log is of another run of a recorder than the last one."""
     if info.first_frame is not None and info.first_frame[0] < next_frame:
         return True
-    return info.metadata != last.metadata or info.model_sha256 != last.model_sha256
+    same = _without(info, CANDIDATE) == _without(last, CANDIDATE)
+    return not same or info.model_sha256 != last.model_sha256
 
 
-def _without_model(info: RecorderInfo) -> dict[str, str]:
-    return {key: value for key, value in info.metadata.items() if not key.startswith("model")}
+def _without(info: RecorderInfo, *models: str) -> dict[str, str]:
+    """Return the metadata without what names some models, which may change within a run."""
+    return {key: text for key, text in info.metadata.items() if not key.startswith(models)}
 
 
 def _name(paths: Sequence[Path]) -> str:
