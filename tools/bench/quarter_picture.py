@@ -52,12 +52,12 @@ def save_picture(path: Path, weeks: Sequence[Week]) -> None:
     f1, false, asked = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
     _draw_two(f1, weeks, lambda one: one.macro_f1(known))
     f1.set(ylabel="macro F1 of frames", ylim=(0, 1))
-    f1.legend(loc="lower right")
+    f1.legend(loc="lower left")
     for number, name in _BAD:
         if number <= len(weeks):
             f1.text(number, 0.02, name, ha="center", va="bottom", rotation=90, color="tab:red")
     _draw_two(false, weeks, lambda one: sum(one.false_events.values()))
-    false.set(ylabel="false events a day", ylim=(0, None))
+    false.set(ylabel="false events in 24 h", yscale="log")
     numbers = [week.number for week in weeks]
     asked.bar(numbers, [week.minutes for week in weeks], color="tab:blue", alpha=0.5)
     asked.set(ylabel="minutes asked", xlabel="week", xticks=numbers)
