@@ -15,6 +15,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile.card import model_attachments
 from hearthlog.models.modelfile.modelfile import SUFFIX
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
@@ -166,10 +167,12 @@ def record(
         if settings.model is not None and settings.model != NO_MODEL:
             watch = ModelWatch(settings.model, reload_requests or SimpleQueue())
             stack.enter_context(closing(watch))
-            if settings.model.suffix == SUFFIX:  # a starter has no folder
-                features = watch.first.classifier.feature_set
-                candidates = CandidateWatch(settings.model.parent, features)
-                stack.enter_context(closing(candidates))
+            is_file = settings.model.suffix == SUFFIX  # else the name of a starter
+            candidates = CandidateWatch(
+                settings.model.parent if is_file else DEFAULT_FOLDER,
+                watch.first.classifier.feature_set,
+            )
+            stack.enter_context(closing(candidates))
         recording = RecordingSession(settings, microphone.name, source.device, watch, candidates)
         try:
             for event in source.events(stop):

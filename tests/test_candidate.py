@@ -233,3 +233,14 @@ def test_logs_in_which_no_candidate_spoke_say_what_lets_one_speak(folder, tmp_pa
     assert "`hearthlog models promote NAME --to candidate`" in done.stderr
     wrong = run(capfd, "models", "compare", "one", "two", "--live")
     assert wrong.returncode == 2
+
+
+def test_a_candidate_of_the_folder_models_speaks_beside_a_starter(
+    folder, tmp_path, day, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    promote(folder, "two", "candidate")
+    begin = ["--start", "2026-03-01T07:00:00", "--model", "general"]
+    done = run(capfd, "record", day, "-o", tmp_path / "logs", *begin)
+    assert done.returncode == 0, done.stderr
+    assert count(tmp_path / "logs", "candidate/label")
