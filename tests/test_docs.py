@@ -274,10 +274,12 @@ def make_home(folder):
     for name in ("general-1", "general-2", "new", "home", "home-1"):
         shutil.copy("general.safetensors", f"{name}.safetensors")
         shutil.copy("general.safetensors", f"models/{name}.safetensors")
+    do("train --data clips --scenario general --cost 2 -o models/home-2.safetensors")
     do("models promote general-1 --anyway")
     do("models promote general-2")
+    do("models promote home-2 --to candidate")
+    do("record day.flac --model models/home.safetensors --start 2026-03-01T06:59 -o logs")
     do("models promote general-1 --to candidate")
-    do("record day.flac --model general.safetensors --start 2026-03-01T06:59 -o logs")
     for model in ("general-2", "new"):
         do(f"relabel logs --model {model}.safetensors")
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
