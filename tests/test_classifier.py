@@ -57,8 +57,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     fitted = make_pipeline(StandardScaler(), machine).fit(
         rounded(statistics(data)).astype(np.float64), data.target
     )
-    rows, numbers = unseen(classes)[:0], np.empty(0, np.intp)
-    learned = LearnedSvm(fitted, rows, numbers, rows, numbers)
+    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp))
     decision = learned.decide(unseen(classes), classes)
     expected = softmax(model.description.inverse_temperature * decision)
 
