@@ -30,6 +30,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
 from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, ClipFinder, KeptSound
 from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT_ELSEWHERE as ELSEWHERE
@@ -676,6 +677,8 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     other = replace(one, description=Description.model_validate_json(about))
     save_model(one, folder / "one.safetensors")
     save_model(other, folder / "other.safetensors")
+    for name in ("one", "other"):
+        insist(folder, load_model(folder / f"{name}.safetensors").sha256)
     (folder / "champion.safetensors").symlink_to("one.safetensors")
     question = SimpleQueue()
     names = ["other.safetensors", "one.safetensors"]
