@@ -124,6 +124,15 @@ def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
     assert 0 < marked.sum() <= MOST_OF_MARK
 
 
+def test_a_pause_that_is_marked_as_silence_does_not_teach_the_sounds_around_it(home):
+    begin, end, _ = segments(home)[0]
+    write(home, [(begin, begin + SECOND // 2, "silence")])
+    assert list(lesson_recordings(home)) == []
+    write(home, [(begin, end, "silence")])
+    (one,) = lesson_recordings(home)
+    assert one.label == "silence"
+
+
 def test_a_mark_of_time_that_was_not_recorded_is_left_out_and_counted(home):
     loud = next(one for one in segments(home) if one[2] != "silence")
     end = max(one[1] for one in segments(home))

@@ -61,8 +61,9 @@ def marked_recordings(
 ) -> Iterator[Recording]:
     """Cut marks out of the sound of a home.
 
-    A mark shorter than a second is extended to one. All marks of a UTC day are of one group. An
-    enrolled sound is without a room, unless it is silence.
+    A mark shorter than a second is extended to one; one of silence is left out instead, for other
+    sounds are in the same second. All marks of a UTC day are of one group. An enrolled sound is
+    without a room, unless it is silence.
 
     Parameters
     ----------
@@ -88,6 +89,8 @@ def marked_recordings(
                 unheard.append(f"{mark.label} in {sound.log.name}")
                 continue
             silence = class_name(mark.label) == SILENCE
+            if silence and mark.end - mark.start < features.window_seconds * NANOSECONDS:
+                continue
             floored = silence or not sound.enrolled
             pieces = list(_recordings(sound, mark, features, floored=floored))
             if gate and not silence and all(_is_quiet(piece, features, gate) for piece in pieces):
