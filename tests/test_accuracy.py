@@ -119,6 +119,13 @@ def test_a_range_of_a_labelling_that_is_half_right_lies_around_the_half():
     assert high - low < said.sum() / 2
 
 
+def test_a_class_that_is_never_labelled_may_have_been_missed_and_one_always_wrong_be_nothing():
+    said, none = np.tile([0, 1], 15), np.zeros(30, np.int64)
+    strata = strata_of(np.tile(said, 40), np.tile(said, 40) > 0)
+    assert checked_rates(said, none, said > 0, 0.1).range_of(strata)[0] == 0
+    assert checked_rates(none, none, said > 0, 0.1).range_of(strata)[1] > 0
+
+
 @pytest.mark.parametrize("chance", [0.9, 0.3])
 def test_nine_ranges_of_ten_hold_where_minutes_are_drawn_from_other_days(chance):
     rng = np.random.default_rng(2)

@@ -84,10 +84,13 @@ class CheckedRates:
         Draws from their distribution, by stratum.
     minutes : int
         That were checked.
+    heard : bool
+        Whether any event in them was true.
     """
 
     rates: Float64
     minutes: int
+    heard: bool
 
     def range_of(self, strata: Strata) -> tuple[int, int]:
         """Return the range that the number of events lies in nine times in ten.
@@ -100,7 +103,7 @@ class CheckedRates:
         expected = self.rates @ np.array(strata, np.float64)
         totals = np.random.default_rng(_SEED).poisson(expected)
         low, high = np.percentile(totals, _ENDS)
-        return int(np.floor(low)), int(np.ceil(high))
+        return int(np.floor(low)) if self.heard else 0, int(np.ceil(high))
 
 
 def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> CheckedRates | None:
@@ -127,7 +130,7 @@ def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> Che
     if len(said) < FEWEST:
         return None
     rng = np.random.default_rng(_SEED)
-    drawn = rng.integers(0, len(said), (_DRAWS, len(said)))
+    drawn, heard = rng.integers(0, len(said), (_DRAWS, len(said))), bool(true.any())
     number, true, said = stratum(said, sounding)[drawn], true[drawn], said[drawn]
     rates = np.empty((_DRAWS, 4))
     for each, (events, size) in enumerate(
@@ -138,4 +141,4 @@ def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> Che
         units = own.sum(axis=1) if by_minute else (said * own).sum(axis=1)
         counted = (true * own).sum(axis=1) + events * (share if by_minute else 1.0)
         rates[:, each] = rng.gamma(counted) / (units + size)
-    return CheckedRates(rates, len(said[0]))
+    return CheckedRates(rates, len(said[0]), heard)

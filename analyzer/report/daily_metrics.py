@@ -238,7 +238,10 @@ def _rates(minutes: HomeMinutes, checks: CheckedMinutes | None) -> dict[str, Che
         return {}
     amounts = {name: int(counts.sum()) + 1 for name, counts in minutes.said.items()}
     whole = sum(amounts.values())
-    drawn = {name: checks.rates(name, amount / whole) for name, amount in amounts.items()}
+    fewest = 1 / max(len(amounts), 1)  # a class that labels hardly name may be missed all the more
+    drawn = {
+        name: checks.rates(name, max(amount / whole, fewest)) for name, amount in amounts.items()
+    }
     return {name: rates for name, rates in drawn.items() if rates is not None}
 
 

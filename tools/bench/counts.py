@@ -23,6 +23,7 @@ from hearthlog.analyzer.accuracy.events import (
     sounding_minutes,
     television_minutes,
 )
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.review.queue.random_minutes import Minutes, draw_minutes
@@ -95,6 +96,8 @@ def read_simulated(folder: Path) -> Home:
     ------
     LogError
         If there are no labels.
+    DataError
+        If there are no two whole days.
     OSError
         If there is no truth.
     """
@@ -106,6 +109,8 @@ def read_simulated(folder: Path) -> Home:
     rows = [line.split("\t") for line in lines]
     truth = unified(true_labelling([(float(a), float(b), label) for a, b, label in rows], start))
     days = round((int(said.ends[-1]) - start) / (_DAY * MINUTE))
+    if days < 2:
+        raise DataError(f"{folder}: has no two whole days, one to check and one to count")
     edges = start + np.arange(days * _DAY + 1) * MINUTE
     names = [name for name in dict.fromkeys(named.classes) if name not in {SILENCE, UNKNOWN}]
 
@@ -145,7 +150,7 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
                 rows = shift[np.searchsorted(minutes.starts, draw_minutes(minutes, number))]
                 checks = _checks(home, rows)
                 for one in home.said:
-                    share = (int(home.said[one].sum()) + 1) / whole
+                    share = max((int(home.said[one].sum()) + 1) / whole, 1 / len(home.said))
                     yield from _range(home, checks, (name, one, day), number, share)
 
 
