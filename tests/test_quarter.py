@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchmarks out")
+
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.frames import FRAME_SAMPLES
