@@ -17,6 +17,7 @@ from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.home_sound import read_home_sound
+from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.dataset import Recording, build_dataset, cut_recordings
 from hearthlog.analyzer.training.home_data import (
     HOME_WEIGHT,
@@ -29,7 +30,7 @@ from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare, softmax
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, ROOM
-from hearthlog.analyzer.training.train import adapt_model, train_model
+from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError

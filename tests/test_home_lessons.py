@@ -8,6 +8,7 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.confirmed import confirmed_segments, silent_segments
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_data import (
@@ -18,7 +19,6 @@ from hearthlog.analyzer.training.home_data import (
 )
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
-from hearthlog.analyzer.training.train import adapt_model
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import HearthlogWarning

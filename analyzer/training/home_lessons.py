@@ -11,6 +11,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.recorder_info import read_recorder_info
 from hearthlog.analyzer.marks.marks import RANDOM
+from hearthlog.analyzer.training.adapt import base_classes
 from hearthlog.analyzer.training.confirmed import (
     MOST_CONFIRMED,
     Candidates,
@@ -26,7 +27,6 @@ from hearthlog.analyzer.training.marked_sound import (
     read_sound_of,
 )
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
-from hearthlog.analyzer.training.train import base_classes
 from hearthlog.models.classes import SILENCE, class_name, meant_by
 from hearthlog.models.classifiers.description import MOST_CLASSES
 from hearthlog.models.classifiers.model import Model

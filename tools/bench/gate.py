@@ -21,8 +21,8 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.train import adapt_model
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model

@@ -200,8 +200,8 @@ def _learned(
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.training.adapt import adapt_model
     from hearthlog.analyzer.training.home_lessons import home_lessons
-    from hearthlog.analyzer.training.train import adapt_model
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = adapted = load_model(base)

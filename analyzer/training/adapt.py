@@ -1,0 +1,192 @@
+"""Adaptation: a model is learned again, from its own segments and those of a home."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.training.calibration import home_temperature
+from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset
+from hearthlog.analyzer.training.home_spans import merged_spans
+from hearthlog.analyzer.training.installed import method_named
+from hearthlog.analyzer.training.learned_segments import learned_digests, segment_digests
+from hearthlog.analyzer.training.method import Examples, Method, cross_validate, prepare
+from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.models.classifiers.description import MOST_WEIGHT, Amount, ClassMetrics, Description
+from hearthlog.models.classifiers.model import Model
+from hearthlog.schemas.arrays import Bool, Indices
+from hearthlog.schemas.progress import ignore_progress
+
+_FEWEST_SEGMENTS = 10
+_FOLDS = 3  # by which the temperature is found
+
+
+def base_classes(model: Model) -> tuple[str, ...]:
+    """Return the classes of a model without those that it has from a home alone.
+
+    Parameters
+    ----------
+    model : Model
+        Whose method is installed.
+
+    Raises
+    ------
+    DataError, ModelError
+        If the method is not installed, or cannot be imported.
+    """
+    description = model.description
+    remembered = method_named(description.method).as_of(description).remembered(model)
+    target = model.training_target if remembered is None else remembered[1]
+    return model.classes[: int(target.max()) + 1] if len(target) else model.classes
+
+
+def adapt_model(base: Model, home: Dataset) -> Model:
+    """Learn a model again, from its own segments and those of a home.
+
+    Parameters
+    ----------
+    base : Model
+        A model whose arrays stand for what it learned, or that has kept its training windows.
+    home : Dataset
+        Of the `base_classes` of the model, some of which may have no segments, and of new ones
+        behind them, which have some.
+
+    Returns
+    -------
+    Model
+        With the parameters, transitions and metrics of `base`, which are those of other homes.
+        Parts of the home that were left out in turn move the temperature that the model had before
+        it was ever adapted. It can be adapted again to more of the home.
+
+    Raises
+    ------
+    DataError
+        If the base model has not kept what it learned from, the home has no segments, the method of
+        the base model is not installed, or that method wants augmented copies and its feature set
+        has none.
+    ModelError
+        If the method cannot be imported, or its feature set is not installed.
+    """
+    description = base.description
+    if not len(home):
+        raise DataError("the home has no segments of a class of the model")
+    method = method_named(description.method).as_of(description)
+    remembered = method.remembered(base)
+    if remembered is not None:
+        examples, others = prepare(method, home), 0
+        examples = examples._replace(more_inputs=remembered[0], more_target=remembered[1])
+    else:
+        joined, others = _joined(base, home), len(base.training_windows)
+        examples = prepare(method, joined)
+    here = np.arange(others, others + len(home))
+    learned = method.fit(examples)
+    arrays = learned.arrays()
+    if remembered is not None:
+        arrays |= method.memory(remembered, learned)
+    before = description.base_inverse_temperature or description.inverse_temperature
+    description = _of_classes(description, home.classes)
+    inverse = _temperature_here(method, examples, here, ~_is_confirmed(home), description)
+    smoothing = description.smoothing
+    weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
+    training = description.training_data.model_copy(
+        update={
+            "home": home.amounts,
+            "home_confirmed": _confirmed(home),
+            "home_spans": merged_spans(home.spans),
+            "base_sha256": base.sha256,
+        }
+    )
+    update = {
+        "training_data": training,
+        "inverse_temperature": inverse,
+        "base_inverse_temperature": before,
+        "smoothing": smoothing.model_copy(update={"weight": weight}),
+    }
+    transitions = base.transitions
+    if len(transitions) and home.classes != base.classes:
+        transitions = default_transitions(home.classes)
+    return Model(
+        description.model_copy(update=update),
+        arrays,
+        transitions=transitions,
+        training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
+        training_windows=base.training_windows,
+        training_floor=base.training_floor,
+        training_target=base.training_target,
+        training_group=base.training_group,
+    )
+
+
+def _of_classes(description: Description, classes: Sequence[str]) -> Description:
+    """Return a description with other classes at its end, of which no figures are known."""
+    if tuple(description.classes) == tuple(classes):
+        return description
+    metrics, training = description.metrics, description.training_data
+    confusion = np.zeros((len(classes), len(classes)), int)
+    same = len([name for name in classes if name in description.classes])
+    confusion[:same, :same] = np.array(metrics.confusion)[:same, :same]
+    unknown = ClassMetrics(precision=0.0, recall=0.0, f1=0.0)
+    none = Amount(sources=0, segments=0, seconds=0.0)
+    figures = {name: metrics.classes.get(name, unknown) for name in classes}
+    amounts = {name: training.classes.get(name, none) for name in classes}
+    bias = description.decision_bias
+    update = {
+        "classes": list(classes),
+        "scenario": {name: description.scenario.get(name, [name]) for name in classes},
+        "decision_bias": {name: value for name, value in bias.items() if name in classes},
+        "metrics": metrics.model_copy(update={"classes": figures, "confusion": confusion.tolist()}),
+        "training_data": training.model_copy(update={"classes": amounts}),
+    }
+    return description.model_copy(update=update)
+
+
+def _temperature_here(
+    method: Method, examples: Examples, home: Indices, marked: Bool, description: Description
+) -> float:
+    """Return the inverse temperature of a model adapted to a home, by parts of it left out.
+
+    Marks alone, of what was hard, would make it unsure of all the rest.
+    """
+    before = description.base_inverse_temperature or description.inverse_temperature
+    if marked.sum() < _FEWEST_SEGMENTS:
+        return before
+    everything = np.arange(len(examples.target))
+    of_marks, others = (np.array_split(home[same], _FOLDS) for same in (marked, ~marked))
+    parts = map(np.concatenate, zip(of_marks, others, strict=True))
+    folds = [(np.setdiff1d(everything, part), part) for part in parts]
+    classes = description.classes
+    [decisions] = cross_validate([method], examples, len(classes), folds, ignore_progress)
+    bias = np.array([description.decision_bias.get(name, 0.0) for name in classes])
+    tried = home[np.isfinite(decisions[home]).all(axis=1)]
+    return home_temperature(decisions[tried] + bias, examples.target[tried], before)
+
+
+def _is_confirmed(home: Dataset) -> Bool:
+    names = np.array(home.collection_names)
+    confirmed: Bool = names[home.collection] == CONFIRMED
+    return confirmed
+
+
+def _confirmed(home: Dataset) -> dict[str, int]:
+    """Count the segments of each class that are as they were labelled."""
+    counts = np.bincount(home.target[_is_confirmed(home)], minlength=len(home.classes))
+    return {name: int(count) for name, count in zip(home.classes, counts, strict=True) if count}
+
+
+def _joined(base: Model, home: Dataset) -> Dataset:
+    """Join the training windows of a model with the segments of a home."""
+    count = len(base.training_windows)
+    if not count:
+        raise DataError(f"{base.name}: has not kept what it learned from; train it anew to adapt")
+    floor = base.training_floor if len(base.training_floor) else np.zeros((count, home.bands))
+    return replace(
+        home,
+        windows=np.concatenate([base.training_windows, home.windows]),
+        target=np.concatenate([base.training_target, home.target]),
+        group=np.concatenate([base.training_group, home.group]),
+        weight=np.concatenate([np.ones(count), home.weight]),
+        floor=np.concatenate([floor, home.floor]),
+        copies=home.copies[:0],
+        copy_floor=home.copy_floor[:0],
+    )
