@@ -24,7 +24,8 @@ from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, w
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.baseline import FEWEST, compared, usual
-from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.report.daily_metrics import day_of
+from hearthlog.analyzer.report.home_metrics import whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly

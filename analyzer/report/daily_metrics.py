@@ -1,39 +1,17 @@
 """The figures of a day: what was heard, for how long, how often, when."""
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.count_range import CheckedRates, strata_of
-from hearthlog.analyzer.accuracy.events import (
-    MINUTE,
-    SET_APART,
-    events_by_minute,
-    events_of,
-    sounding_minutes,
-    television_minutes,
-)
-from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.accuracy.events import MINUTE
 from hearthlog.analyzer.logs.local_time import at_hour, day_span, local_time
-from hearthlog.analyzer.logs.spans import (
-    NONE,
-    Spans,
-    common,
-    cut,
-    joined,
-    lengths,
-    one,
-    without,
-)
-from hearthlog.analyzer.report.read_home import HomeData
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, one, without
+from hearthlog.analyzer.report.home_metrics import HomeMetrics
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
-from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.arrays import Bool, Int64
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 EVENING, MORNING = 22, 7  # of the clock: between them is the night
@@ -42,207 +20,6 @@ HOUR = 60 * MINUTE
 _STRETCH_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 MOST = 0.75  # of a day and of its night, for its figures to be compared
 _BIN, _BUSY = 10 * MINUTE, MINUTE
-
-
-@dataclass(frozen=True)
-class HomeMetrics:
-    """What was heard in a home, by all its microphones together."""
-
-    classes: list[str]
-    coverage: Spans  # when at least one of them heard
-    listened: dict[str, Spans]  # by class: when at least one of them heard whose model knows it
-    sound: Spans  # when at least one of them heard something else than silence
-    spans: dict[str, Spans]  # by class: when at least one of them heard it
-    # by class, but silence: when events began; spans with no more than ten seconds between them are
-    # one event, and so are those of two microphones at one time
-    events: dict[str, Int64]
-    minutes: "HomeMinutes"
-    rates: dict[str, CheckedRates]  # by class, of the minutes that were checked
-
-    def between(self, start: int, end: int) -> "HomeMetrics":
-        """Return what was heard in a span of time.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; an event belongs to the span that it begins in.
-        """
-        return HomeMetrics(
-            self.classes,
-            cut(self.coverage, start, end),
-            {name: cut(spans, start, end) for name, spans in self.listened.items()},
-            cut(self.sound, start, end),
-            {name: cut(spans, start, end) for name, spans in self.spans.items()},
-            {name: _within(starts, one(start, end)) for name, starts in self.events.items()},
-            self.minutes.between(one(start, end)),
-            self.rates,
-        )
-
-
-@dataclass(frozen=True)
-class HomeMinutes:
-    """The minutes in which at least one microphone heard.
-
-    Attributes
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    sounding, television, gone_through : np.ndarray [shape=(n,)], bool
-        Whether anything sounds, and like a television, by the labels; whether a person has gone
-        through all of the minute.
-    said, corrected : dict of str to np.ndarray [shape=(n,)], int64
-        By class but silence, the events that begin in each minute: as labelled, and with what a
-        person says in the place of labels.
-    """
-
-    starts: Int64
-    sounding: Bool
-    television: Bool
-    gone_through: Bool
-    said: dict[str, Int64]
-    corrected: dict[str, Int64]
-
-    def between(self, spans: Spans) -> "HomeMinutes":
-        """Return the minutes that begin in some spans of time.
-
-        Parameters
-        ----------
-        spans : Spans
-            In nanoseconds of UTC.
-        """
-        of = np.searchsorted(spans.starts, self.starts, side="right") - 1
-        return self.rows((of >= 0) & (self.starts < spans.ends[of]))
-
-    def count(self, name: str, rates: CheckedRates | None) -> Count:
-        """Count the events of a class; those of `SET_APART` only where no television sounds.
-
-        Parameters
-        ----------
-        name : str
-            Of the class.
-        rates : CheckedRates or None
-            Of the class.
-        """
-        own = self.rows(~self.television) if name in SET_APART else self
-        if name not in own.said:
-            return Count(rates=rates)
-        certain, rest = own.gone_through, ~own.gone_through
-        return Count(
-            int(own.corrected[name].sum()),
-            int(own.corrected[name][certain].sum()),
-            strata_of(own.said[name][rest], own.sounding[rest]),
-            rates,
-        )
-
-    def beside_television(self, name: str) -> int:
-        """Count the labelled events of a class where something sounds like a television.
-
-        Parameters
-        ----------
-        name : str
-            Of the class; 0 for one that is not set apart.
-        """
-        if name not in SET_APART or name not in self.said:
-            return 0
-        return int(self.corrected[name][self.television].sum())
-
-    def rows(self, rows: Bool) -> "HomeMinutes":
-        """Return some of the minutes.
-
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(n,)], bool
-        """
-        return HomeMinutes(
-            self.starts[rows],
-            self.sounding[rows],
-            self.television[rows],
-            self.gone_through[rows],
-            {name: counts[rows] for name, counts in self.said.items()},
-            {name: counts[rows] for name, counts in self.corrected.items()},
-        )
-
-
-def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
-    """Put together what the microphones of a home heard.
-
-    Parameters
-    ----------
-    data : HomeData
-        With the segments and classes of at least one microphone.
-    checks : CheckedMinutes, optional
-        Minutes of the home that were drawn at random, and checked.
-
-    Returns
-    -------
-    HomeMetrics
-        A span is silent where no microphone heard anything else; segments of a class that are at
-        most ten seconds apart, of whichever microphones, are one event.
-    """
-    labels = _together(data.segments.values())
-    everything = joined(labels.starts, labels.ends)
-    loud = labels.labels != SILENCE
-    sound = joined(labels.starts[loud], labels.ends[loud])
-    classes = list(dict.fromkeys(chain.from_iterable(data.classes.values())))
-    listened, spans, events = {}, {}, {}
-    for name in classes:
-        own = labels.labels == name
-        knowing = [part for source, part in data.segments.items() if name in data.classes[source]]
-        listened[name] = _spans(_together(knowing))
-        spans[name] = joined(labels.starts[own], labels.ends[own])
-        events[name] = events_of(labels, name).starts
-    if SILENCE in spans:
-        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone heard something
-        del events[SILENCE]
-    minutes = _minutes(data, everything, events)
-    return HomeMetrics(
-        classes, everything, listened, sound, spans, events, minutes, _rates(minutes, checks)
-    )
-
-
-def _together(parts: Iterable[Labelling]) -> Labelling:
-    """Put labels of microphones in the order of time; they may overlap."""
-    parts = list(parts)
-    starts, ends, labels = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("starts", "ends", "labels")
-    )
-    order = np.argsort(starts, kind="stable")
-    return Labelling(starts[order], ends[order], labels[order])
-
-
-def _spans(labels: Labelling) -> Spans:
-    return joined(labels.starts, labels.ends)
-
-
-def _minutes(data: HomeData, coverage: Spans, events: Mapping[str, Int64]) -> HomeMinutes:
-    """Count what begins in each minute that was heard, at least in part."""
-    first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
-    edges = np.arange(first, last + 1) * MINUTE
-    labels = _together(data.labelled.values())
-    through = [data.gone_through.get(source, NONE) for source in data.segments]
-    whole = [lengths(spans, edges) == MINUTE for spans in through]
-    minutes = HomeMinutes(
-        edges[:-1],
-        sounding_minutes(labels, edges),
-        television_minutes(labels, edges),
-        np.logical_and.reduce(whole),
-        {name: events_by_minute(events_of(labels, name), edges) for name in events},
-        {name: np.diff(np.searchsorted(starts, edges)) for name, starts in events.items()},
-    )
-    return minutes.rows(lengths(coverage, edges) > 0)
-
-
-def _rates(minutes: HomeMinutes, checks: CheckedMinutes | None) -> dict[str, CheckedRates]:
-    if checks is None:
-        return {}
-    amounts = {name: int(counts.sum()) + 1 for name, counts in minutes.said.items()}
-    whole = sum(amounts.values())
-    fewest = 1 / max(len(amounts), 1)  # a class that labels hardly name may be missed all the more
-    drawn = {
-        name: checks.rates(name, max(amount / whole, fewest)) for name, amount in amounts.items()
-    }
-    return {name: rates for name, rates in drawn.items() if rates is not None}
 
 
 @dataclass(frozen=True)
@@ -315,7 +92,7 @@ class Day:
         np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         """
-        return _within(self.home.events.get(name, NONE.starts), self.span)
+        return self.home.events_in(name, self.span)
 
     def night_events(self, name: str) -> Int64:
         """Return when the events of a class began in the night.
@@ -330,7 +107,7 @@ class Day:
         np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         """
-        return _within(self.home.events.get(name, NONE.starts), self.night)
+        return self.home.events_in(name, self.night)
 
     def count(self, name: str) -> Count | None:
         """Return how often a class was heard on this day; None if it could not be.
@@ -457,10 +234,6 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> Day:
     span = one(start, end)
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
     return Day(day, near, zone, span, night, common(near.coverage, span))
-
-
-def _within(starts: Int64, span: Spans) -> Int64:
-    return starts[(starts >= span.starts[0]) & (starts < span.ends[0])]
 
 
 def _length(spans: Spans) -> Minutes:

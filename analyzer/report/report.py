@@ -13,7 +13,8 @@ from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.baseline import DAYS
-from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, whole_home
+from hearthlog.analyzer.report.daily_metrics import HOUR, day_of
+from hearthlog.analyzer.report.home_metrics import whole_home
 from hearthlog.analyzer.report.interrai import DAYS as ASSESSED
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.read_home import HomeData, read_home
