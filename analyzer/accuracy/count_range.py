@@ -41,12 +41,12 @@ class Strata(NamedTuple):
 NO_MINUTES = Strata()
 
 
-def stratum(said: Int64, sounding: Bool) -> Int64:
+def stratum(labelled: Int64, sounding: Bool) -> Int64:
     """Return the number of the stratum that each minute is in, 0 to 3.
 
     Parameters
     ----------
-    said : np.ndarray [shape=(n,)], int64
+    labelled : np.ndarray [shape=(n,)], int64
         Labelled events of a class.
     sounding : np.ndarray [shape=(n,)], bool
         Whether anything sounds.
@@ -55,22 +55,22 @@ def stratum(said: Int64, sounding: Bool) -> Int64:
     -------
     np.ndarray [shape=(n,)], int64
     """
-    numbers: Int64 = np.where(sounding | (said > 0), 1 + np.minimum(said, 2), 0)
+    numbers: Int64 = np.where(sounding | (labelled > 0), 1 + np.minimum(labelled, 2), 0)
     return numbers
 
 
-def strata_of(said: Int64, sounding: Bool) -> Strata:
+def strata_of(labelled: Int64, sounding: Bool) -> Strata:
     """Count minutes, and the events in them, by stratum.
 
     Parameters
     ----------
-    said : np.ndarray [shape=(n,)], int64
+    labelled : np.ndarray [shape=(n,)], int64
         Labelled events of a class.
     sounding : np.ndarray [shape=(n,)], bool
         Whether anything sounds.
     """
-    number = stratum(said, sounding)
-    minutes, events = np.bincount(number, minlength=4), np.bincount(number, said, 4)
+    number = stratum(labelled, sounding)
+    minutes, events = np.bincount(number, minlength=4), np.bincount(number, labelled, 4)
     return Strata(int(minutes[0]), int(minutes[1]), int(events[2]), int(events[3]))
 
 
@@ -84,13 +84,13 @@ class CheckedRates:
         Draws from their distribution, by stratum.
     minutes : int
         That were checked.
-    heard : bool
+    occurs : bool
         Whether any event in them was true.
     """
 
     rates: Float64
     minutes: int
-    heard: bool
+    occurs: bool
 
     def range_of(self, strata: Strata) -> tuple[int, int]:
         """Return the range that the number of events lies in nine times in ten.
@@ -103,10 +103,12 @@ class CheckedRates:
         expected = self.rates @ np.array(strata, np.float64)
         totals = np.random.default_rng(_SEED).poisson(expected)
         low, high = np.percentile(totals, _ENDS)
-        return int(np.floor(low)) if self.heard else 0, int(np.ceil(high))
+        return int(np.floor(low)) if self.occurs else 0, int(np.ceil(high))
 
 
-def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> CheckedRates | None:
+def checked_rates(
+    labelled: Int64, true: Int64, sounding: Bool, share: float
+) -> CheckedRates | None:
     """Draw rates of a class, given minutes that a person went through.
 
     A hot deck with a Bayesian prior: minutes are drawn again with replacement, for events come in
@@ -115,7 +117,7 @@ def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> Che
 
     Parameters
     ----------
-    said, true : np.ndarray [shape=(n,)], int64
+    labelled, true : np.ndarray [shape=(n,)], int64
         Labelled and true events that begin in each checked minute.
     sounding : np.ndarray [shape=(n,)], bool
         Whether labels say that anything sounds.
@@ -127,18 +129,18 @@ def checked_rates(said: Int64, true: Int64, sounding: Bool, share: float) -> Che
     CheckedRates or None
         None of fewer than five minutes.
     """
-    if len(said) < FEWEST:
+    if len(labelled) < FEWEST:
         return None
     rng = np.random.default_rng(_SEED)
-    drawn, heard = rng.integers(0, len(said), (_DRAWS, len(said))), bool(true.any())
-    number, true, said = stratum(said, sounding)[drawn], true[drawn], said[drawn]
+    drawn, occurs = rng.integers(0, len(labelled), (_DRAWS, len(labelled))), bool(true.any())
+    number, true, labelled = stratum(labelled, sounding)[drawn], true[drawn], labelled[drawn]
     rates = np.empty((_DRAWS, 4))
     for each, (events, size) in enumerate(
         (_MISSED_IN_QUIET, _MISSED_IN_SOUND, _PER_LABELLED, _PER_LABELLED)
     ):
         own = number == each
         by_minute = each < 2
-        units = own.sum(axis=1) if by_minute else (said * own).sum(axis=1)
+        units = own.sum(axis=1) if by_minute else (labelled * own).sum(axis=1)
         counted = (true * own).sum(axis=1) + events * (share if by_minute else 1.0)
         rates[:, each] = rng.gamma(counted) / (units + size)
-    return CheckedRates(rates, len(said[0]), heard)
+    return CheckedRates(rates, len(labelled[0]), occurs)

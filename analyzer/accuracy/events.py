@@ -1,7 +1,5 @@
 """What counts as one event, and minutes in which something like a television is on."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -104,8 +102,3 @@ def overlapping(events: Spans, others: Spans) -> Bool:
     begins = np.append(others.starts, np.iinfo(np.int64).max)[after]
     overlaps: Bool = begins < events.ends
     return overlaps
-
-
-def in_order(names: Sequence[str]) -> list[str]:
-    """Return names of classes but silence, each once, in their order."""
-    return [name for name in dict.fromkeys(names) if name != SILENCE]

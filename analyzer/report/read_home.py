@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.checked_minutes import marks_of
+from hearthlog.analyzer.accuracy.reviewed_labels import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
 from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
@@ -127,8 +127,9 @@ def read_home(
         home.labelled[source] = home.segments[source] = _labelling(parts[source])
     marks, reviewed = _reviews(home, logs.between(since, close[1], REVIEW_LAYER), labelling)
     for source in marks.keys() | reviewed.keys():
-        labels, own = home.labelled.setdefault(source, marks_of([])), marks.get(source, [])
-        home.segments[source] = overlaid(labels, marks_of(own))
+        own = marks.get(source, [])
+        labels = home.labelled.setdefault(source, labelling_of_marks([]))
+        home.segments[source] = overlaid(labels, labelling_of_marks(own))
         through: list[Mark | ReviewedSpan] = [*own, *reviewed.get(source, [])]
         starts, ends = np.array([(span.start, span.end) for span in through]).T
         home.gone_through[source] = joined(starts, ends)

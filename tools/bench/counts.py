@@ -48,13 +48,13 @@ class Home(NamedTuple):
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
-    said, true : dict of str to np.ndarray [shape=(n,)], int64
+    labelled, true : dict of str to np.ndarray [shape=(n,)], int64
         By class: events that begin in each minute.
     sounding, television : np.ndarray [shape=(n,)], bool
     """
 
     starts: Int64
-    said: dict[str, Int64]
+    labelled: dict[str, Int64]
     true: dict[str, Int64]
     sounding: Bool
     television: Bool
@@ -103,12 +103,12 @@ def read_simulated(folder: Path) -> Home:
     """
     sources = find_labellings(folder / "logs")
     named = sources.read(sources.microphone(None), LIVE)
-    said = unified(named.labelling)
-    start = int(said.starts[0]) // (_DAY * MINUTE) * (_DAY * MINUTE)
+    labels = unified(named.labelling)
+    start = int(labels.starts[0]) // (_DAY * MINUTE) * (_DAY * MINUTE)
     lines = (folder / "truth.txt").read_text("utf-8").splitlines()
     rows = [line.split("\t") for line in lines]
     truth = unified(true_labelling([(float(a), float(b), label) for a, b, label in rows], start))
-    days = round((int(said.ends[-1]) - start) / (_DAY * MINUTE))
+    days = round((int(labels.ends[-1]) - start) / (_DAY * MINUTE))
     if days < 2:
         raise DataError(f"{folder}: has no two whole days, one to check and one to count")
     edges = start + np.arange(days * _DAY + 1) * MINUTE
@@ -119,10 +119,10 @@ def read_simulated(folder: Path) -> Home:
 
     return Home(
         edges[:-1],
-        counts(said),
+        counts(labels),
         counts(truth),
-        sounding_minutes(said, edges),
-        television_minutes(said, edges),
+        sounding_minutes(labels, edges),
+        television_minutes(labels, edges),
     )
 
 
@@ -140,7 +140,7 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
     Checked
     """
     day_of = np.arange(len(home.starts)) // _DAY
-    whole = sum(int(said.sum()) + 1 for said in home.said.values())
+    whole = sum(int(events.sum()) + 1 for events in home.labelled.values())
     for day in range(int(day_of[-1]) + 1):
         others = np.flatnonzero(day_of != day)
         for number in _CHECKED:
@@ -149,15 +149,15 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
                 minutes = Minutes(home.starts[: len(others)], home.sounding[shift])
                 rows = shift[np.searchsorted(minutes.starts, draw_minutes(minutes, number))]
                 checks = _checks(home, rows)
-                for one in home.said:
-                    share = max((int(home.said[one].sum()) + 1) / whole, 1 / len(home.said))
+                for one in home.labelled:
+                    share = max((int(home.labelled[one].sum()) + 1) / whole, 1 / len(home.labelled))
                     yield from _range(home, checks, (name, one, day), number, share)
 
 
 def _checks(home: Home, rows: Int64) -> CheckedMinutes:
-    none = {name: np.zeros(len(rows), np.int64) for name in home.said}
+    none = {name: np.zeros(len(rows), np.int64) for name in home.labelled}
     return CheckedMinutes(
-        {name: said[rows] for name, said in home.said.items()},
+        {name: events[rows] for name, events in home.labelled.items()},
         none,
         {name: true[rows] for name, true in home.true.items()},
         none,
@@ -178,8 +178,8 @@ def _range(
     here[day * _DAY : (day + 1) * _DAY] = True
     if name in SET_APART:
         here &= ~home.television
-    low, high = rates.range_of(strata_of(home.said[name][here], home.sounding[here]))
-    labelled, true = int(home.said[name][here].sum()), int(home.true[name][here].sum())
+    low, high = rates.range_of(strata_of(home.labelled[name][here], home.sounding[here]))
+    labelled, true = int(home.labelled[name][here].sum()), int(home.true[name][here].sum())
     yield Checked(folder, name, number, labelled, true, low, high)
 
 

@@ -6,9 +6,9 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
     CheckedMinutes,
     ClassCheck,
     read_checked_minutes,
-    read_looked_at,
 )
 from hearthlog.analyzer.accuracy.count_range import FEWEST
+from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.report.class_words import in_words
 from hearthlog.schemas.messages.topics import LIVE
@@ -29,7 +29,7 @@ class Accuracy:
     def __init__(self, logs: HomeLogs) -> None:
         self.losses: list[str] = []
         self.minutes: CheckedMinutes = read_checked_minutes(logs, LIVE, 0, _EVER, self.losses)
-        self.right, self.looked_at = read_looked_at(logs, LIVE, self.losses)
+        self.right, self.looked_at = count_unchanged(logs, LIVE, self.losses)
 
     def lines(self) -> Iterator[str]:
         """Say what was checked, and how much of it was right."""
@@ -37,8 +37,8 @@ class Accuracy:
         if not len(self.minutes):
             yield "not checked here: how many of these labels are right in this home is not known"
         else:
-            said = listed(list(self._classes()), "and") or "nothing in them"
-            yield f"checked here, {checked} drawn at random: {said}"
+            classes = listed(list(self._classes()), "and") or "nothing in them"
+            yield f"checked here, {checked} drawn at random: {classes}"
         if 0 < len(self.minutes) < FEWEST:
             yield (
                 f"{FEWEST - len(self.minutes)} more minutes, and the report says in which range "
@@ -63,7 +63,7 @@ class Accuracy:
         }
 
     def _checks(self) -> Iterator[tuple[str, ClassCheck]]:
-        for name in self.minutes.said:
+        for name in self.minutes.labelled:
             check = self.minutes.check(name)
             if check.labelled or check.true:
                 yield name, check
