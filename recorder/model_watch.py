@@ -145,7 +145,7 @@ class ModelWatch:
         awaited = judgement_path(folder, model.sha256)
         judged = file_identity(awaited)  # before it is read: a later one is another one
         judgement = read_judgement(folder, model.sha256)
-        if judgement is not None and judgement.may_speak:
+        if judgement is not None and judgement.may_label:
             return ""
         self._awaited, self._judged = awaited, judged
         promote = f"hearthlog models promote {model.name}"

@@ -115,7 +115,7 @@ def test_a_model_that_is_deaf_to_silence_is_refused_and_it_is_said_what_would_ch
     assert champion() == "one"
     judgement = read_judgement(Path("models"), model.sha256)
     assert judgement.champion == load_model(Path("models/one.safetensors")).sha256
-    assert not judgement.may_speak
+    assert not judgement.may_label
 
 
 @pytest.mark.usefixtures("place")
@@ -297,7 +297,7 @@ def test_a_model_that_is_returned_to_may_label(place):
     keep_alike()
     promote(folder, "alike")
     model, _ = rollback(folder)
-    assert read_judgement(folder, model.sha256).may_speak
+    assert read_judgement(folder, model.sha256).may_label
 
 
 def hostile(path, kind, good):

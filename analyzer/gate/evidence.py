@@ -1,6 +1,6 @@
 """What another model would change in a home, measured on time that it has not learned from."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,10 +8,10 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.gate.changes import Changes, changes_of_frames
-from hearthlog.analyzer.gate.hearing import NOTHING, Ears, Heard, hear, joined_frames
 from hearthlog.analyzer.gate.recent_time import (
     Part,
     RecentLog,
+    WeightedPart,
     choose,
     learned_time,
     minutes_a_day,
@@ -19,6 +19,12 @@ from hearthlog.analyzer.gate.recent_time import (
     unlearned_time,
 )
 from hearthlog.analyzer.gate.reference import Sound, reference, spans_of
+from hearthlog.analyzer.gate.two_models import (
+    NO_FRAMES,
+    LabelledFrames,
+    TwoModels,
+    joined_frames,
+)
 from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.model import Model
@@ -108,41 +114,38 @@ def gather_evidence(
     places = _places(
         [(log, [s for s in own if s.random or not _is_in(learned, s)]) for log, own in known]
     )
-    hearing = _Hearing(Ears.of(before, after), len(chosen) + len(places), losses, progress)
-    heard = joined_frames([hearing.of(*weighted) for weighted in chosen])
-    right = [_right(sounds, hearing.of(part), hearing.classes) for part, sounds in places]
-    share = heard.weight / max(heard.weight.sum(), 1.0)
-    day, sure = share * minutes_a_day(logs), heard.confidence >= SURE
+    models = TwoModels(before, after)
+    parts = [*chosen, *(WeightedPart(part, 1.0) for part, _ in places)]
+    labelled = list(_label(models, parts, losses, progress))
+    frames = joined_frames(labelled[: len(chosen)])
+    right = [
+        _right(sounds, own, models.classes)
+        for (_, sounds), own in zip(places, labelled[len(chosen) :], strict=True)
+    ]
+    share = frames.weight / max(frames.weight.sum(), 1.0)
+    day, sure = share * minutes_a_day(logs), frames.confidence >= SURE
     return Evidence(
-        minutes=len(heard.stamps) * FRAME_SECONDS / 60,
-        changes=changes_of_frames(hearing.classes, heard.before, heard.after, day),
-        sure=changes_of_frames(hearing.classes, heard.before, heard.after, day * sure).minutes,
+        minutes=len(frames.stamps) * FRAME_SECONDS / 60,
+        changes=changes_of_frames(models.classes, frames.before, frames.after, day),
+        sure=changes_of_frames(models.classes, frames.before, frames.after, day * sure).minutes,
         random=_sum(one for one, _ in right),
         marks=_sum(one for _, one in right),
         losses=losses,
     )
 
 
-class _Hearing:
-    """Both models on one part after the other; their classes are those of the first, and others."""
-
-    def __init__(self, ears: Ears, parts: int, losses: list[str], progress: Progress) -> None:
-        first, second = (model.classes for model in ears.models)
-        names = translation(second, first)
-        self.classes = list(dict.fromkeys([*first, *names.values()]))
-        self._numbers = np.array([self.classes.index(names[name]) for name in second])
-        self._ears, self._parts, self._losses, self._progress = ears, parts, losses, progress
-        self._done = 0
-
-    def of(self, part: Part, weight: float = 1.0) -> Heard:
+def _label(
+    models: TwoModels, parts: Sequence[WeightedPart], losses: list[str], progress: Progress
+) -> Iterator[LabelledFrames]:
+    """Label one part after the other; of one that cannot be read there are no frames."""
+    for i, (part, weight) in enumerate(parts):
         try:
-            heard = hear(part, self._ears, weight)
+            frames = models.label(part, weight)
         except LogError as error:
-            self._losses.append(str(error))
-            heard = NOTHING
-        self._done += 1
-        self._progress(self._done / self._parts)
-        return heard._replace(after=self._numbers[heard.after])
+            losses.append(str(error))
+            frames = NO_FRAMES
+        progress((i + 1) / len(parts))
+        yield frames
 
 
 def _known_sounds(
@@ -171,7 +174,7 @@ def _is_in(spans: Spans, sound: Sound) -> bool:
 
 
 def _places(known: list[tuple[RecentLog, list[Sound]]]) -> list[tuple[Part, list[Sound]]]:
-    """Join sounds that are near each other, so that they are heard at once; the latest at most."""
+    """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
     places: list[tuple[Part, list[Sound]]] = []
     for log, sounds in known:
         times = spans_of([(s.start, s.end) for s in sounds], _NEAR)
@@ -185,16 +188,21 @@ def _places(known: list[tuple[RecentLog, list[Sound]]]) -> list[tuple[Part, list
     return places[: int(np.searchsorted(seconds, _REFERENCE_SECONDS, side="right"))]
 
 
-def _right(sounds: Sequence[Sound], heard: Heard, classes: Sequence[str]) -> tuple[Right, Right]:
+def _right(
+    sounds: Sequence[Sound], frames: LabelledFrames, classes: Sequence[str]
+) -> tuple[Right, Right]:
     """Count the sounds that each model is right about: those drawn at random, and the others."""
     names = translation({sound.label for sound in sounds}, classes)
     counts = {True: Right(), False: Right()}
     for sound in sounds:
-        first, last = np.searchsorted(heard.stamps, [sound.start, sound.end])
+        first, last = np.searchsorted(frames.stamps, [sound.start, sound.end])
         if names[sound.label] not in classes or last <= first:
             continue
         number = classes.index(names[sound.label])
-        a, b = (bool((one[first:last] == number).mean() > _MOST) for one in heard[1:3])
+        a, b = (
+            bool((labels[first:last] == number).mean() > _MOST)
+            for labels in (frames.before, frames.after)
+        )
         counts[sound.random] = _sum([counts[sound.random], Right(1, a, b, b > a, a > b)])
     return counts[True], counts[False]
 

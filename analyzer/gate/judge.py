@@ -23,7 +23,7 @@ _LONGEST = 400  # characters of a reason
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What was found of a model.
+    """The judgement of a model, and what it rests on.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgemen
     judgement = read_judgement(folder, model.sha256)
     with suppress(ModelError):
         if judgement is not None and load(folder, CHAMPION).sha256 == model.sha256:
-            return judgement if judgement.may_speak else None  # it labels now
+            return judgement if judgement.may_label else None  # it labels now
     champion = find_champion(folder, home, model.sha256)
     sha256 = "" if champion is None else champion.sha256
     return judgement if judgement is not None and judgement.champion == sha256 else None

@@ -136,10 +136,10 @@ def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path,
 def _right(sounds: Sequence[Sound], before: Labelling, after: Labelling) -> Right:
     """Count the sounds whose label a model gives to most of their time, as far as it labelled."""
     first, second = (_agrees(sounds, labels) for labels in (before, after))
-    heard = _labelled(sounds, before) & _labelled(sounds, after)
-    first, second = first[heard], second[heard]
+    both = _labelled(sounds, before) & _labelled(sounds, after)
+    first, second = first[both], second[both]
     return Right(
-        int(heard.sum()),
+        int(both.sum()),
         int(first.sum()),
         int(second.sum()),
         int((second & ~first).sum()),

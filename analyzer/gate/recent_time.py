@@ -23,7 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 _DAY = 86_400 * NANOSECONDS
 _RECENT = 14 * _DAY
 _NEVER = 1 << 62
-_LOUD = 36, 75 * NANOSECONDS  # number of spans that are heard, and their length
+_LOUD = 36, 75 * NANOSECONDS  # number of spans that are labelled, and their length
 _QUIET = 16, 120 * NANOSECONDS
 _AROUND = 10 * NANOSECONDS  # a sound
 _SHORTEST = 30 * NANOSECONDS  # time that is worth a look into a log
@@ -150,9 +150,9 @@ def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
     for part in parts:
         whole = Spans(np.array([part.start]), np.array([part.end]))
         inside = cut(near, part.start, part.end)
-        for found, spans in ((loud, inside), (quiet, without(whole, inside))):
+        for chosen, spans in ((loud, inside), (quiet, without(whole, inside))):
             times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
-            found += [part._replace(start=start, end=end) for start, end in times]
+            chosen += [part._replace(start=start, end=end) for start, end in times]
     return [*_weighted(loud, *_LOUD), *_weighted(quiet, *_QUIET)]
 
 
@@ -189,8 +189,8 @@ def sample(parts: Sequence[Part], count: int, longest: int) -> list[Part]:
 
 def _weighted(parts: Sequence[Part], count: int, longest: int) -> list[WeightedPart]:
     chosen = sample(parts, count, longest)
-    there, heard = (sum(part.end - part.start for part in some) for some in (parts, chosen))
-    return [WeightedPart(part, there / heard) for part in chosen]
+    whole, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
+    return [WeightedPart(part, whole / sampled) for part in chosen]
 
 
 def minutes_a_day(logs: Sequence[RecentLog]) -> float:

@@ -66,9 +66,9 @@ def _true(log: Path, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Soun
         yield Sound(max(mark.start, span.start), min(mark.end, span.end), mark.label, random=True)
     labellings = find_labellings(log)
     name = labellings.find(span.microphone, span.corrects)
-    said = labellings.read(span.microphone, name, span.start, span.end).labelling
-    rest, row = remains(said, spans_of([(mark.start, mark.end) for mark in own]))
-    for start, end, label in zip(rest.starts, rest.ends, said.labels[row], strict=True):
+    labels = labellings.read(span.microphone, name, span.start, span.end).labelling
+    rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
+    for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):
         yield Sound(int(start), int(end), str(label), random=True)
 
 

@@ -42,10 +42,10 @@ def damages(evidence: Evidence, champion: str) -> list[str]:
         loss = f" ({evidence.losses[0]})" if evidence.losses else ""
         text = f"only {time_words(evidence.minutes)} of the last two weeks are in the logs and not "
         return [f"{text}learned from{loss}: record for some hours more, then promote it"]
-    found = [*_silence_lost(evidence), *_not_better(evidence, champion)]
+    reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
     if not clearly_better(evidence.random):
-        found += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
-    return found
+        reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
+    return reasons
 
 
 def clearly_better(right: Right) -> bool:

@@ -1,4 +1,4 @@
-"""What was found of a model before it may label a home: one small file for each, beside the models.
+"""Whether a model may label a home, and why not: one small file for each, beside the models.
 
 The file is named by the content of the model, so that another model of the same name has none.
 """
@@ -49,7 +49,7 @@ class Judgement(BaseModel):
     insisted: Annotated[bool, Field(strict=True)] = False
 
     @property
-    def may_speak(self) -> bool:
+    def may_label(self) -> bool:
         """Whether the model may label."""
         return self.insisted or not self.reasons
 
@@ -87,8 +87,9 @@ def read_judgement(folder: Path, sha256: str) -> Judgement | None:
         if path.is_file():
             with path.open("rb") as stream:
                 data = stream.read(_LARGEST + 1)
-            found = Judgement.model_validate_json(data) if len(data) <= _LARGEST else None
-            return found if found is not None and found.model == sha256 else None
+            if len(data) <= _LARGEST:
+                judgement = Judgement.model_validate_json(data)
+                return judgement if judgement.model == sha256 else None
     return None
 
 
@@ -130,7 +131,7 @@ def insist(folder: Path, sha256: str) -> None:
     ModelError
         If that cannot be written.
     """
-    found = read_judgement(folder, sha256)
-    judgement = found or Judgement(model=sha256, champion="", judged=time.time_ns())
-    if found is None or not found.may_speak:
+    judgement = read_judgement(folder, sha256)
+    if judgement is None or not judgement.may_label:
+        judgement = judgement or Judgement(model=sha256, champion="", judged=time.time_ns())
         write_judgement(folder, judgement.model_copy(update={"insisted": True}))

@@ -195,7 +195,7 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
             verdict = judge(folder, model, home, report)
         print_verdict(verdict)
         judgement = verdict.judgement
-    if not judgement.may_speak:
+    if not judgement.may_label:
         raise ModelError(refusal(judgement, model.name))
 
 

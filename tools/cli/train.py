@@ -130,7 +130,7 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
 
 
 def _print_next(verdict: "Verdict", output: Path) -> None:
-    if not verdict.judgement.may_speak:
+    if not verdict.judgement.may_label:
         print(f"\n{refusal(verdict.judgement, verdict.model)}")
     elif output.parent == models_folder():
         print(

@@ -1,4 +1,4 @@
-"""What two models say of the same sound, frame by frame, as their labels would be."""
+"""The labels of two models for the same sound, frame by frame."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,6 +10,7 @@ from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.relabel.reading import info_for_model
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
+from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
@@ -21,7 +22,7 @@ _LABELS_WARM_UP = 5 * NANOSECONDS
 _BEHIND = 5 * NANOSECONDS  # sound after the part that its last labels depend on
 
 
-class Heard(NamedTuple):
+class LabelledFrames(NamedTuple):
     """Frames that two models have labelled.
 
     Attributes
@@ -43,7 +44,7 @@ class Heard(NamedTuple):
     weight: Float64
 
 
-NOTHING = Heard(
+NO_FRAMES = LabelledFrames(
     np.empty(0, np.int64),
     np.empty(0, np.intp),
     np.empty(0, np.intp),
@@ -52,57 +53,63 @@ NOTHING = Heard(
 )
 
 
-def joined_frames(several: Sequence[Heard]) -> Heard:
+def joined_frames(several: Sequence[LabelledFrames]) -> LabelledFrames:
     """Put frames behind each other."""
-    columns = zip(NOTHING, *several, strict=True)
-    return Heard(*(np.concatenate(column) for column in columns))
+    columns = zip(NO_FRAMES, *several, strict=True)
+    return LabelledFrames(*(np.concatenate(column) for column in columns))
 
 
-class Ears(NamedTuple):
-    """Two models of the same feature set, ready to label."""
-
-    models: tuple[Model, Model]
-    classifiers: tuple[Classifier, Classifier]
-
-    @classmethod
-    def of(cls, before: Model, after: Model) -> "Ears":
-        """Make them ready."""
-        return cls((before, after), (Classifier(before), Classifier(after)))
-
-
-def hear(part: Part, ears: Ears, weight: float = 1.0) -> Heard:
-    """Label a part of a log with two models, each as a recorder would.
+class TwoModels:
+    """Two models of the same feature set, ready to label.
 
     Parameters
     ----------
-    part : Part
-    ears : Ears
-    weight : float, optional
-        Of its frames.
+    before, after : Model
 
-    Returns
-    -------
-    Heard
-        Of the frames that both models label.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or has no features of the set of the models.
+    Attributes
+    ----------
+    classes : list of str
+        Those of the first model, then others of the second.
     """
-    info, _ = info_for_model(part.log, ears.models[0], part.log)
-    sound = [
-        event
-        for batch in read_recorded(
-            info, part.start - _FLOOR_WARM_UP, part.end + _BEHIND, sound_only=True
-        )
-        for event in batch.events
-        if isinstance(event, Features | Gap)
-    ]
-    first, second = (_labelled(sound, part, classifier) for classifier in ears.classifiers)
-    stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
-    weights = np.full(len(stamps), weight)
-    return Heard(stamps, first.labels[a], second.labels[b], first.confidence[a], weights)
+
+    def __init__(self, before: Model, after: Model) -> None:
+        names = translation(after.classes, before.classes)
+        self.classes = list(dict.fromkeys([*before.classes, *names.values()]))
+        self._numbers = np.array([self.classes.index(names[name]) for name in after.classes])
+        self._model = before
+        self._classifiers = Classifier(before), Classifier(after)
+
+    def label(self, part: Part, weight: float = 1.0) -> LabelledFrames:
+        """Label a part of a log with both models, each as a recorder would.
+
+        Parameters
+        ----------
+        part : Part
+        weight : float, optional
+            Of its frames.
+
+        Returns
+        -------
+        LabelledFrames
+            Those that both models label, with indices of `classes`.
+
+        Raises
+        ------
+        LogError
+            If the log cannot be read, or has no features of the set of the models.
+        """
+        info, _ = info_for_model(part.log, self._model, part.log)
+        start, end = part.start - _FLOOR_WARM_UP, part.end + _BEHIND
+        sound = [
+            event
+            for batch in read_recorded(info, start, end, sound_only=True)
+            for event in batch.events
+            if isinstance(event, Features | Gap)
+        ]
+        first, second = (_labelled(sound, part, classifier) for classifier in self._classifiers)
+        stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
+        after, weights = self._numbers[second.labels[b]], np.full(len(stamps), weight)
+        return LabelledFrames(stamps, first.labels[a], after, first.confidence[a], weights)
 
 
 class _Labelled(NamedTuple):
@@ -113,7 +120,7 @@ class _Labelled(NamedTuple):
 
 def _labelled(sound: Sequence[Features | Gap], part: Part, classifier: Classifier) -> _Labelled:
     labeller = StreamLabeller(classifier, part.start - _LABELS_WARM_UP)
-    pieces = [said for event in sound if (said := labeller.push(event)) is not None]
+    pieces = [piece for event in sound if (piece := labeller.push(event)) is not None]
     labeller.close()
     segments = labeller.segments
     if not (pieces and segments):
