@@ -149,14 +149,32 @@ def test_nine_ranges_of_ten_hold_where_minutes_are_drawn_from_other_days(chance)
     assert np.mean(held) >= 0.85
 
 
-def test_a_television_is_much_talking_music_and_laughing_for_long():
-    edges = START + np.arange(61) * MINUTE
-    starts = START + np.array([10, 30]) * MINUTE
-    names = np.array(["music", "speech"], object)
-    labels = Labelling(starts, starts + np.array([15, 1]) * MINUTE, names)
-    minutes = television_minutes(labels, edges)
+def sounds(name, seconds, every):
+    """Label an hour, in whose minutes 10 to 25 a sound begins again and again."""
+    starts = START + np.arange(10 * 60, 25 * 60, every) * NANOSECONDS
+    pauses = starts + seconds * NANOSECONDS
+    labels = np.array([name, "silence"] * len(starts), object)
+    edges = np.append(np.stack([starts, pauses], 1).ravel(), START + 60 * MINUTE)
+    return Labelling(edges[:-1], edges[1:], labels)
+
+
+def television(labels):
+    return television_minutes(labels, START + np.arange(61) * MINUTE)
+
+
+@pytest.mark.parametrize("name", ["speech", "objects_activity", "laughing"])
+def test_a_television_is_long_sound_that_changes_whatever_it_is_called(name):
+    minutes = television(sounds(name, 5, 10))
     assert minutes[10:25].all()
-    assert not minutes[36:].any()
+    assert not minutes[40:].any()
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds", "every"),
+    [("crying", 5, 10), ("yelling", 5, 10), ("shower", 890, 900), ("speech", 1, 20)],
+)
+def test_long_crying_or_shouting_or_a_shower_or_a_few_words_are_no_television(name, seconds, every):
+    assert not television(sounds(name, seconds, every)).any()
 
 
 def report_day(root, checks=None):
@@ -172,6 +190,20 @@ def test_coughs_beside_a_television_are_counted_apart(tmp_path):
     assert day.count("coughing").labelled == 1
     assert day.beside_television("coughing") == 2
     assert day.beside_television("speech") == 0
+
+
+def test_what_a_person_has_gone_through_is_certain_in_parts_of_minutes_too(tmp_path):
+    coughs = [(at(f"{h:02}:00:{s:02}"), 2, "coughing", 0.9) for h in range(8, 20) for s in (5, 40)]
+    logs = write_day(tmp_path, DAY, coughs)
+    begin = START + at("12:00") * NANOSECONDS
+    half = ReviewedSpan("mic", begin, begin + MINUTE // 2, "Ann", 1, "live", QUEUE)
+    wrong = Mark("mic", begin + 5 * NANOSECONDS, begin + 7 * NANOSECONDS, "objects_activity")
+    write_marks(log_at(logs, at("12:00")), [wrong], reviewed=[half])
+    count = report_day(tmp_path).count("coughing")
+    assert (count.labelled, count.certain, count.unchecked.labelled) == (23, 0, 23)
+    check(logs, at("13:00"))
+    count = report_day(tmp_path).count("coughing")
+    assert (count.labelled, count.certain, count.unchecked.labelled) == (23, 2, 21)
 
 
 def test_minutes_that_were_gone_through_are_certain_and_others_have_a_range(tmp_path):

@@ -123,14 +123,14 @@ def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
 
 def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
     assert exactly(3).text == "3"
-    assert Count(7, 0, Strata(100, 20, 5, 2)).text == "7"
+    assert Count(7, 0, Strata(100, 20, 7)).text == "7"
     said = np.array([1, 1, 1, 1, 0, 0, 2, 1])
     rates = checked_rates(said, np.minimum(said, 1), said > 0, 0.5)
-    count = Count(27, 2, Strata(100, 20, 20, 5), rates)
+    count = Count(27, 2, Strata(100, 20, 25), rates)
     low, high = count.range
     assert 2 <= low < 25 < high
     assert count.text == f"{low} to {high} (27 labelled)"
-    assert count == Count(27, 2, Strata(100, 20, 20, 5), rates), "the same each time"
+    assert count == Count(27, 2, Strata(100, 20, 25), rates), "the same each time"
     both = count + Count(3, 3, rates=rates)
     assert (both.labelled, both.range) == (30, (low + 3, high + 3))
     assert [Minutes(m).text for m in (0, 0.2, 59.4, 125)] == [

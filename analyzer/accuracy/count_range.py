@@ -11,27 +11,27 @@ FEWEST = 5  # minutes
 _DRAWS = 2000
 _SEED = 20_261_123
 _ENDS = (5.0, 95.0)  # percentiles: nine times in ten the count is between them
-# Events and minutes that are added to what was checked, so that few minutes promise little.
-_MISSED_IN_QUIET = (0.5, 30.0)  # of all classes together
+# Events, and minutes or labelled events, that are added to what was checked, so that few minutes
+# promise little.
+_MISSED_IN_QUIET = (0.5, 60.0)  # of all classes together
 _MISSED_IN_SOUND = (1.0, 5.0)  # of all classes together
-_PER_LABELLED = (0.5, 1.0)
+_RIGHT, _WRONG = 0.3, 0.7
 
 
 class Strata(NamedTuple):
-    """Minutes by what the labels say of a class, as counts of them or of events in them.
+    """What labels say of a class, in minutes of two kinds.
 
     Attributes
     ----------
-    quiet, without : int
-        Minutes in which nothing sounds, and those in which something else does.
-    once, more : int
-        Labelled events of minutes that have one, and of those that have several.
+    quiet, sounding : int
+        Minutes in which nothing sounds, and in which anything does.
+    labelled : int
+        Events of the class in them.
     """
 
     quiet: int = 0
-    without: int = 0
-    once: int = 0
-    more: int = 0
+    sounding: int = 0
+    labelled: int = 0
 
     def plus(self, other: Self) -> "Strata":
         """Return the sums."""
@@ -41,26 +41,8 @@ class Strata(NamedTuple):
 NO_MINUTES = Strata()
 
 
-def stratum(labelled: Int64, sounding: Bool) -> Int64:
-    """Return the number of the stratum that each minute is in, 0 to 3.
-
-    Parameters
-    ----------
-    labelled : np.ndarray [shape=(n,)], int64
-        Labelled events of a class.
-    sounding : np.ndarray [shape=(n,)], bool
-        Whether anything sounds.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-    """
-    numbers: Int64 = np.where(sounding | (labelled > 0), 1 + np.minimum(labelled, 2), 0)
-    return numbers
-
-
 def strata_of(labelled: Int64, sounding: Bool) -> Strata:
-    """Count minutes, and the events in them, by stratum.
+    """Count minutes of both kinds, and the events in them.
 
     Parameters
     ----------
@@ -69,26 +51,27 @@ def strata_of(labelled: Int64, sounding: Bool) -> Strata:
     sounding : np.ndarray [shape=(n,)], bool
         Whether anything sounds.
     """
-    number = stratum(labelled, sounding)
-    minutes, events = np.bincount(number, minlength=4), np.bincount(number, labelled, 4)
-    return Strata(int(minutes[0]), int(minutes[1]), int(events[2]), int(events[3]))
+    return Strata(int((~sounding).sum()), int(sounding.sum()), int(labelled.sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class CheckedRates:
-    """How many events of a class there are in a minute, or for each labelled event.
+    """How many labelled events of a class are true, and how many are missed in a minute.
 
     Attributes
     ----------
-    rates : np.ndarray [shape=(draws, 4)], float64
-        Draws from their distribution, by stratum.
+    right : np.ndarray [shape=(draws,)], float64
+        Share of labelled events, drawn from its distribution.
+    missed : np.ndarray [shape=(draws, 2)], float64
+        True events without a labelled one, in a quiet minute and in one that sounds.
     minutes : int
         That were checked.
     occurs : bool
         Whether any event in them was true.
     """
 
-    rates: Float64
+    right: Float64
+    missed: Float64
     minutes: int
     occurs: bool
 
@@ -100,8 +83,9 @@ class CheckedRates:
         strata : Strata
             Of minutes that were not checked.
         """
-        expected = self.rates @ np.array(strata, np.float64)
-        totals = np.random.default_rng(_SEED).poisson(expected)
+        rng = np.random.default_rng(_SEED)
+        minutes = np.array([strata.quiet, strata.sounding], np.float64)
+        totals = rng.binomial(strata.labelled, self.right) + rng.poisson(self.missed @ minutes)
         low, high = np.percentile(totals, _ENDS)
         return int(np.floor(low)) if self.occurs else 0, int(np.ceil(high))
 
@@ -112,8 +96,9 @@ def checked_rates(
     """Draw rates of a class, given minutes that a person went through.
 
     A hot deck with a Bayesian prior: minutes are drawn again with replacement, for events come in
-    bouts; then rates are drawn from gamma distributions. Within each stratum, minutes must be drawn
-    at random, but not the same share of each.
+    bouts; then the share of right events is drawn from a beta distribution, and rates of missed
+    ones from gamma distributions. Of quiet and of sounding minutes each, those that were checked
+    must be drawn at random, but not the same share of both.
 
     Parameters
     ----------
@@ -132,15 +117,17 @@ def checked_rates(
     if len(labelled) < FEWEST:
         return None
     rng = np.random.default_rng(_SEED)
-    drawn, occurs = rng.integers(0, len(labelled), (_DRAWS, len(labelled))), bool(true.any())
-    number, true, labelled = stratum(labelled, sounding)[drawn], true[drawn], labelled[drawn]
-    rates = np.empty((_DRAWS, 4))
-    for each, (events, size) in enumerate(
-        (_MISSED_IN_QUIET, _MISSED_IN_SOUND, _PER_LABELLED, _PER_LABELLED)
-    ):
-        own = number == each
-        by_minute = each < 2
-        units = own.sum(axis=1) if by_minute else (labelled * own).sum(axis=1)
-        counted = (true * own).sum(axis=1) + events * (share if by_minute else 1.0)
-        rates[:, each] = rng.gamma(counted) / (units + size)
-    return CheckedRates(rates, len(labelled[0]), occurs)
+    drawn = rng.integers(0, len(labelled), (_DRAWS, len(labelled)))
+    found = np.minimum(labelled, true)
+
+    def total(counts: Int64) -> Int64:
+        sums: Int64 = counts[drawn].sum(axis=1)
+        return sums
+
+    missed = np.empty((_DRAWS, 2))
+    kinds = (~sounding, _MISSED_IN_QUIET), (sounding, _MISSED_IN_SOUND)
+    for each, (own, (events, minutes)) in enumerate(kinds):
+        unheard, checked = total((true - found) * own), total(own.astype(np.int64))
+        missed[:, each] = rng.gamma(unheard + events * share) / (checked + minutes)
+    right = rng.beta(total(found) + _RIGHT, total(labelled - found) + _WRONG)
+    return CheckedRates(right, missed, len(labelled), bool(true.any()))

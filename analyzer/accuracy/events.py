@@ -4,7 +4,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, joined, lengths
-from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, MUSIC, SILENCE, SPEECH, YELLING
+from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, SILENCE, YELLING
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -12,8 +12,9 @@ MINUTE = 60 * NANOSECONDS
 SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which a television has, too
 AROUND = 10  # minutes before and after one, in which a television would be heard
 _PAUSE = 10 * NANOSECONDS
-_OF_TELEVISION = (SPEECH, MUSIC, LAUGHING)
-_SHARE = 0.2  # of the time
+_ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # a person who cries for long is no television
+_SHARE = 0.1  # of the time
+_CHANGES = 2  # in a minute
 
 
 def events_of(labels: Labelling, name: str) -> Spans:
@@ -51,7 +52,9 @@ def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
 def television_minutes(labels: Labelling, edges: Int64) -> Bool:
     """Tell in which minutes something sounds like a television, a radio or company.
 
-    That is where talking, music and laughing fill a fifth of the ten minutes before and after.
+    That is where, in the ten minutes before and after, two sounds a minute begin, and where those
+    that are neither coughing nor crying nor shouting fill a tenth of the time. Which ones they are
+    does not matter, for a model may take a television for anything.
 
     Parameters
     ----------
@@ -64,10 +67,18 @@ def television_minutes(labels: Labelling, edges: Int64) -> Bool:
     -------
     np.ndarray [shape=(n,)], bool
     """
-    own = np.isin(labels.labels, _OF_TELEVISION)
-    filled = lengths(joined(labels.starts[own], labels.ends[own]), edges)
-    around = np.convolve(filled, np.ones(2 * AROUND + 1), "full")[AROUND : AROUND + len(filled)]
-    return around > _SHARE * (2 * AROUND + 1) * MINUTE
+    others = ~np.isin(labels.labels, _ALONE)
+    filled = lengths(joined(labels.starts[others], labels.ends[others]), edges)
+    begun = np.diff(np.searchsorted(labels.starts[labels.labels != SILENCE], edges))
+    minutes = 2 * AROUND + 1
+    much = _around(filled) > _SHARE * minutes * MINUTE
+    television: Bool = much & (_around(begun) > _CHANGES * minutes)
+    return television
+
+
+def _around(amounts: Int64) -> Int64:
+    """Sum up the amounts of each minute and of those around it."""
+    return np.convolve(amounts, np.ones(2 * AROUND + 1, np.int64))[AROUND : AROUND + len(amounts)]
 
 
 def events_by_minute(events: Spans, edges: Int64) -> Int64:

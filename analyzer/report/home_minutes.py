@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -10,13 +11,12 @@ from hearthlog.analyzer.accuracy.count_range import CheckedRates, strata_of
 from hearthlog.analyzer.accuracy.events import (
     MINUTE,
     SET_APART,
-    events_by_minute,
     events_of,
     sounding_minutes,
     television_minutes,
 )
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, lengths
+from hearthlog.analyzer.logs.spans import Spans, common, lengths, rows_at
 from hearthlog.analyzer.report.values import Count
 from hearthlog.schemas.arrays import Bool, Int64
 
@@ -32,9 +32,10 @@ class HomeMinutes:
     sounding, television, gone_through : np.ndarray [shape=(n,)], bool
         Whether anything sounds, and like a television, by the labels; whether a person has gone
         through all of the minute.
-    labelled, corrected : dict of str to np.ndarray [shape=(n,)], int64
-        By class but silence, the events that begin in each minute: as labelled, and with what a
-        person says in the place of labels.
+    labelled, corrected, certain : dict of str to np.ndarray [shape=(n,)], int64
+        By class but silence, the events that begin in each minute: labelled ones where no one has
+        gone through; all, with what a person says in the place of labels; those of them that begin
+        where a person has gone through.
     """
 
     starts: Int64
@@ -43,6 +44,7 @@ class HomeMinutes:
     gone_through: Bool
     labelled: dict[str, Int64]
     corrected: dict[str, Int64]
+    certain: dict[str, Int64]
 
     def between(self, spans: Spans) -> "HomeMinutes":
         """Return the minutes that begin in some spans of time.
@@ -68,10 +70,10 @@ class HomeMinutes:
         own = self.rows(~self.television) if name in SET_APART else self
         if name not in own.labelled:
             return Count(rates=rates)
-        certain, rest = own.gone_through, ~own.gone_through
+        rest = ~own.gone_through
         return Count(
             int(own.corrected[name].sum()),
-            int(own.corrected[name][certain].sum()),
+            int(own.certain[name].sum()),
             strata_of(own.labelled[name][rest], own.sounding[rest]),
             rates,
         )
@@ -102,6 +104,7 @@ class HomeMinutes:
             self.gone_through[rows],
             {name: counts[rows] for name, counts in self.labelled.items()},
             {name: counts[rows] for name, counts in self.corrected.items()},
+            {name: counts[rows] for name, counts in self.certain.items()},
         )
 
 
@@ -123,14 +126,23 @@ def home_minutes(
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
-    whole = [lengths(spans, edges) == MINUTE for spans in gone_through]
+    known = reduce(common, gone_through)
+
+    def begun(starts: Int64) -> Int64:
+        return np.diff(np.searchsorted(starts, edges))
+
+    def unknown(name: str) -> Int64:
+        starts = events_of(labels, name).starts
+        return starts[rows_at(known, starts) < 0]
+
     minutes = HomeMinutes(
         edges[:-1],
         sounding_minutes(labels, edges),
         television_minutes(labels, edges),
-        np.logical_and.reduce(whole),
-        {name: events_by_minute(events_of(labels, name), edges) for name in events},
-        {name: np.diff(np.searchsorted(starts, edges)) for name, starts in events.items()},
+        lengths(known, edges) == MINUTE,
+        {name: begun(unknown(name)) for name in events},
+        {name: begun(starts) for name, starts in events.items()},
+        {name: begun(starts[rows_at(known, starts) >= 0]) for name, starts in events.items()},
     )
     return minutes.rows(lengths(coverage, edges) > 0)
 

@@ -26,6 +26,7 @@ from hearthlog.analyzer.accuracy.events import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.spans import joined, lengths
 from hearthlog.analyzer.review.queue.random_minutes import Minutes, draw_minutes
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Int64
@@ -42,18 +43,21 @@ _Row = tuple[str, float, float, float, float, int]
 
 
 class Home(NamedTuple):
-    """The minutes of a home, by its labels and by its truth.
+    """The labelled minutes of a home, by its labels and by its truth.
 
     Attributes
     ----------
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
+    day : np.ndarray [shape=(n,)], int64
+        Number of the day that each is of, from 0 on.
     labelled, true : dict of str to np.ndarray [shape=(n,)], int64
         By class: events that begin in each minute.
     sounding, television : np.ndarray [shape=(n,)], bool
     """
 
     starts: Int64
+    day: Int64
     labelled: dict[str, Int64]
     true: dict[str, Int64]
     sounding: Bool
@@ -114,15 +118,18 @@ def read_simulated(folder: Path) -> Home:
     edges = start + np.arange(days * _DAY + 1) * MINUTE
     names = [name for name in dict.fromkeys(named.classes) if name not in {SILENCE, UNKNOWN}]
 
-    def counts(labels: Labelling) -> dict[str, Int64]:
-        return {name: events_by_minute(events_of(labels, name), edges) for name in names}
+    heard = lengths(joined(labels.starts, labels.ends), edges) > 0
+
+    def counts(source: Labelling) -> dict[str, Int64]:
+        return {name: events_by_minute(events_of(source, name), edges)[heard] for name in names}
 
     return Home(
-        edges[:-1],
+        edges[:-1][heard],
+        np.flatnonzero(heard) // _DAY,
         counts(labels),
         counts(truth),
-        sounding_minutes(labels, edges),
-        television_minutes(labels, edges),
+        sounding_minutes(labels, edges)[heard],
+        television_minutes(labels, edges)[heard],
     )
 
 
@@ -139,10 +146,9 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
     ------
     Checked
     """
-    day_of = np.arange(len(home.starts)) // _DAY
     whole = sum(int(events.sum()) + 1 for events in home.labelled.values())
-    for day in range(int(day_of[-1]) + 1):
-        others = np.flatnonzero(day_of != day)
+    for day in range(int(home.day[-1]) + 1):
+        others = np.flatnonzero(home.day != day)
         for number in _CHECKED:
             for draw in range(_DRAWS):
                 shift = np.roll(others, 7919 * draw)  # other minutes for the same draw
@@ -174,8 +180,7 @@ def _range(
     rates = checks.rates(name, share)
     if rates is None:
         return
-    here = np.zeros(len(home.starts), bool)
-    here[day * _DAY : (day + 1) * _DAY] = True
+    here = home.day == day
     if name in SET_APART:
         here &= ~home.television
     low, high = rates.range_of(strata_of(home.labelled[name][here], home.sounding[here]))
