@@ -57,8 +57,10 @@ class Pipeline:
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
-        self._live = self._stream(LIVE, classifier)
-        self._candidate = self._stream(CANDIDATE, candidate)
+        self._streams = {
+            LIVE: self._stream(LIVE, classifier),
+            CANDIDATE: self._stream(CANDIDATE, candidate),
+        }
         self._statistics_every = statistics_every
         self._features = features.extractor()
         self._statistics = RollingStatistics(features.window_frames, features.width)
@@ -68,6 +70,10 @@ class Pipeline:
         self._watch = SoundWatch()
         self._end = 0
         self._level = OK
+
+    @property
+    def _live(self) -> LabelStream | None:
+        return self._streams[LIVE]
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -145,9 +151,14 @@ class Pipeline:
         return self._close(self._end)
 
     def change_model(
-        self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
+        self,
+        model: Model | None,
+        classifier: Classifier | None,
+        frame: int,
+        stamp: int,
+        labelling: str = LIVE,
     ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Use another model from a frame on; features and statistics go on.
+        """Use another model from a frame on; all else goes on.
 
         Parameters
         ----------
@@ -157,6 +168,8 @@ class Pipeline:
             Of that model.
         frame, stamp : int
             Number of the next frame, and its start in nanoseconds of UTC.
+        labelling : str
+            `live`, or `candidate` for the model on trial.
 
         Returns
         -------
@@ -165,34 +178,12 @@ class Pipeline:
         opening : list of EncodedMessage
             First messages of the log of this model.
         """
-        earlier, self._live = self._live, self._stream(LIVE, classifier)
+        earlier, stream = self._streams[labelling], self._stream(labelling, classifier)
+        self._streams[labelling] = stream
         closing = [] if earlier is None else earlier.close(stamp)
-        self._follow(self._live, frame, 0 if earlier is None else frame - earlier.delay)
-        return closing, self.report("model", stamp, _from_frame("model", model, frame))
-
-    def change_candidate(
-        self, model: Model | None, classifier: Classifier | None, frame: int, stamp: int
-    ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Use another candidate from a frame on; all else goes on.
-
-        Parameters
-        ----------
-        model : Model or None
-            For the same feature set; None for no candidate.
-        classifier : Classifier or None
-            Of that model.
-        frame, stamp : int
-            Number of the next frame, and its start in nanoseconds of UTC.
-
-        Returns
-        -------
-        closing, opening : list of EncodedMessage
-            As of `change_model`.
-        """
-        closing = [] if self._candidate is None else self._candidate.close(stamp)
-        self._candidate = self._stream(CANDIDATE, classifier)
-        self._follow(self._candidate, frame, 0)
-        return closing, self.report("model", stamp, _from_frame("candidate", model, frame))
+        self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
+        what = "model" if labelling == LIVE else labelling
+        return closing, self.report("model", stamp, _from_frame(what, model, frame))
 
     def _stream(self, labelling: str, classifier: Classifier | None) -> LabelStream | None:
         return None if classifier is None else LabelStream(self.microphone, labelling, classifier)
@@ -265,12 +256,16 @@ class Pipeline:
     def _labels(
         self, features: Float32, floors: Floors | None, first: int, stamps: Int64
     ) -> list[EncodedMessage]:
-        streams = [stream for stream in (self._live, self._candidate) if stream is not None]
-        return [one for stream in streams for one in stream.push(features, floors, first, stamps)]
+        streams = [stream for stream in self._streams.values() if stream is not None]
+        return [
+            message
+            for stream in streams
+            for message in stream.push(features, floors, first, stamps)
+        ]
 
     def _close(self, end: int) -> list[EncodedMessage]:
         """End the segments at `end`; the next frame begins anew."""
-        streams = [stream for stream in (self._live, self._candidate) if stream is not None]
+        streams = [stream for stream in self._streams.values() if stream is not None]
         messages = [message for stream in streams for message in stream.close(end)]
         return sorted(messages, key=attrgetter("log_time"))
 

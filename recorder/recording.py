@@ -1,7 +1,7 @@
 """The recorder: a source of sound, the pipeline, and the log that it writes."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ from hearthlog.recorder.stream_messages import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.provenance import provenance
-from hearthlog.schemas.messages.topics import topics_of
+from hearthlog.schemas.messages.topics import CANDIDATE, topics_of
 
 
 @dataclass
@@ -286,9 +286,7 @@ class RecordingSession:
         the model card to the file.
         """
         stamp = int(frames.stamps[0])
-        for text in watch.refusals():
-            self.summary.models_refused += 1
-            self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, text)))
+        self._report_refused(watch.refusals(), stamp)
         if watch.ready is not None and self._log.may_begin(stamp):
             self._model, classifier = watch.ready
             watch.ready = None
@@ -299,16 +297,21 @@ class RecordingSession:
         """Report candidates that were refused, and let another one label from these frames on."""
         stamp = int(frames.stamps[0])
         self._news += candidates.news()
-        for text in candidates.refusals():
-            self.summary.models_refused += 1
-            self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, text)))
+        self._report_refused(candidates.refusals(), stamp)
         if self._news and self._log.may_begin(stamp):
             model, classifier = self._other(self._news[-1])
             self._news.clear()
             if model is not self._candidate:
                 self._candidate = model
-                messages = self._pipeline.change_candidate(model, classifier, frames.first, stamp)
+                messages = self._pipeline.change_model(
+                    model, classifier, frames.first, stamp, CANDIDATE
+                )
                 self._begin_log(*messages)
+
+    def _report_refused(self, reasons: Iterable[str], stamp: int) -> None:
+        for reason in reasons:
+            self.summary.models_refused += 1
+            self._log.write(self._pipeline.report("model", stamp, Notice(WARNING, reason)))
 
     def _other(self, candidate: Loaded | None) -> tuple[Model | None, Classifier | None]:
         """Return a candidate, unless it is the model in use."""
