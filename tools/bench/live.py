@@ -1,5 +1,6 @@
 """One microphone recorded live: how much of a core, and how much memory."""
 
+import shutil
 import subprocess
 import sys
 import time
@@ -8,7 +9,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.modelfile.modelfile import SUFFIX
+from hearthlog.models.modelfile.registry import CANDIDATE
+from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.sources import capture
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.bench.labmic import DEVICE, make_microphone
@@ -19,7 +26,7 @@ from hearthlog.tools.bench.workload import Workload
 _SECONDS = 60.0
 _SETTLE_SECONDS = 5.0
 _START_SECONDS = 30.0
-_HEARD_SECONDS = 10.0  # again and again; the device keeps them in memory
+_HEARD_SECONDS = 10  # again and again; the device keeps them in memory
 _CPU = Target(1.0, at_most=True)
 _MEMORY = Target(120.0, at_most=True)
 _HEAVY = ("sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy")
@@ -54,7 +61,7 @@ class _Usage:
 
 
 def measure(work: Workload) -> Table:
-    """Record for a minute, and beside it hear the same device without doing anything."""
+    """Record sound for a minute, once more with a candidate; hear it without doing anything."""
     size = SVM_RBF.summary(work.model)
     title = f"live: one microphone for {_SECONDS:.0f} s, {size}"
     try:
@@ -68,39 +75,72 @@ def measure(work: Workload) -> Table:
 
 
 def _live(work: Workload) -> list[Row]:
-    middle = len(work.samples) // 2
-    samples = work.samples[middle : middle + round(_HEARD_SECONDS * SAMPLE_RATE)]
-    env = make_microphone(work.folder, samples)
-    logs = work.folder / "logs-live"
-    recorder = ["record", "--device", DEVICE, "--model", work.model_file, "--output", logs]
+    env = make_microphone(work.folder, _most_sounding(work.samples))
+    logs, on_trial = work.folder / "logs-live", work.folder / "logs-on-trial"
     block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
     latency = capture.LATENCY_SECONDS
     bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
-        ours = stack.enter_context(_running([*HEARTHLOG, *recorder], env))
-        other = stack.enter_context(_running(bare, env))
-        _wait_for_log(logs, ours)
+        recorders = [
+            stack.enter_context(_running(_recorder(model, folder), env))
+            for model, folder in ((work.model_file, logs), (_beside_candidate(work), on_trial))
+        ]
+        processes = [*recorders, stack.enter_context(_running(bare, env))]
+        for recorder, folder in zip(recorders, (logs, on_trial), strict=True):
+            _wait_for_log(folder, recorder)
         time.sleep(_SETTLE_SECONDS)
-        before, began = _usage(ours) | _usage(other), time.monotonic()
+        before, began = [_usage(process) for process in processes], time.monotonic()
         time.sleep(_SECONDS)
-        after, seconds = _usage(ours) | _usage(other), time.monotonic() - began
-        ours.terminate()
-        gaps = ours.wait(timeout=_START_SECONDS) == _GAPS
-    if before.keys() != after.keys() or len(after) != 3:
+        after, seconds = [_usage(process) for process in processes], time.monotonic() - began
+        for recorder in recorders:
+            recorder.terminate()
+        ends = [recorder.wait(timeout=_START_SECONDS) for recorder in recorders]
+    if [one.keys() for one in before] != [one.keys() for one in after]:
         raise BenchError("the recorder lost the microphone while it was measured")
-    *percent, bare_percent = [100 * (after[pid].cpu - before[pid].cpu) / seconds for pid in after]
-    *megabytes, bare_megabytes = [usage.memory / 1e6 for usage in after.values()]
-    unit = "% of a core"
-    note = "sound was lost: the machine was busy" if gaps else ""
-    rows = [Row("hearthlog, all processes", sum(percent), unit, target=_CPU, note=note)]
-    names = ("recorder", "capture")
-    rows += [Row(f"  {n}", p, unit) for n, p in zip(names, percent, strict=True)]
-    rows += [
-        Row("the bare microphone", bare_percent, unit, note="opened alike, sound thrown away"),
-        Row("memory (PSS), all processes", sum(megabytes), "MB", target=_MEMORY),
+    percents = [
+        [100 * (last[pid].cpu - first[pid].cpu) / seconds for pid in first]
+        for first, last in zip(before, after, strict=True)
     ]
-    rows += [Row(f"  {n}", m, "MB") for n, m in zip(names, megabytes, strict=True)]
-    return [*rows, Row("the bare microphone, memory", bare_megabytes, "MB")]
+    megabytes = [[usage.memory / 1e6 for usage in last.values()] for last in after]
+    notes = ["sound was lost: the machine was busy" if end == _GAPS else "" for end in ends]
+    return _rows(percents, megabytes, notes)
+
+
+def _recorder(model: Path, logs: Path) -> list[object]:
+    return [*HEARTHLOG, "record", "--device", DEVICE, "--model", model, "--output", logs]
+
+
+def _beside_candidate(work: Workload) -> Path:
+    """Copy the model to a folder with a candidate; the same model would not label twice."""
+    folder = work.folder / "on-trial"
+    folder.mkdir()
+    shutil.copy(starter_file(GENERAL), folder / (CANDIDATE + SUFFIX))
+    return Path(shutil.copy(work.model_file, folder))
+
+
+def _most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Return the ten seconds in which most seconds are loud: in quiet a model is hardly asked."""
+    seconds = samples[: len(samples) // SAMPLE_RATE * SAMPLE_RATE].reshape(-1, SAMPLE_RATE)
+    levels = np.log10(np.einsum("ij,ij->i", seconds, seconds, dtype=np.float64) + 1.0)
+    sums = np.convolve(levels, np.ones(min(_HEARD_SECONDS, len(levels))), "valid")
+    return seconds[sums.argmax() :][:_HEARD_SECONDS].ravel()
+
+
+def _rows(percents: list[list[float]], megabytes: list[list[float]], notes: list[str]) -> list[Row]:
+    """Make rows of what a recorder, one with a candidate, and the bare microphone have used."""
+    unit, names = "% of a core", ("recorder", "capture")
+    alone, on_trial, (bare,) = percents
+    rows = [Row("hearthlog, all processes", sum(alone), unit, target=_CPU, note=notes[0])]
+    rows += [Row(f"  {n}", p, unit) for n, p in zip(names, alone, strict=True)]
+    rows += [
+        Row("with a candidate, all processes", sum(on_trial), unit, note=notes[1]),
+        Row("the bare microphone", bare, unit, note="opened alike, sound thrown away"),
+    ]
+    alone, on_trial, (bare,) = megabytes
+    rows += [Row("memory (PSS), all processes", sum(alone), "MB", target=_MEMORY)]
+    rows += [Row(f"  {n}", m, "MB") for n, m in zip(names, alone, strict=True)]
+    rows += [Row("memory with a candidate", sum(on_trial), "MB")]
+    return [*rows, Row("the bare microphone, memory", bare, "MB")]
 
 
 @contextmanager
