@@ -23,7 +23,7 @@ from hearthlog.analyzer.review.queue.random_minutes import (
 )
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
 from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.analyzer.review.timeline.model import no_spans
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
@@ -58,7 +58,7 @@ def home(recorded, tmp_path):
 
 
 def items(home, queue="useful", count=10, models="none"):
-    return queue_items(queue, find_labellings(home), LIVE, EVER, count, home / models)
+    return review_items(queue_spans(queue, find_labellings(home), LIVE, EVER, count, home / models))
 
 
 def written(home, read):
@@ -206,7 +206,7 @@ def test_what_was_looked_at_is_not_asked_again_whether_it_was_right_or_not(home)
 
 def test_in_a_short_log_most_is_left_for_spans(home):
     limits = (START, START + 9 * MINUTE)
-    found = queue_items("useful", find_labellings(home), LIVE, limits, 10)
+    found = queue_spans("useful", find_labellings(home), LIVE, limits, 10)
     assert {item.chosen for item in found} == {QUEUE}
 
 

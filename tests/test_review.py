@@ -30,7 +30,7 @@ from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_review
 from hearthlog.analyzer.review.queue.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.queue.review_list import write_list
 from hearthlog.analyzer.review.session.marking import Marking
-from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.analyzer.review.session.session import ReviewItem, Session
 from hearthlog.analyzer.review.session.sound import sound_of
 from hearthlog.analyzer.review.timeline.model import SoundClip
@@ -554,6 +554,10 @@ def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
 
 
 # What is in the queue
+
+
+def queue_items(*arguments):
+    return review_items(queue_spans(*arguments))
 
 
 @pytest.mark.parametrize("ranking", ["useful", "uncertain", "novel", "disagreeing"])

@@ -53,11 +53,11 @@ def gate(
         folder.mkdir()
         shutil.copytree(home / "logs", logs)
         shutil.copy(model, folder / "champion.safetensors")
-        found = recent_logs([logs])
-        truth = _truth(home, found)
-        _review_at_random(found, truth, minutes, np.random.default_rng(seed))
+        recent = recent_logs([logs])
+        truth = _truth(home, recent)
+        _review_at_random(recent, truth, minutes, np.random.default_rng(seed))
         champion = load_model(model)
-        models = [*_candidates(champion, found, truth, logs), *map(load_model, other or [])]
+        models = [*_candidates(champion, recent, truth, logs), *map(load_model, other or [])]
         for number, candidate in enumerate(models):
             path = folder / f"model-{number}.safetensors"
             save_model(candidate, path)
@@ -67,7 +67,7 @@ def gate(
 def _line(name: str, verdict: Verdict) -> str:
     random = None if verdict.evidence is None else verdict.evidence.random
     right = "" if random is None else f"{random.after} of {random.sounds}, not {random.before}"
-    says = "; ".join(verdict.judgement.reasons) or "may speak"
+    says = "; ".join(verdict.judgement.reasons) or "may label"
     return f"{name:32} {right:20} {says}"
 
 
@@ -129,8 +129,8 @@ def _candidates(
 
 
 def _described(model: Model, name: str, **changes: object) -> Model:
-    about = model.description.model_copy(update=changes)
-    return replace(model, name=name, description=about)
+    description = model.description.model_copy(update=changes)
+    return replace(model, name=name, description=description)
 
 
 def _spread(logs: Sequence[RecentLog], truth: Labelling, count: int) -> list[Mark]:
@@ -138,10 +138,10 @@ def _spread(logs: Sequence[RecentLog], truth: Labelling, count: int) -> list[Mar
     end = logs[0].start // _DAY * _DAY + _DAY
     first = [log for log in logs if log.end <= end]
     sources = find_labellings(*[log.path for log in first])
-    said = sources.read(sources.microphone(None), LIVE).labelling
-    both = overlay([truth, said]).in_all()
+    labels = sources.read(sources.microphone(None), LIVE).labelling
+    both = overlay([truth, labels]).in_all()
     true = np.array([_label(label) for label in truth.labels[both.rows[0]]], object)
-    wrong = true != said.labels[both.rows[1]]
+    wrong = true != labels.labels[both.rows[1]]
     long = both.ends - both.starts >= _SHORTEST
     marks = []
     for which in (wrong & long, ~wrong & long):

@@ -96,8 +96,8 @@ def live(home: Home) -> Iterator[Week]:
         truth, recorded = _record(home, number, parts, begin, model)
         sources = find_labellings(logs)
         microphone = sources.microphone(None)
-        said = sources.read(microphone, LIVE, begin, end).labelling
-        starter = said if model == starter_file(GENERAL) else _labelled(recorded)
+        labels = sources.read(microphone, LIVE, begin, end).labelling
+        starter = labels if model == starter_file(GENERAL) else _labelled(recorded)
         wrong, models = float(number == WRONG_WEEK), home.folder / "models"
         person = Person(truth, wrong=wrong, seed=home.seed, models=models)
         done = person.review(logs, _MINUTES, end, (begin, end))
@@ -105,7 +105,7 @@ def live(home: Home) -> Iterator[Week]:
         yield Week(
             number,
             model.stem,
-            scored(truth, said),
+            scored(truth, labels),
             scored(truth, starter),
             round(done.seconds / 60.0, 2),
             len(done.marks),

@@ -22,7 +22,7 @@ class Scored:
     Attributes
     ----------
     seconds : dict of str to dict of str to float
-        What is true, what was said, and for how long.
+        What is true, what was labelled, and for how long.
     false_events : dict of str to float
         By class, in 24 hours.
     """
@@ -37,12 +37,12 @@ class Scored:
         ----------
         classes : sequence of str
         """
-        true = {name: sum(said.values()) for name, said in self.seconds.items()}
-        found = {
-            name: sum(said.get(name, 0.0) for said in self.seconds.values()) for name in classes
+        true = {name: sum(row.values()) for name, row in self.seconds.items()}
+        labelled = {
+            name: sum(row.get(name, 0.0) for row in self.seconds.values()) for name in classes
         }
         return {
-            name: 2.0 * self.seconds[name].get(name, 0.0) / (true[name] + found[name])
+            name: 2.0 * self.seconds[name].get(name, 0.0) / (true[name] + labelled[name])
             for name in classes
             if true.get(name)
         }
@@ -90,15 +90,15 @@ class Week:
     said: list[str] = field(default_factory=list)
 
 
-def scored(truth: Labelling, said: Labelling) -> Scored:
+def scored(truth: Labelling, labelled: Labelling) -> Scored:
     """Score a labelling where both it and the truth have labels.
 
     Parameters
     ----------
-    truth, said : Labelling
+    truth, labelled : Labelling
         In the order of time, one label at a time.
     """
-    true, own = _named(truth), _named(said)
+    true, own = _named(truth), _named(labelled)
     parts = overlay([true, own]).in_all()
     seconds: dict[str, dict[str, float]] = {}
     pairs = np.stack([true.labels[parts.rows[0]], own.labels[parts.rows[1]]])

@@ -332,12 +332,12 @@ def heard(scene: Recorded, model: Model) -> Heard:
 def _scores(model: Model, heard: Heard) -> dict[str, float]:
     """Return the F1 of each class that is there."""
     classes = np.array(model.classes, object)
-    said = np.full(len(heard.inputs), SILENCE, object)
+    labels = np.full(len(heard.inputs), SILENCE, object)
     loud = ~heard.quiet
-    said[loud] = classes[Classifier(model).probabilities(heard.inputs[loud]).argmax(axis=1)]
+    labels[loud] = classes[Classifier(model).probabilities(heard.inputs[loud]).argmax(axis=1)]
     return {
-        name: 2.0 * float(((said == name) & (heard.true == name)).sum())
-        / float((said == name).sum() + (heard.true == name).sum())
+        name: 2.0 * float(((labels == name) & (heard.true == name)).sum())
+        / float((labels == name).sum() + (heard.true == name).sum())
         for name in sorted(set(heard.true))
     }  # fmt: skip
 

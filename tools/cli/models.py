@@ -29,7 +29,7 @@ models = typer.Typer(
 _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "size")
 
 
-class _Said(NamedTuple):
+class _ClassShare(NamedTuple):
     """How much of the sound each of two models gives to a class."""
 
     name: str
@@ -116,19 +116,22 @@ def compare(
     recordings = _recordings(data, logs, chosen, features)
     if logs is not None and not recordings:
         tell("nothing is marked: it is said how the models differ, not which is better")
-        said = _said_in_logs(first, second, logs)
+        shares = _minutes_in_logs(first, second, logs)
         if as_json:
-            print(json.dumps({"said": _said_json(said)}, indent=2))
+            print(json.dumps({"said": _shares_json(shares)}, indent=2))
         else:
-            _print_said(first.name, second.name, said, None)
+            _print_shares(first.name, second.name, shares, None)
         return
     comparison = compare_models(first, second, recordings, chosen)
-    said = _said_of_segments(comparison) if logs is None else _said_in_logs(first, second, logs)
+    if logs is None:
+        shares = _shares_of_segments(comparison)
+    else:
+        shares = _minutes_in_logs(first, second, logs)
     if as_json:
-        more = {"clear": comparison.clear, "said": _said_json(said)}
+        more = {"clear": comparison.clear, "said": _shares_json(shares)}
         print(json.dumps(asdict(comparison) | more, indent=2))
     else:
-        _print_comparison(comparison, said)
+        _print_comparison(comparison, shares)
     if not comparison.held_out:
         tell(
             "every source is one that these models have learned from: this says nothing of how "
@@ -248,18 +251,18 @@ def _after(before: str | None) -> str:
     return "" if before is None else f", after {before}"
 
 
-def _said_of_segments(comparison: "Comparison") -> list["_Said"]:
+def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
     """Return the share of the segments that each model gives to each class."""
     sides = (comparison.a, comparison.b)
     both = [[sum(column) for column in zip(*one.scores.confusion, strict=True)] for one in sides]
     total = max(comparison.a.scores.segments, 1)
     return [
-        _Said(name, a / total, b / total, f"{a / total:.1%}", f"{b / total:.1%}")
+        _ClassShare(name, a / total, b / total, f"{a / total:.1%}", f"{b / total:.1%}")
         for name, a, b in zip(comparison.a.scores.classes, *both, strict=True)
     ]
 
 
-def _said_in_logs(a: "Model", b: "Model", logs: Path) -> list["_Said"]:
+def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
     """Return how many minutes of a mean day each model gives to each class."""
     from hearthlog.analyzer.gate.changes import time_words
     from hearthlog.analyzer.gate.evidence import gather_evidence
@@ -270,35 +273,37 @@ def _said_in_logs(a: "Model", b: "Model", logs: Path) -> list["_Said"]:
         changes = gather_evidence(a, b, recent_logs([logs]), report).changes
     times = zip(changes.classes, changes.before.tolist(), changes.after.tolist(), strict=True)
     return [
-        _Said(name, before, after, time_words(before), time_words(after))
+        _ClassShare(name, before, after, time_words(before), time_words(after))
         for name, before, after in times
     ]
 
 
-def _said_json(said: list["_Said"]) -> dict[str, list[float]]:
-    return {one.name: [one.a, one.b] for one in said}
+def _shares_json(shares: list["_ClassShare"]) -> dict[str, list[float]]:
+    return {one.name: [one.a, one.b] for one in shares}
 
 
-def _print_comparison(comparison: "Comparison", said: list["_Said"]) -> None:
+def _print_comparison(comparison: "Comparison", shares: list["_ClassShare"]) -> None:
     a, b = comparison.a, comparison.b
     print(f"{a.scores.segments} segments from {a.scores.groups} sources", end="")
     print(f"; {comparison.sources_left_out} sources left out that a model has learned from")
     for reason, count in comparison.skipped.items():
         print(f"{count} recordings left out: {reason}")
     print()
-    _print_said(a.name, b.name, said, comparison)
+    _print_shares(a.name, b.name, shares, comparison)
     print(f"\n{_verdict(comparison)}")
 
 
-def _print_said(a: str, b: str, said: list["_Said"], comparison: "Comparison | None") -> None:
+def _print_shares(
+    a: str, b: str, shares: list["_ClassShare"], comparison: "Comparison | None"
+) -> None:
     """Print a row for each class that either model says or that occurs."""
     sides = () if comparison is None else (comparison.a, comparison.b)
     f1 = [{name: one.f1 for name, one in side.scores.per_class.items()} for side in sides]
-    names = dict.fromkeys([*(name for one in f1 for name in one), *(one.name for one in said)])
-    times = {one.name: one for one in said}
+    names = dict.fromkeys([*(name for one in f1 for name in one), *(one.name for one in shares)])
+    times = {one.name: one for one in shares}
     rows = []
     for name in names:
-        time = times.get(name, _Said(name, 0.0, 0.0, "", ""))
+        time = times.get(name, _ClassShare(name, 0.0, 0.0, "", ""))
         scores = [share(one[name]) if name in one else "" for one in f1]
         if any(scores) or time.a or time.b:
             rows.append((name, *scores, time.a_text, time.b_text))

@@ -29,6 +29,8 @@ from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import end_with_warnings, tell, wrong_use
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.logs.labellings import Labellings
+    from hearthlog.analyzer.review.queue.review_list import ReviewSpan
     from hearthlog.analyzer.review.session.marking import Marking
     from hearthlog.analyzer.review.session.session import ReviewItem
     from hearthlog.analyzer.review.timeline.model import Timeline
@@ -241,7 +243,7 @@ def _work(
     from hearthlog.analyzer.logs.labellings import find_labellings
     from hearthlog.analyzer.review.queue.asked import corrected_name
     from hearthlog.analyzer.review.session.marking import Marking
-    from hearthlog.analyzer.review.session.queue_items import queue_items
+    from hearthlog.analyzer.review.session.queue_items import review_items
     from hearthlog.analyzer.review.timeline.model import no_spans
     from hearthlog.schemas.messages.topics import LIVE
 
@@ -251,16 +253,7 @@ def _work(
         sources = find_labellings(*logs)
         labelling = sources.find(microphone, choice.labels)
         if choice.queue is not None:
-            with share_done("choosing spans") as progress:
-                items = queue_items(
-                    choice.queue,
-                    sources,
-                    (microphone, labelling),
-                    choice.limits,
-                    choice.spans,
-                    models_folder(),
-                    progress,
-                )
+            items = review_items(_queue_spans(choice.queue, sources, microphone, labelling, choice))
             _tell_fewer(len(items), choice)
     marking = Marking(
         microphone,
@@ -279,7 +272,6 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.review.queue.asked import asked_path, labels_of
     from hearthlog.analyzer.review.queue.review_list import write_list
-    from hearthlog.analyzer.review.session.queue_items import queue_spans
     from hearthlog.schemas.storage.new_files import check_new
 
     if find_format(path) is None:
@@ -292,16 +284,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
     microphone = sources.microphone(choice.microphone)
     labelling = sources.find(microphone, choice.labels)
     assert choice.queue is not None
-    with share_done("choosing spans") as progress:
-        spans = queue_spans(
-            choice.queue,
-            sources,
-            (microphone, labelling),
-            choice.limits,
-            choice.spans,
-            models_folder(),
-            progress,
-        )
+    spans = _queue_spans(choice.queue, sources, microphone, labelling, choice)
     segments = sources.read(microphone, labelling, *choice.limits).labelling
     marks = sorted(mark for span in spans for mark in labels_of(span, segments))
     write_labels(path, marks, find_coverage(logs[0]))
@@ -319,6 +302,18 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice) -> None:
         f"marks: hearthlog annotate import {logs[0]} {path}"
     )
     end_with_warnings(sources.losses)
+
+
+def _queue_spans(
+    queue: str, sources: "Labellings", microphone: str, labelling: str, choice: _Choice
+) -> "list[ReviewSpan]":
+    from hearthlog.analyzer.review.session.queue_items import queue_spans
+
+    labelled = microphone, labelling
+    with share_done("choosing spans") as progress:
+        return queue_spans(
+            queue, sources, labelled, choice.limits, choice.spans, models_folder(), progress
+        )
 
 
 def _tell_fewer(count: int, choice: _Choice) -> None:

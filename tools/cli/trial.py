@@ -5,9 +5,7 @@ from typing import Any
 from hearthlog.analyzer.gate.changes import time_words
 from hearthlog.analyzer.gate.on_trial import Trial, gain_interval
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.table import print_table
-
-_SHOWN = 8  # changes
+from hearthlog.tools.cli.changes_table import print_changes
 
 
 def trial_as_json(trial: Trial) -> dict[str, Any]:
@@ -33,22 +31,13 @@ def trial_as_json(trial: Trial) -> dict[str, Any]:
 
 def print_trial(trial: Trial) -> None:
     """Print how two models that label at the same time differ, and which is more often right."""
-    changes = trial.changes
     print(
         printable(
             f"{trial.candidate}, a candidate, beside {trial.champion}: "
             f"{time_words(trial.minutes)} in which both labelled"
         )
     )
-    for change in changes.pairs()[:_SHOWN]:
-        print(f"  {change}")
-    rows = [
-        (name, time_words(before), time_words(after))
-        for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True)
-        if before or after
-    ]
-    print()
-    print_table(("a day", trial.champion, trial.candidate), rows)
+    print_changes(trial.changes, trial.champion, trial.candidate)
     print()
     for what, right in (
         ("sounds of minutes drawn at random", trial.random),

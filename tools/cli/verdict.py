@@ -2,15 +2,13 @@
 
 from typing import TYPE_CHECKING
 
-from hearthlog.tools.cli.table import print_table
+from hearthlog.tools.cli.changes_table import print_changes
 from hearthlog.tools.cli.text import tell
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.gate.evidence import Evidence, Right
     from hearthlog.analyzer.gate.judge import Verdict
     from hearthlog.models.modelfile.judgement import Judgement
-
-_SHOWN = 8  # changes
 
 
 def print_verdict(verdict: "Verdict") -> None:
@@ -44,21 +42,12 @@ def refusal(judgement: "Judgement", name: str) -> str:
 def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     from hearthlog.analyzer.gate.changes import time_words
 
-    changes, heard = evidence.changes, time_words(evidence.minutes)
-    pairs = changes.pairs()
+    little = "" if evidence.changes.pairs() else " less than half a minute a day"
     print(
-        f"\non {heard} of the last two weeks that it has not learned from, {model} instead of "
-        f"{champion} changes{'' if pairs else ' less than half a minute a day'}"
+        f"\non {time_words(evidence.minutes)} of the last two weeks that it has not learned from, "
+        f"{model} instead of {champion} changes{little}"
     )
-    for change in pairs[:_SHOWN]:
-        print(f"  {change}")
-    rows = [
-        (name, time_words(before), time_words(after))
-        for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True)
-        if before or after
-    ]
-    print()
-    print_table(("a day", champion, model), rows)
+    print_changes(evidence.changes, champion, model)
 
 
 def _print_right(what: str, right: "Right", verdict: "Verdict") -> None:

@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.ranking import USEFUL
-from hearthlog.analyzer.review.session.queue_items import queue_items
+from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
@@ -108,8 +108,8 @@ class Person:
         """
         sources = find_labellings(logs)
         labelled = sources.microphone(None), LIVE
-        items = queue_items(queue, sources, labelled, limits, _MOST_ITEMS, self.models)
-        return self.go_through(items, logs, made, minutes)
+        spans = queue_spans(queue, sources, labelled, limits, _MOST_ITEMS, self.models)
+        return self.go_through(review_items(spans), logs, made, minutes)
 
     def go_through(
         self, items: Iterable[ReviewItem], logs: Path, made: int, minutes: float = math.inf
@@ -129,30 +129,30 @@ class Person:
         """
         sources = find_labellings(logs)
         microphone = sources.microphone(None)
-        said = sources.read(microphone, LIVE)
+        labelled = sources.read(microphone, LIVE)
         coverage = find_coverage(logs)[microphone]
         rng = generator(self.seed, made % (1 << 32))
         done = Review([], [], 0.0)
         for item in items:
-            labels = self._corrections(item, said, rng)
+            labels = self._corrections(item, labelled, rng)
             seconds = done.seconds + _seconds(item, len(labels))
             if seconds > 60.0 * minutes:
                 break
-            about = (self.name, made, LIVE)
-            marks = [Mark(microphone, *label, *about) for label in labels]
-            looked_at = ReviewedSpan(microphone, item.start, item.end, *about, item.chosen)
+            origin = (self.name, made, LIVE)
+            marks = [Mark(microphone, *label, *origin) for label in labels]
+            looked_at = ReviewedSpan(microphone, item.start, item.end, *origin, item.chosen)
             _write(coverage, marks, looked_at)
             done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
         return done
 
     def _corrections(
-        self, item: ReviewItem, said: NamedLabelling, rng: np.random.Generator
+        self, item: ReviewItem, labelled: NamedLabelling, rng: np.random.Generator
     ) -> list[tuple[int, int, str]]:
         """Return the sounds in an item, with their true borders, that are not labelled rightly."""
         inside, row, _ = pieces(self.truth, one(item.start, item.end))
         labels = self.truth.labels[row]
-        parts = overlay([inside, said.labelling]).in_all()
-        true, own = labels[parts.rows[0]], said.labelling.labels[parts.rows[1]]
+        parts = overlay([inside, labelled.labelling]).in_all()
+        true, own = labels[parts.rows[0]], labelled.labelling.labels[parts.rows[1]]
         differs = np.array([not _same(a, b) for a, b in zip(true, own, strict=True)], bool)
         wrong = np.bincount(
             parts.rows[0], (parts.ends - parts.starts) * differs, minlength=len(labels)
@@ -160,11 +160,11 @@ class Person:
         lengths = inside.ends - inside.starts
         marked = (lengths >= _HEARD) & (wrong >= np.minimum(_WRONG, lengths / 2))
         return [
-            (int(inside.starts[i]), int(inside.ends[i]), self._said(labels[i], rng))
+            (int(inside.starts[i]), int(inside.ends[i]), self._mark_label(labels[i], rng))
             for i in np.flatnonzero(marked)
         ]
 
-    def _said(self, label: str, rng: np.random.Generator) -> str:
+    def _mark_label(self, label: str, rng: np.random.Generator) -> str:
         if rng.random() < self.wrong:
             names = sorted(set(self.truth.labels))
             label = names[(names.index(label) + 1) % len(names)]
@@ -185,10 +185,10 @@ def true_labelling(spans: list[LabelledSpan], start: int) -> Labelling:
     return Labelling(times[:, 0], times[:, 1], np.array([span[2] for span in spans], object))
 
 
-def _same(true: str, said: str) -> bool:
+def _same(true: str, label: str) -> bool:
     if true == OTHER_NEGATIVE:
-        return said in {OTHER_NEGATIVE, UNKNOWN}
-    return class_name(true) == class_name(said)
+        return label in {OTHER_NEGATIVE, UNKNOWN}
+    return class_name(true) == class_name(label)
 
 
 def _seconds(item: ReviewItem, marks: int) -> float:

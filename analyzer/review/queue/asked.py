@@ -36,22 +36,22 @@ def corrected_name(labelling: str) -> str:
     return labelling.removeprefix(f"{RELABEL}/")
 
 
-def labels_of(span: ReviewSpan, said: Labelling) -> list[Mark]:
+def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
     """Return the labels of a span for a label file: one, or of a whole minute all.
 
     Parameters
     ----------
     span : ReviewSpan
-    said : Labelling
+    labelling : Labelling
         The one that is reviewed.
     """
     if span.reason != RANDOM:
         return [Mark(span.microphone, span.start, span.end, span.label_a)]
-    parts, rows, _ = pieces(said, one(span.start, span.end))
+    parts, rows, _ = pieces(labelling, one(span.start, span.end))
     times = zip(parts.starts.tolist(), parts.ends.tolist(), strict=True)
     return [
         Mark(span.microphone, *each, label)
-        for each, label in zip(times, said.labels[rows].tolist(), strict=True)
+        for each, label in zip(times, labelling.labels[rows].tolist(), strict=True)
     ]
 
 
@@ -80,14 +80,15 @@ def looked_at(
     dict of Path to list of ReviewedSpan
         By log.
     """
-    found: dict[Path, list[ReviewedSpan]] = {}
+    reviewed: dict[Path, list[ReviewedSpan]] = {}
     for span in asked:
         answers = (
             mark.microphone == span.microphone and mark.start < span.end and mark.end > span.start
             for mark in marks
         )
         if span.microphone in coverage and any(answers):
-            about = reviewer, made, corrected_name(span.a), chosen_as(span)
+            origin = reviewer, made, corrected_name(span.a), chosen_as(span)
             for log, first, last in coverage[span.microphone].split(span.start, span.end):
-                found.setdefault(log, []).append(ReviewedSpan(span.microphone, first, last, *about))
-    return found
+                part = ReviewedSpan(span.microphone, first, last, *origin)
+                reviewed.setdefault(log, []).append(part)
+    return reviewed

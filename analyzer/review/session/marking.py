@@ -274,8 +274,8 @@ class Marking:
         return change
 
     def _looked_at(self, start: int, end: int, now: int, chosen: str) -> list[ReviewedSpan]:
-        about = self.reviewer, now, self.corrects, chosen
-        return [ReviewedSpan(self.microphone, start, end, *about)] if chosen else []
+        origin = self.reviewer, now, self.corrects, chosen
+        return [ReviewedSpan(self.microphone, start, end, *origin)] if chosen else []
 
 
 def _outside(span: ReviewedSpan, start: int, end: int) -> list[ReviewedSpan]:

@@ -1,6 +1,6 @@
 """The spans that a review goes through: of a queue, or of a list that `diff` made."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,20 @@ _MINUTES_LEFT = 10  # for each that is drawn, or a short log would have no usefu
 Limits = tuple[int | None, int | None]
 
 
-def queue_items(  # noqa: PLR0913, PLR0917
+def review_items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
+    """Return the items of a review, in the order of the spans.
+
+    Parameters
+    ----------
+    spans : iterable of ReviewSpan
+    """
+    return [
+        ReviewItem(span.start, span.end, span.label_a, _text(span), chosen_as(span))
+        for span in spans
+    ]
+
+
+def queue_spans(  # noqa: PLR0913, PLR0917
     queue: str,
     sources: Labellings,
     labelled: tuple[str, str],
@@ -39,7 +52,7 @@ def queue_items(  # noqa: PLR0913, PLR0917
     count: int | None,
     models: Path = DEFAULT_FOLDER,
     progress: Progress = ignore_progress,
-) -> list[ReviewItem]:
+) -> list[ReviewSpan]:
     """Choose spans of a labelling for a review.
 
     Parameters
@@ -61,7 +74,7 @@ def queue_items(  # noqa: PLR0913, PLR0917
 
     Returns
     -------
-    list of ReviewItem
+    list of ReviewSpan
         The most useful first, or in the order of the list.
 
     Raises
@@ -70,33 +83,6 @@ def queue_items(  # noqa: PLR0913, PLR0917
         If there is nothing to review, or no such list.
     LogError
         If the labelling has no segment in these limits, or its segments overlap or cannot be.
-    """
-    return [
-        ReviewItem(span.start, span.end, span.label_a, _text(span), chosen_as(span))
-        for span in queue_spans(queue, sources, labelled, limits, count, models, progress)
-    ]
-
-
-def queue_spans(  # noqa: PLR0913, PLR0917
-    queue: str,
-    sources: Labellings,
-    labelled: tuple[str, str],
-    limits: Limits,
-    count: int | None,
-    models: Path = DEFAULT_FOLDER,
-    progress: Progress = ignore_progress,
-) -> list[ReviewSpan]:
-    """Choose spans of a labelling, as `queue_items` does, for a list.
-
-    Parameters
-    ----------
-    queue, sources, labelled, limits, count, models, progress
-        As of `queue_items`.
-
-    Raises
-    ------
-    DataError, LogError
-        As of `queue_items`.
     """
     microphone, labelling = labelled
     if queue not in QUEUES:

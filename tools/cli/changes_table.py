@@ -1,0 +1,32 @@
+"""What another labelling changes in a home, in lines."""
+
+from typing import TYPE_CHECKING
+
+from hearthlog.tools.cli.table import print_table
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.gate.changes import Changes
+
+_SHOWN = 8  # changes
+
+
+def print_changes(changes: "Changes", before: str, after: str) -> None:
+    """Print the longest changes, and the minutes a day of each class.
+
+    Parameters
+    ----------
+    changes : Changes
+    before, after : str
+        Names of the models that labelled.
+    """
+    from hearthlog.analyzer.gate.changes import time_words
+
+    for change in changes.pairs()[:_SHOWN]:
+        print(f"  {change}")
+    rows = [
+        (name, time_words(first), time_words(second))
+        for name, first, second in zip(changes.classes, changes.before, changes.after, strict=True)
+        if first or second
+    ]
+    print()
+    print_table(("a day", before, after), rows)
