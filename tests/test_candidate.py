@@ -202,6 +202,11 @@ def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd)
     )
     assert "cannot be told" in first["verdict"]
     review_as_the_candidate_says(logs)
+    again = json.loads(run(capfd, "models", "compare", "--live", "--logs", logs, "--json").stdout)
+    known = again["random"]
+    assert known["gained"] - known["lost"] == known["after"] - known["before"]
+    assert known["after"] == known["sounds"] > known["before"] > 0
+    assert again["marks"]["sounds"] == 0  # that of which nothing is known is none
     said = run(capfd, "models", "compare", "--live", "--logs", logs)
     assert said.returncode == 0, said.stderr
     assert "two is better: right where one is not" in said.stdout
@@ -222,6 +227,8 @@ def review_as_the_candidate_says(logs):
         for begin, length, label in segments
         if minute.start <= begin and begin + length <= minute.end
     ]
+    end = minute.end + NANOSECONDS
+    marks.append(Mark("mic", end, end + NANOSECONDS, "unknown"))
     write_marks(log, marks, reviewed=[minute])
 
 

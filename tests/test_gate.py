@@ -16,6 +16,7 @@ from spliced import run
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_frames, changes_of_labellings
 from hearthlog.analyzer.gate.evidence import Evidence, Right
+from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import Part, choose, recent_logs, sample
 from hearthlog.analyzer.gate.rules import clearly_better, damages
 from hearthlog.analyzer.logs.labelling import Labelling
@@ -189,6 +190,7 @@ def test_who_repairs_what_the_champion_was_sure_of_is_let_if_random_minutes_say_
     judgement_path(Path("models"), load_model(Path("models/good.safetensors")).sha256).unlink()
     let = run(capfd, "models", "promote", "good")
     assert let.returncode == 0, let.stderr
+    assert "other sounds that were marked" not in let.stdout  # none outside of these minutes
     assert champion() == "good"
 
 
@@ -213,6 +215,9 @@ def test_a_model_that_does_not_say_what_it_learned_from_has_learned_from_all_mar
     keep("old", training_data=one.description.training_data.model_copy(update={"home": home}))
     done = run(capfd, "models", "promote", "old")
     assert "are in the logs and not learned from" in done.stderr
+    assert "other sounds that were marked" not in done.stdout
+    keep_alike()
+    assert "other sounds that were marked" in run(capfd, "models", "promote", "alike").stdout
 
 
 @pytest.mark.usefixtures("place")
@@ -230,6 +235,17 @@ def test_what_cannot_be_judged_is_refused_in_a_line(capfd, tmp_path):
         path.rename(tmp_path / "kept")
     assert "one (" in (gone := refusal())
     assert "which labels now, is neither in models nor a starter" in gone
+
+
+@pytest.mark.usefixtures("place")
+def test_the_champion_itself_is_compared_with_what_labelled_the_logs():
+    model = keep_alike()
+    champion = Path("models/champion.safetensors")
+    champion.unlink()
+    champion.symlink_to("alike.safetensors")
+    other = find_champion(Path("models"), [Path("logs")], model.sha256)
+    assert other is not None
+    assert other.name == "one"
 
 
 @pytest.mark.usefixtures("place")
@@ -373,20 +389,22 @@ def test_changes_are_the_minutes_of_a_day_for_each_pair():
 
 def test_two_labellings_in_logs_are_compared_in_minutes_a_day():
     def labelling(name, *labels):
-        starts = START + np.arange(len(labels)) * MINUTE
+        day, minute = np.divmod(np.arange(len(labels)), 2)
+        starts = START + day * 24 * 60 * MINUTE + minute * MINUTE
         own = Labelling(starts, starts + MINUTE, np.array(labels, object))
         return NamedLabelling(name, tuple(dict.fromkeys(labels)), own)
 
-    a = labelling("live", "silence", "silence", "speech")
-    b = labelling("candidate", "silence", "speech", "speech")
+    a = labelling("live", "silence", "silence", "silence", "speech")
+    b = labelling("candidate", "silence", "speech", "speech", "speech")
     found = changes_of_labellings(compare_labellings(a, b))
     assert [str(change) for change in found.pairs()] == ["1.0 min a day from silence to talking"]
 
 
-def test_logs_that_cannot_be_read_are_passed_over(place):
+def test_logs_that_cannot_be_read_or_are_weeks_old_are_passed_over(place):
     (log,) = recent_logs([place / "logs"])
     broken = log.path.with_name("home_20260301T090000Z.mcap")
     broken.write_bytes(b"garbage")
+    shutil.copy(log.path, log.path.with_name("home_20260201T090000Z.mcap"))
     assert recent_logs([place / "logs"]) == [log]
     assert recent_logs([place / "nowhere"]) == []
 
@@ -441,3 +459,4 @@ def test_what_the_champion_is_sure_of_stays():
         "of 15 min a day of talking of which one is sure 5.0 min are left, most becomes music"
     )
     assert damages(evidence(table, sure=[[900, 0, 0], [0, 9, 3], [0, 0, 0]]), "one") == []
+    assert damages(evidence(table, sure=[[900, 0, 0], [0, 1, 4], [0, 0, 0]]), "one") == []

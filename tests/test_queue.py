@@ -206,7 +206,7 @@ def test_what_was_looked_at_is_not_asked_again_whether_it_was_right_or_not(home)
 
 def test_in_a_short_log_most_is_left_for_spans(home):
     limits = (START, START + 9 * MINUTE)
-    found = queue_spans("useful", find_labellings(home), LIVE, limits, 10)
+    found = review_items(queue_spans("useful", find_labellings(home), LIVE, limits, 10))
     assert {item.chosen for item in found} == {QUEUE}
 
 
