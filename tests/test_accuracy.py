@@ -64,11 +64,11 @@ def test_a_checked_minute_has_what_is_right_wrong_and_missed(tmp_path):
     check(logs, at("10:02"), corrects="other")
     minutes = checked(tmp_path)
     assert len(minutes) == 3
-    assert minutes.check("coughing") == (2, 1, 2, 1)
-    assert minutes.check("speech") == (1, 1, 1, 0)
-    assert minutes.check("crying") == (0, 0, 1, 1)
-    assert minutes.check("objects_activity") == (0, 0, 1, 1)
-    assert minutes.check("music") == (0, 0, 0, 0)
+    assert minutes.check("coughing") == (2, 1, 2, 1, 1)
+    assert minutes.check("speech") == (1, 1, 1, 0, 0)
+    assert minutes.check("crying") == (0, 0, 1, 1, 0)
+    assert minutes.check("objects_activity") == (0, 0, 1, 1, 0)
+    assert minutes.check("music") == (0, 0, 0, 0, 0)
     assert minutes.sounding.tolist() == [True, True, False]
     assert len(checked(tmp_path, "other")) == 0
 
@@ -76,7 +76,7 @@ def test_a_checked_minute_has_what_is_right_wrong_and_missed(tmp_path):
 def test_a_mark_that_says_nothing_is_known_says_nothing(tmp_path):
     logs = write_day(tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)])
     check(logs, at("10:00"), [(5, 7, "unknown")])
-    assert checked(tmp_path).check("coughing") == (1, 1, 1, 0)
+    assert checked(tmp_path).check("coughing") == (1, 1, 1, 0, 0)
 
 
 def test_a_damaged_layer_is_a_loss_and_the_other_minutes_count(tmp_path):
@@ -239,7 +239,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     accuracy = Accuracy(find_home_logs([tmp_path / "home"]))
     lines = list(accuracy.lines())
     assert lines[0].startswith("checked here, 6 minutes drawn at random: coughing right in 3 of 6")
-    assert "of 2 spans that were asked for or chosen, 1 had the right label" in lines[1]
+    assert "of 2 spans that were asked for or chosen, 1 had the right label" in lines[2]
     assert accuracy.as_json()["classes"]["coughing"]["labelled"] == 6
     done = run(capfd, "info", log_at(logs, at("08:00")))
     assert "not checked here" not in done.stdout, "no model labelled this log"
@@ -250,4 +250,21 @@ def test_an_interval_of_few_checks_is_wide_and_of_many_narrow():
     assert few.precision[1] - few.precision[0] > 0.5
     assert many.precision == pytest.approx((0.713, 0.784), abs=0.002)
     assert ClassCheck(0, 0, 0, 0).precision is None
-    assert ClassCheck(0, 0, 3, 3).miss_rate[0] > 0.4
+    assert ClassCheck(0, 0, 3, 3).miss_rate(1)[0] > 0.4
+
+
+def test_what_is_missed_in_a_quiet_minute_stands_for_more_than_in_one_with_sound(tmp_path):
+    coughs = [(at(f"{h:02}:00:05"), 2, "coughing", 0.9) for h in range(8, 20)]
+    logs = write_day(tmp_path, DAY, coughs)
+    for hour in range(8, 14):
+        check(logs, at(f"{hour:02}:00"))
+    check(logs, at("15:30"), [(5, 7, "coughing")])
+    check(logs, at("16:30"))
+    accuracy = Accuracy(find_home_logs([tmp_path]))
+    assert accuracy.weight == pytest.approx((1428 / 2) / (12 / 6))
+    checked = accuracy.minutes.check("coughing")
+    assert checked == (6, 6, 7, 1, 1)
+    assert checked.miss_rate(1)[1] < 0.5
+    assert checked.miss_rate(accuracy.weight)[1] > 0.9
+    whole = ClassCheck(40, 30, 50, 20, 2)
+    assert whole.miss_rate(10)[0] > whole.miss_rate(1)[0]

@@ -37,25 +37,40 @@ class ClassCheck(NamedTuple):
         Labelled events, and those with a part that is true.
     true, missed : int
         True events, and those of which no part was labelled.
+    in_quiet : int
+        Of the missed ones, those in minutes in which nothing sounds by the labels.
     """
 
     labelled: int
     right: int
     true: int
     missed: int
+    in_quiet: int = 0
 
     @property
     def precision(self) -> tuple[float, float] | None:
-        """Where the share of right ones lies nine times in ten; None if nothing was labelled."""
+        """Where the share of right ones lies nine times in ten; None if nothing was labelled.
+
+        Every labelled event is in a minute with sound, and of those all are drawn alike.
+        """
         return _interval(self.right, self.labelled)
 
-    @property
-    def miss_rate(self) -> tuple[float, float] | None:
-        """Where the share of missed ones lies nine times in ten; None if there was nothing."""
-        return _interval(self.missed, self.true)
+    def miss_rate(self, weight: float) -> tuple[float, float] | None:
+        """Return where the share of missed ones lies nine times in ten; None of no true event.
+
+        Parameters
+        ----------
+        weight : float
+            Of a quiet minute, as of `quiet_weight`.
+        """
+        if not self.true:
+            return None
+        more, squares = (weight - 1) * self.in_quiet, (weight**2 - 1) * self.in_quiet
+        effective = (self.true + more) ** 2 / (self.true + squares)  # size, as Kish defines it
+        return _interval(effective * (self.missed + more) / (self.true + more), effective)
 
 
-def _interval(some: int, whole: int) -> tuple[float, float] | None:
+def _interval(some: float, whole: float) -> tuple[float, float] | None:
     """Return the central 90 % of a beta distribution, with the prior of Jeffreys."""
     if not whole:
         return None
@@ -124,8 +139,10 @@ class CheckedMinutes:
         """
         kept = self._kept(name)
         columns = (self.labelled, self.right, self.true, self.missed)
-        return ClassCheck(*(int(column[name][kept].sum()) if name in column else 0
-                            for column in columns))  # fmt: skip
+        none = np.zeros(len(self), np.int64)
+        labelled, right, true, missed = (column.get(name, none)[kept] for column in columns)
+        sums = (labelled, right, true, missed, missed[~self.sounding[kept]])
+        return ClassCheck(*(int(counts.sum()) for counts in sums))
 
     def rates(self, name: str, share: float) -> CheckedRates | None:
         """Return the rates of a class; None if too few minutes were checked.

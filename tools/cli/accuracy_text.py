@@ -8,6 +8,7 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
     read_checked_minutes,
 )
 from hearthlog.analyzer.accuracy.count_range import FEWEST
+from hearthlog.analyzer.accuracy.minute_kinds import quiet_weight
 from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.report.class_words import in_words
@@ -29,6 +30,7 @@ class Accuracy:
     def __init__(self, logs: HomeLogs) -> None:
         self.losses: list[str] = []
         self.minutes: CheckedMinutes = read_checked_minutes(logs, LIVE, 0, _EVER, self.losses)
+        self.weight = quiet_weight(logs, LIVE, self.minutes.sounding)
         self.right, self.looked_at = count_unchanged(logs, LIVE, self.losses)
 
     def lines(self) -> Iterator[str]:
@@ -39,6 +41,10 @@ class Accuracy:
         else:
             classes = listed(list(self._classes()), "and") or "nothing in them"
             yield f"checked here, {checked} drawn at random: {classes}"
+            yield (
+                "sounds of one kind with at most ten seconds between them count once here; in "
+                "brackets the share of all, nine times in ten"
+            )
         if 0 < len(self.minutes) < FEWEST:
             yield (
                 f"{FEWEST - len(self.minutes)} more minutes, and the report says in which range "
@@ -55,7 +61,8 @@ class Accuracy:
         return {
             "minutes": len(self.minutes),
             "classes": {
-                name: check._asdict() | {"precision": check.precision, "miss_rate": check.miss_rate}
+                name: check._asdict()
+                | {"precision": check.precision, "miss_rate": check.miss_rate(self.weight)}
                 for name, check in self._checks()
             },
             "spans": self.looked_at,
@@ -72,8 +79,14 @@ class Accuracy:
         for name, check in self._checks():
             parts = []
             if check.precision is not None:
-                low, high = (f"{100 * share:.0f}" for share in check.precision)
-                parts.append(f"right in {check.right} of {check.labelled} ({low} to {high} %)")
-            if check.missed:
-                parts.append(f"missed {check.missed} of {check.true}")
+                shares = _percent(check.precision)
+                parts.append(f"right in {check.right} of {check.labelled} ({shares})")
+            missed = check.miss_rate(self.weight)
+            if check.missed and missed is not None:
+                parts.append(f"missed {check.missed} of {check.true} ({_percent(missed)})")
             yield f"{in_words(name).lower()} {listed(parts, 'and')}"
+
+
+def _percent(shares: tuple[float, float]) -> str:
+    low, high = (f"{100 * share:.0f}" for share in shares)
+    return f"{low} to {high} %"
