@@ -218,6 +218,15 @@ def test_minutes_that_were_gone_through_are_certain_and_others_have_a_range(tmp_
     assert report_day(tmp_path).count("coughing").range is None
 
 
+def test_what_a_model_does_not_know_has_no_range(tmp_path):
+    logs = write_day(tmp_path, DAY, [(at("08:00:05"), 2, "unknown", 0.9)])
+    for hour in range(8, 14):
+        check(logs, at(f"{hour:02}:00"))
+    home = report_day(tmp_path, checked(tmp_path)).home
+    assert "speech" in home.rates
+    assert "unknown" not in home.rates
+
+
 def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, capfd):
     coughs = [(at(f"{h:02}:00:05"), 2, "coughing", 0.9) for h in range(8, 20)]
     logs = write_day(tmp_path / "home", DAY, coughs)
@@ -232,12 +241,15 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     page = tmp_path / "after.html"
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
     text = page.read_text()
-    assert "In 6 minutes of these weeks" in text
+    assert "In 6 minutes of this day and the 28 days before" in text
     assert "3 of 6" in text
+    assert "How long, as labelled" in text
+    assert re.search(r"talking, in all</td><td>[^<]+, as labelled<", text)
     assert re.search(r"\d+ to \d+ \(8 labelled\)", text)
     assert "not checked here" not in text
     accuracy = Accuracy(find_home_logs([tmp_path / "home"]))
     lines = list(accuracy.lines())
+    assert "at most ten seconds between them count once" in lines[1]
     assert lines[0].startswith("checked here, 6 minutes drawn at random: coughing right in 3 of 6")
     assert "of 2 spans that were asked for or chosen, 1 had the right label" in lines[2]
     assert accuracy.as_json()["classes"]["coughing"]["labelled"] == 6

@@ -89,7 +89,7 @@ def test_exported_labels_come_back_as_marks_of_every_log(logs, hearthlog, tmp_pa
     labels = tmp_path / "day.txt"
     assert hearthlog("export", logs, "-o", labels).returncode == 0
     result = hearthlog("annotate", "import", logs, labels)
-    assert (result.returncode, result.stderr) == (0, "")
+    assert (result.returncode, result.stderr.count("\n")) == (0, 1)
     recorders = find_logs(logs)
     written = [path for path in recorders if path.name.endswith(".review.mcap")]
     assert len(written) == len(recorders) // 2 > 1
@@ -132,7 +132,9 @@ def test_a_label_file_that_does_not_say_who_labelled_is_yours(log, hearthlog, tm
     labels = tmp_path / "labels.csv"
     labels.write_text("start,end,label,reviewer,made\n1,2,speech,,\n3,4,speech,Ann,2026-03-02\n")
     before = time.time_ns()
-    assert hearthlog("annotate", "import", log, labels).returncode == 0
+    done = hearthlog("annotate", "import", log, labels)
+    assert done.returncode == 0
+    assert f"next: a model of this home, from these: hearthlog train --home {log}" in done.stderr
     mine, hers = read_marks(log)
     assert mine.reviewer == getpass.getuser()
     assert before <= mine.made <= time.time_ns()
@@ -150,7 +152,7 @@ def test_what_a_file_cannot_say_of_a_mark_is_not_lost_and_what_it_changes_is_tak
     labels.write_text("1.000000\t2.000000\tcoughing\n3.0\t4.0\tspeech\n")
     result = hearthlog("annotate", "import", log, labels, "--reviewer", "Bob")
     assert result.stdout.splitlines()[1:] == ["speech  1 mark, 1.00 s"]
-    assert result.stderr == "hearthlog: 1 mark stood there already\n"
+    assert result.stderr.startswith("hearthlog: 1 mark stood there already\n")
     same, changed = read_marks(log)
     assert same == mark(zero, 1.0000004, 2)._replace(**said)
     assert (changed.label, changed.reviewer) == ("speech", "Bob")

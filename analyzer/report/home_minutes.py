@@ -18,6 +18,7 @@ from hearthlog.analyzer.accuracy.events import (
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, common, lengths, rows_at
 from hearthlog.analyzer.report.values import Count
+from hearthlog.models.classes import UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
 
 
@@ -156,7 +157,11 @@ def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, 
         Which tell how often each class is labelled.
     checks : CheckedMinutes
     """
-    amounts = {name: int(counts.sum()) + 1 for name, counts in minutes.labelled.items()}
+    amounts = {
+        name: int(counts.sum()) + 1
+        for name, counts in minutes.labelled.items()
+        if class_name(name) != UNKNOWN  # which nothing is truly
+    }
     whole = sum(amounts.values())
     fewest = 1 / max(len(amounts), 1)  # a class that labels hardly name may be missed all the more
     drawn = {

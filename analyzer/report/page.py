@@ -100,8 +100,8 @@ def week_page(account: Account, picture: bytes) -> str:
         title=f"Week {first.isocalendar().week}, {spoken}",
         gist=list(gist_of_week(account)),
         overview=[
-            ("How long it was heard", _week(account, [minutes_of(name) for name in names])),
-            ("How often it was heard", _week(account, [events_of(name) for name in names])),
+            ("How long it was heard, as labelled", _week(account, list(map(minutes_of, names)))),
+            ("How often it was heard", _week(account, list(map(events_of, names)))),
         ],
         absent=[name for name in account.classes if name not in (*names, SILENCE)],
         parts=[
@@ -141,7 +141,8 @@ def _sounds(account: Account, day: Day) -> PageTable:
     """Tell minutes and events of each class but those that were not heard at all."""
     usually = ["Usually"] * account.comparable
     often = "How often" if account.checked else "How often, as labelled"
-    heads = ["Sound", "How long", *usually, often, *usually, *["Right here"] * account.checked]
+    how = ["How long, as labelled", *usually, often, *usually]
+    heads = ["Sound", *how, *["Right here"] * account.checked]
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     rows = []
     for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
@@ -263,6 +264,15 @@ def _interrai(account: Account, days: Sequence[Day]) -> PageTable:
     for item in interrai.ITEMS:
         audible = not item.needs or item.needs in account.classes
         values = [value for day in days if (value := item.value(day)) is not None]
-        text = _text(_sum(values)) if audible else "this model does not know the sound"
+        number = _sum(values)
+        text = _text(number) if audible else "this model does not know the sound"
+        if account.checked and number is not None and not _is_checked(number):
+            text += ", as labelled"
         rows.append(_row(item.topic, item.heard, text, item.limits))
-    return PageTable(["The form asks about", "Heard here", "Count", "What sound cannot tell"], rows)
+    count = "Count" if account.checked else "Count, as labelled"
+    return PageTable(["The form asks about", "Heard here", count, "What sound cannot tell"], rows)
+
+
+def _is_checked(value: Count | Minutes) -> bool:
+    """Tell whether checked minutes say what the right number is."""
+    return isinstance(value, Count) and value.rates is not None

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -79,6 +80,8 @@ def import_labels(
             f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
             f"{number(minutes, 'minute')} drawn at random"
         )
+    if taken:
+        tell(f"next: a model of this home, from these: hearthlog train --home {quote(str(log))}")
 
 
 @annotate.command("export")

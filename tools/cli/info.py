@@ -180,7 +180,8 @@ def _print(summary: "Summary") -> None:
         for name, topic in sorted(summary.topics.items())
     ]
     print_table(("topic", "type", "messages", "per second", "MB raw"), topics, words=2)
-    print_table(("microphone", "label", "minutes", "segments"), _label_rows(summary), words=2)
+    heads = "microphone", "label", "minutes by frame", "segments"
+    print_table(heads, _label_rows(summary), words=2)
     print_lines(_gap_lines(summary))
 
 
