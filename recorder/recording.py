@@ -243,6 +243,10 @@ class RecordingSession:
     def add(self, event: Event) -> None:
         """Record one event of the source.
 
+        Parameters
+        ----------
+        event : Event
+
         Raises
         ------
         LogError

@@ -135,14 +135,14 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float6
     examples = Examples(*arrays)
     target = examples.target
     base = method.fit(examples, split.others)
-    said = examples.decide(base, split.pool, classes).argmax(axis=1)
+    labelled = examples.decide(base, split.pool, classes).argmax(axis=1)
     true = target[split.pool]
-    wrong = np.flatnonzero((said != true) & (true != split.silence))
+    wrong = np.flatnonzero((labelled != true) & (true != split.silence))
     scores = np.full((len(CORRECTED), classes), np.nan)
     labels = np.unique(target[split.test])
     for place, count in enumerate(CORRECTED):
         marked = wrong[:count]
-        passed = np.flatnonzero((said == true)[: marked[-1]]) if len(marked) else marked
+        passed = np.flatnonzero((labelled == true)[: marked[-1]]) if len(marked) else marked
         home = split.pool[np.concatenate([marked, _few_of_each(passed, true)])]
         weight = examples.weight.copy()
         weight[home] = HOME_WEIGHT

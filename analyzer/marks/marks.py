@@ -117,6 +117,10 @@ class ReviewedSpan(NamedTuple):
 def read_marks(log: Path) -> list[Mark]:
     """Read the marks of a log.
 
+    Parameters
+    ----------
+    log : Path
+
     Returns
     -------
     list of Mark
@@ -133,6 +137,10 @@ def read_marks(log: Path) -> list[Mark]:
 
 def read_reviewed(log: Path) -> list[ReviewedSpan]:
     """Read the spans of a log that a reviewer has looked at.
+
+    Parameters
+    ----------
+    log : Path
 
     Returns
     -------

@@ -91,6 +91,10 @@ def log_digest(log: Path) -> str:
 def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     """Read what a layer says of itself; None if there is no layer.
 
+    Parameters
+    ----------
+    layer : Path
+
     Raises
     ------
     LogError
@@ -113,12 +117,22 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
 
 
 def part_path(layer: Path) -> Path:
-    """Return a path for an unfinished layer: hidden beside the layer, and new each time."""
+    """Return a path for an unfinished layer: hidden beside the layer, and new each time.
+
+    Parameters
+    ----------
+    layer : Path
+    """
     return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
 
 
 def delete_parts(layer: Path) -> None:
-    """Delete the unfinished files that this and other runs have left of a layer."""
+    """Delete the unfinished files that this and other runs have left of a layer.
+
+    Parameters
+    ----------
+    layer : Path
+    """
     for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
         with suppress(OSError):
             part.unlink()

@@ -65,15 +65,15 @@ def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
     LogError
         If the labelling that was looked at cannot be read.
     """
-    found: list[Candidates] = []
-    seen = [span for span in sound.reviewed if span.chosen != RANDOM]
-    for name in sorted({span.corrects or LIVE for span in seen}):
+    confirmed: list[Candidates] = []
+    reviewed = [span for span in sound.reviewed if span.chosen != RANDOM]
+    for name in sorted({span.corrects or LIVE for span in reviewed}):
         labelling = _labelling(sound, name)
         if labelling is not None and sound.values.shape[1]:
-            spans = [(span.start, span.end) for span in seen if (span.corrects or LIVE) == name]
+            spans = [(span.start, span.end) for span in reviewed if (span.corrects or LIVE) == name]
             target = _classes_of(sound, labelling, classes)
-            found.append(_cut(sound, np.where(sound.inside(spans), target, -1), classes))
-    return _joined(found)
+            confirmed.append(_cut(sound, np.where(sound.inside(spans), target, -1), classes))
+    return _joined(confirmed)
 
 
 def silent_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
@@ -101,12 +101,12 @@ def silent_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
     return _cut(sound, np.where(target == silence, silence, -1), classes)
 
 
-def chosen(found: Iterable[Candidates], model: Model) -> list[Recording]:
+def chosen(candidates: Iterable[Candidates], model: Model) -> list[Recording]:
     """Choose segments of each class of which a model is sure, as evenly spaced as can be.
 
     Parameters
     ----------
-    found : iterable of Candidates
+    candidates : iterable of Candidates
     model : Model
 
     Returns
@@ -116,11 +116,11 @@ def chosen(found: Iterable[Candidates], model: Model) -> list[Recording]:
         the model labels them so. Silence below the gate of the model, of which it need not be told,
         is taken only where there is not enough of other silence.
     """
-    recordings, target = _joined(found)
+    recordings, target = _joined(candidates)
     if not recordings:
         return []
     silent = np.array([class_name(recording.label) == SILENCE for recording in recordings])
-    probabilities, quiet = _heard(recordings, silent, model)
+    probabilities, quiet = _probabilities(recordings, silent, model)
     rows = np.arange(len(target))
     sure = np.where(probabilities.argmax(axis=1) == target, probabilities[rows, target], 0.0)
     kept: list[int] = []
@@ -190,17 +190,19 @@ def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidate
     return Candidates(recordings, own[rows])
 
 
-def _joined(found: Iterable[Candidates]) -> Candidates:
+def _joined(parts: Iterable[Candidates]) -> Candidates:
     """Join candidates in the order of time, each of them once."""
-    several = list(found)
-    recordings = [recording for one in several for recording in one.recordings]
-    target = np.concatenate([np.empty(0, np.intp), *(one.target for one in several)])
+    parts = list(parts)
+    recordings = [recording for part in parts for recording in part.recordings]
+    target = np.concatenate([np.empty(0, np.intp), *(part.target for part in parts)])
     once = {recording.features.tobytes(): row for row, recording in enumerate(recordings)}
     rows = sorted(once.values(), key=lambda row: recordings[row].span or (0, 0))
     return Candidates([recordings[row] for row in rows], target[rows])
 
 
-def _heard(recordings: Sequence[Recording], silent: Bool, model: Model) -> tuple[Float64, Bool]:
+def _probabilities(
+    recordings: Sequence[Recording], silent: Bool, model: Model
+) -> tuple[Float64, Bool]:
     """Return the probabilities that a model gives to segments, and which are below its gate.
 
     The probabilities are those of the windows from which would be learned: of silence all, else
@@ -217,14 +219,14 @@ def _heard(recordings: Sequence[Recording], silent: Bool, model: Model) -> tuple
             floors[row] = recording.floor[-1]
             quiet[row] = _quiet_windows(recording, recording.floor, classifier)
     of_each = of_segments(inputs, segments, floors)
-    said = np.zeros((*quiet.shape, len(model.classes)))
-    said[~quiet] = classifier.probabilities(of_each[~quiet])
+    by_window = np.zeros((*quiet.shape, len(model.classes)))
+    by_window[~quiet] = classifier.probabilities(of_each[~quiet])
     if quiet.any():
-        said[quiet, model.classes.index(SILENCE)] = 1.0
+        by_window[quiet, model.classes.index(SILENCE)] = 1.0
     loud = loud_windows(features.power(segments).astype(np.float64), inputs.window_frames)
     loud |= ~loud.any(axis=1, keepdims=True) | silent[:, np.newaxis]
     share = (loud / loud.sum(axis=1, keepdims=True))[:, :, np.newaxis]
-    probabilities: Float64 = (said * share).sum(axis=1)
+    probabilities: Float64 = (by_window * share).sum(axis=1)
     return probabilities, quiet.min(axis=1)
 
 

@@ -89,21 +89,21 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     """
     features = feature_set(model.description.feature_set)
     marked: list[Recording] = []
-    found: list[Candidates] = []
+    candidates: list[Candidates] = []
     counts = _Counts()
     for folder in folders:
         sounds = list(_counted(read_reviewed_sound(folder, features), counts))
         marked += marked_recordings(sounds, folder, features, model.description.gate)
-        found += [confirmed_segments(sound, model.classes) for sound in sounds]
+        candidates += [confirmed_segments(sound, model.classes) for sound in sounds]
     scenario, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()
     in_room = [one for one in marked if one.floor is not None]
     kept: list[Recording] = []
     if marked:
-        kept = chosen(found, model)
+        kept = chosen(candidates, model)
         if in_room and SILENCE in model.classes and _silent(kept) < MOST_CONFIRMED:
-            kept = chosen([*found, *_silence_anywhere(folders, model)], model)
+            kept = chosen([*candidates, *_silence_anywhere(folders, model)], model)
             if not _silent([*kept, *in_room]):
                 raise DataError(_NO_SILENCE)
         if in_room and not counts.looked_at:

@@ -209,5 +209,5 @@ def _is_of(recorded: Columns, features: FeatureSet) -> bool:
 def _set_of(log: Path, microphone: str) -> str:
     """Return the name of the feature set of a microphone in a log."""
     name = topic(microphone, "info")
-    said = read_columns([log], {name}, fields={"feature_set"}).get(name)
-    return "unknown" if said is None or not len(said) else str(said["feature_set"][0])
+    info = read_columns([log], {name}, fields={"feature_set"}).get(name)
+    return "unknown" if info is None or not len(info) else str(info["feature_set"][0])

@@ -137,6 +137,10 @@ def train_model(
 def check_varied(data: Dataset) -> None:
     """Check that not all segments are alike.
 
+    Parameters
+    ----------
+    data : Dataset
+
     Raises
     ------
     DataError
@@ -148,6 +152,10 @@ def check_varied(data: Dataset) -> None:
 
 def group_folds(data: Dataset) -> list[Fold]:
     """Divide the segments into up to five folds that never split a source group.
+
+    Parameters
+    ----------
+    data : Dataset
 
     Returns
     -------

@@ -18,6 +18,10 @@ _FEW = 12  # sources
 def model_attachments(model: Model) -> list[Attachment]:
     """Return the attachments of a log with labels of a model: its card and its description.
 
+    Parameters
+    ----------
+    model : Model
+
     Raises
     ------
     ModelError
@@ -33,6 +37,10 @@ def model_attachments(model: Model) -> list[Attachment]:
 
 def model_card(model: Model) -> str:
     """Describe a model for people, as Markdown.
+
+    Parameters
+    ----------
+    model : Model
 
     Raises
     ------

@@ -27,12 +27,23 @@ def asked_path(labels: Path) -> Path:
 
 
 def chosen_as(span: ReviewSpan) -> str:
-    """Return how a span was chosen, as `ReviewedSpan` says it."""
+    """Return how a span was chosen, as `ReviewedSpan` says it.
+
+    Parameters
+    ----------
+    span : ReviewSpan
+    """
     return RANDOM if span.reason == RANDOM else QUEUE
 
 
 def corrected_name(labelling: str) -> str:
-    """Return the name of a labelling, as marks say it: `live`, or the name of a model."""
+    """Return the name of a labelling, as marks say it: `live`, or the name of a model.
+
+    Parameters
+    ----------
+    labelling : str
+        `live`, or `relabel/` and a model.
+    """
     return labelling.removeprefix(f"{RELABEL}/")
 
 

@@ -163,6 +163,10 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
 def read_list(path: Path) -> list[ReviewSpan]:
     """Read a list of spans.
 
+    Parameters
+    ----------
+    path : Path
+
     Returns
     -------
     list of ReviewSpan
