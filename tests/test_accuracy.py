@@ -14,7 +14,7 @@ from spliced import run
 
 from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
 from hearthlog.analyzer.accuracy.count_range import FEWEST, checked_rates, strata_of
-from hearthlog.analyzer.accuracy.events import MINUTE, television_minutes
+from hearthlog.analyzer.accuracy.events import MINUTE, events_of, television_minutes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
@@ -125,6 +125,14 @@ def test_a_class_that_is_never_labelled_may_have_been_missed_and_one_always_wron
     strata = strata_of(np.tile(said, 40), np.tile(said, 40) > 0)
     assert checked_rates(said, none, said > 0, 0.1).range_of(strata)[0] == 0
     assert checked_rates(none, none, said > 0, 0.1).range_of(strata)[1] > 0
+    few = checked_rates(said[:5], none[:5], said[:5] > 0, 0.1)
+    assert few.range_of(strata_of(np.tile(said, 9999), np.tile(said, 9999) > 0))[0] == 0
+
+
+def test_segments_ten_seconds_apart_are_one_event():
+    starts = np.array([0, 11, 23], np.int64) * NANOSECONDS
+    coughs = Labelling(starts, starts + NANOSECONDS, np.full(3, "coughing", object))
+    assert (events_of(coughs, "coughing").starts // NANOSECONDS).tolist() == [0, 23]
 
 
 @pytest.mark.parametrize("chance", [0.9, 0.3])
