@@ -1,7 +1,7 @@
 """A simulated person, who reviews what a home recorded and knows what is true of it."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -141,7 +141,7 @@ class Person:
             origin = (self.name, made, LIVE)
             marks = [Mark(microphone, *label, *origin) for label in labels]
             looked_at = ReviewedSpan(microphone, item.start, item.end, *origin, item.chosen)
-            _write(coverage, marks, looked_at)
+            write_review(coverage, marks, looked_at)
             done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
         return done
 
@@ -196,8 +196,21 @@ def _seconds(item: ReviewItem, marks: int) -> float:
     return length + (_MARK_SECONDS * marks if length >= _MINUTE else _LOOK_SECONDS)
 
 
-def _write(coverage: Coverage, marks: list[Mark], looked_at: ReviewedSpan) -> None:
-    """Write what came of one item to the layers of the logs that it is in."""
+def write_review(coverage: Coverage, marks: Sequence[Mark], looked_at: ReviewedSpan) -> None:
+    """Write what came of a span to the layers of the logs that it is in.
+
+    Parameters
+    ----------
+    coverage : Coverage
+        Of the microphone.
+    marks : sequence of Mark
+    looked_at : ReviewedSpan
+
+    Raises
+    ------
+    LogError
+        If marks cannot be written.
+    """
     for log, first, last in coverage.split(looked_at.start, looked_at.end):
         inside = [mark for mark in marks if mark.start < last and mark.end > first]
         cut = [m._replace(start=max(m.start, first), end=min(m.end, last)) for m in inside]
