@@ -84,6 +84,7 @@ def test_an_evening_with_nothing_but_a_microphone(
         assert info.stdout.splitlines()[-1].endswith("hearthlog train --home logs")
         trained = hearthlog("train", "--home", "logs")
         assert trained.returncode == 0, trained.stderr
+        assert "home-1 refused: " in trained.stdout  # it is made all the same
         refused = hearthlog("models", "promote", "home-1")
         assert refused.returncode == 1
         assert "record for some hours" in refused.stderr  # it has learned from all there is

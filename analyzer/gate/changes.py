@@ -1,4 +1,4 @@
-"""What another labelling changes, in minutes a day for each pair of classes."""
+"""What another labelling changes, in minutes for each pair of classes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from hearthlog.analyzer.evaluation.difference import Difference
 from hearthlog.models.classes import SILENCE, find_class
 from hearthlog.schemas.arrays import Float64, Indices
 
+A_DAY = " a day"
 _LEAST_MINUTES = 0.5  # of a change that is told
 
 
@@ -18,12 +19,13 @@ class Change(NamedTuple):
 
     before: str
     after: str
-    minutes: float  # a day
+    minutes: float
+    each: str  # a word for the time they are of, as in `Changes`
 
     def __str__(self) -> str:
         """Say it: `20 h 15 min a day from silence to household sounds`."""
         before, after = class_words(self.before), class_words(self.after)
-        return f"{time_words(self.minutes)} a day from {before} to {after}"
+        return f"{time_words(self.minutes)}{self.each} from {before} to {after}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,36 +36,46 @@ class Changes:
     ----------
     classes : sequence of str
     minutes : np.ndarray [shape=(C, C)], float64
-        A day that has the class of the row in the first labelling and that of the column in the
-        second.
+        That have the class of the row in the first labelling and that of the column in the second.
+    each : str, optional
+        ` a day` if the minutes are of a mean day; empty if they are of all that was recorded.
     """
 
     classes: Sequence[str]
     minutes: Float64
+    each: str = A_DAY
 
     @property
     def before(self) -> Float64:
-        """Minutes a day of each class in the first labelling."""
+        """Minutes of each class in the first labelling."""
         return self.minutes.sum(axis=1)
 
     @property
     def after(self) -> Float64:
-        """Minutes a day of each class in the second labelling."""
+        """Minutes of each class in the second labelling."""
         return self.minutes.sum(axis=0)
 
     def pairs(self) -> list[Change]:
-        """List the changes of half a minute a day or more, the longest first."""
+        """List the changes of half a minute or more, the longest first."""
         told = (self.minutes >= _LEAST_MINUTES) & ~np.eye(len(self.classes), dtype=bool)
         places = np.argwhere(told)
         changes = [
-            Change(self.classes[i], self.classes[j], float(self.minutes[i, j]))
+            Change(self.classes[i], self.classes[j], float(self.minutes[i, j]), self.each)
             for i, j in places.tolist()
         ]
         return sorted(changes, key=lambda change: -change.minutes)
 
+    def words(self, minutes: float) -> str:
+        """Write some of the minutes: `20 h 15 min a day`."""
+        return time_words(minutes) + self.each
+
 
 def changes_of_frames(
-    classes: Sequence[str], before: Indices, after: Indices, minutes: Float64
+    classes: Sequence[str],
+    before: Indices,
+    after: Indices,
+    minutes: Float64,
+    each: str = A_DAY,
 ) -> Changes:
     """Count the changes of frames.
 
@@ -73,10 +85,13 @@ def changes_of_frames(
     before, after : np.ndarray [shape=(n,)], int
         Indices of the classes of the same frames in both labellings.
     minutes : np.ndarray [shape=(n,)], float64
-        Of a day, that each frame stands for.
+        That each frame stands for.
+    each : str, optional
+        As of `Changes`.
     """
     counts = np.bincount(before * len(classes) + after, minutes, len(classes) ** 2)
-    return Changes(classes, counts.reshape(len(classes), len(classes)).astype(np.float64))
+    table = counts.reshape(len(classes), len(classes)).astype(np.float64)
+    return Changes(classes, table, each)
 
 
 def changes_of_labellings(difference: Difference) -> Changes:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.changes import Changes, changes_of_frames
+from hearthlog.analyzer.gate.changes import A_DAY, Changes, changes_of_frames
 from hearthlog.analyzer.gate.recent_time import (
     Part,
     RecentLog,
@@ -15,6 +15,7 @@ from hearthlog.analyzer.gate.recent_time import (
     choose,
     learned_time,
     minutes_a_day,
+    recorded_minutes,
     sounding_time,
     unlearned_time,
 )
@@ -67,8 +68,10 @@ class Evidence:
     ----------
     minutes : float
         Of the time that both have labelled.
+    recorded : float
+        Minutes that there are in all.
     changes : Changes
-        From the first model to the second.
+        From the first model to the second, in a mean day, or in all if less than a day is recorded.
     sure : np.ndarray [shape=(C, C)], float64
         As `changes.minutes`, of the time in which the first model is sure.
     random, marks : Right
@@ -79,6 +82,7 @@ class Evidence:
     """
 
     minutes: float
+    recorded: float
     changes: Changes
     sure: Float64
     random: Right
@@ -123,14 +127,43 @@ def gather_evidence(
         for (_, sounds), own in zip(places, labelled[len(chosen) :], strict=True)
     ]
     share = frames.weight / max(frames.weight.sum(), 1.0)
-    day, sure = share * minutes_a_day(logs), frames.confidence >= SURE
+    recorded, day = recorded_minutes(logs), minutes_a_day(logs)
+    minutes, each = (share * recorded, "") if day is None else (share * day, A_DAY)
+    labels, sure = (models.classes, frames.before, frames.after), frames.confidence >= SURE
     return Evidence(
         minutes=len(frames.stamps) * FRAME_SECONDS / 60,
-        changes=changes_of_frames(models.classes, frames.before, frames.after, day),
-        sure=changes_of_frames(models.classes, frames.before, frames.after, day * sure).minutes,
+        recorded=recorded,
+        changes=changes_of_frames(*labels, minutes, each),
+        sure=changes_of_frames(*labels, minutes * sure).minutes,
         random=_sum(one for one, _ in right),
         marks=_sum(one for _, one in right),
         losses=losses,
+    )
+
+
+def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> Right:
+    """Run two models over the sounds of the minutes that were drawn at random alone.
+
+    Parameters
+    ----------
+    before, after : Model
+        Of the same feature set.
+    logs : sequence of RecentLog
+
+    Raises
+    ------
+    ModelError
+        As `gather_evidence`.
+    """
+    losses: list[str] = []
+    known = _known_sounds(logs, losses)
+    places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
+    models = TwoModels(before, after)
+    parts = [WeightedPart(part, 1.0) for part, _ in places]
+    labelled = _label(models, parts, losses, ignore_progress)
+    return _sum(
+        _right(sounds, own, models.classes)[0]
+        for (_, sounds), own in zip(places, labelled, strict=True)
     )
 
 

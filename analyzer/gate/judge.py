@@ -6,9 +6,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from hearthlog.analyzer.gate.evidence import Evidence, gather_evidence
-from hearthlog.analyzer.gate.recent_time import recent_logs
-from hearthlog.analyzer.gate.rules import damages
+from hearthlog.analyzer.gate.evidence import Evidence, gather_evidence, right_at_random
+from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
+from hearthlog.analyzer.gate.rules import damages, is_worse, less_right
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
@@ -70,8 +70,11 @@ def judge(
         text = f"it is for feature set {mine}, and {champion.name}, which labels now, for {theirs}"
         reasons = [f"{text}: they cannot be compared on the same logs"]
     elif champion.sha256 != model.sha256:
-        evidence = gather_evidence(champion, model, recent_logs(home), progress)
-        reasons = damages(evidence, champion.name)
+        logs = recent_logs(home)
+        evidence = gather_evidence(champion, model, logs, progress)
+        reasons = damages(evidence, champion.name) or _worse_than_at_first(
+            folder, model, champion, home, logs
+        )
     judgement = Judgement(
         model=model.sha256,
         champion="" if champion is None else champion.sha256,
@@ -122,8 +125,32 @@ def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | No
     return None
 
 
+def _worse_than_at_first(
+    folder: Path, model: Model, champion: Model, home: Sequence[Path], logs: Sequence[RecentLog]
+) -> list[str]:
+    """See whether models that each lost a little have lost what the first one of the home had."""
+    first = _first_model(folder, home)
+    if first is None or first.sha256 in {model.sha256, champion.sha256}:
+        return []
+    if first.description.feature_set != model.description.feature_set:
+        return []
+    right = right_at_random(first, model, logs)
+    return [less_right(right, first.name)] if is_worse(right) else []
+
+
+def _first_model(folder: Path, home: Sequence[Path]) -> Model | None:
+    """Find the model that labelled the first log of a home; None if it is gone."""
+    with suppress(LogError, ModelError):
+        path = find_model(folder, find_home_logs(home).first_model())
+        return None if path is None else load_model(path)
+    return None
+
+
 def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgement | None:
-    """Return the judgement of a model, if it labels now or was compared with the model that does.
+    """Return the judgement that lets a model label, if it still holds.
+
+    It does if the model labels now, or was compared with the model that does. A refusal does not:
+    there may be more to judge by since.
 
     Parameters
     ----------
@@ -139,12 +166,14 @@ def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgemen
         As `find_champion`.
     """
     judgement = read_judgement(folder, model.sha256)
+    if judgement is None or not judgement.may_label:
+        return None
     with suppress(ModelError):
-        if judgement is not None and load(folder, CHAMPION).sha256 == model.sha256:
-            return judgement if judgement.may_label else None  # it labels now
+        if load(folder, CHAMPION).sha256 == model.sha256:
+            return judgement
     champion = find_champion(folder, home, model.sha256)
     sha256 = "" if champion is None else champion.sha256
-    return judgement if judgement is not None and judgement.champion == sha256 else None
+    return judgement if judgement.champion == sha256 else None
 
 
 def _names(home: Sequence[Path]) -> str:

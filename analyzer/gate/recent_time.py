@@ -130,7 +130,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[Part]:
     return parts
 
 
-def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
+def choose(parts: Sequence[Part], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
     """Choose parts of the time to judge by: 45 minutes with sound at most, and 32 without.
 
     Parameters
@@ -139,6 +139,8 @@ def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
         In the order of time.
     sounding : Spans
         Where something was heard; it is a small part of the time of many homes.
+    seed : int, optional
+        Of what is drawn.
 
     Returns
     -------
@@ -153,10 +155,10 @@ def choose(parts: Sequence[Part], sounding: Spans) -> list[WeightedPart]:
         for chosen, spans in ((loud, inside), (quiet, without(whole, inside))):
             times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
             chosen += [part._replace(start=start, end=end) for start, end in times]
-    return [*_weighted(loud, *_LOUD), *_weighted(quiet, *_QUIET)]
+    return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
 
 
-def sample(parts: Sequence[Part], count: int, longest: int) -> list[Part]:
+def sample(parts: Sequence[Part], count: int, longest: int, seed: int = _SEED) -> list[Part]:
     """Choose spans of time, so many at most.
 
     One begins in each of as many equal shares of the time, at a moment that is drawn: so they are
@@ -169,12 +171,13 @@ def sample(parts: Sequence[Part], count: int, longest: int) -> list[Part]:
     count : int
     longest : int
         Nanoseconds of each; one ends earlier where its part does.
+    seed : int, optional
     """
     lengths = np.array([part.end - part.start for part in parts], np.int64)
     total = int(lengths.sum())
     if total <= count * longest:
         return list(parts)
-    drawn = np.random.default_rng(_SEED).random(count)
+    drawn = np.random.default_rng(seed).random(count)
     moments = ((np.arange(count) + drawn) * (total / count)).astype(np.int64)
     begins = np.concatenate([[0], np.cumsum(lengths)])
     rows = np.searchsorted(begins, moments, side="right") - 1
@@ -187,14 +190,22 @@ def sample(parts: Sequence[Part], count: int, longest: int) -> list[Part]:
     return chosen
 
 
-def _weighted(parts: Sequence[Part], count: int, longest: int) -> list[WeightedPart]:
-    chosen = sample(parts, count, longest)
+def _weighted(parts: Sequence[Part], count: int, longest: int, seed: int) -> list[WeightedPart]:
+    chosen = sample(parts, count, longest, seed)
     whole, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
     return [WeightedPart(part, whole / sampled) for part in chosen]
 
 
-def minutes_a_day(logs: Sequence[RecentLog]) -> float:
-    """Return how much is recorded in a mean day on which there are logs, at most 24 hours."""
+def recorded_minutes(logs: Sequence[RecentLog]) -> float:
+    """Return how much is recorded."""
+    return sum(log.end - log.start for log in logs) / (60 * NANOSECONDS)
+
+
+def minutes_a_day(logs: Sequence[RecentLog]) -> float | None:
+    """Return how much is recorded in a mean day on which there are logs, at most 24 hours.
+
+    None if less than a day is recorded in all, which says nothing of a mean day.
+    """
     days = {log.start // _DAY for log in logs} | {(log.end - 1) // _DAY for log in logs}
-    total = sum(log.end - log.start for log in logs)
-    return min(total / max(len(days), 1), _DAY) / (60 * NANOSECONDS)
+    total, day = recorded_minutes(logs), _DAY / (60 * NANOSECONDS)
+    return None if total < day else min(total / len(days), day)

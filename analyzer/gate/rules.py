@@ -18,7 +18,7 @@ _SOUND_LEFT = 0.5  # of the time that is not silence
 _MANY = 0.05  # of the time: a class that has become many times as much
 _TIMES = 4.0
 _CHANGED = 0.20  # of the time that is not silence
-_CHANGED_MINUTES = 10.0  # a day
+_CHANGED_MINUTES = 10.0
 
 
 def damages(evidence: Evidence, champion: str) -> list[str]:
@@ -53,32 +53,53 @@ def clearly_better(right: Right) -> bool:
     return right.gained - right.lost > 2 * np.sqrt(right.gained + right.lost)
 
 
+def is_worse(right: Right) -> bool:
+    """Tell whether the second model is right about fewer sounds, by more than a standard error."""
+    return bool(right.lost - right.gained > np.sqrt(right.gained + right.lost))
+
+
+def less_right(right: Right, name: str) -> str:
+    """Say about how many sounds a model is right, and the one that it is compared with.
+
+    Parameters
+    ----------
+    right : Right
+        Of the sounds of minutes that were drawn at random.
+    name : str
+        Of the first model.
+    """
+    return (
+        f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
+        f"{right.after}, {name} about {right.before}"
+    )
+
+
 def _silence_lost(evidence: Evidence) -> Iterator[str]:
     changes = evidence.changes
     if SILENCE in changes.classes:
         i = changes.classes.index(SILENCE)
         before, after = float(changes.before[i]), float(changes.after[i])
         if before - after > _SILENCE_FALLS * changes.minutes.sum():
-            yield f"silence falls from {time_words(before)} a day to {time_words(after)}"
+            yield f"silence falls from {changes.words(before)} to {time_words(after)}"
 
 
 def _not_better(evidence: Evidence, champion: str) -> Iterator[str]:
     """See whether it is right about fewer sounds, or about no more though it changes much."""
     right, changes = evidence.random, evidence.changes
-    known = (
-        f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
-        f"{right.after}, {champion} about {right.before}"
-    )
+    known = less_right(right, champion)
     changed = changes.minutes.sum() - np.trace(changes.minutes)
     much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
-    if right.lost - right.gained > np.sqrt(right.lost + right.gained):
+    if is_worse(right):
         yield known
     elif right.sounds and right.lost >= right.gained and changed > much:
-        yield f"{known}, and {time_words(changed)} a day would change"
+        yield (
+            f"{known}, and {changes.words(changed)} would change: `hearthlog review logs --queue` "
+            "asks for more such minutes, then promote it again"
+        )
 
 
 def _sound(evidence: Evidence) -> float:
-    """Return the minutes a day that are not silence for both models."""
+    """Return the minutes that are not silence for both models."""
     changes = evidence.changes
     silent = [changes.minutes[i, i] for i, name in enumerate(changes.classes) if name == SILENCE]
     return float(changes.minutes.sum() - sum(silent))
@@ -95,7 +116,7 @@ def _sure_lost(evidence: Evidence, champion: str) -> Iterator[str]:
             others[i] = 0
             most = class_words(changes.classes[int(others.argmax())])
             yield (
-                f"of {time_words(sure)} a day of {class_words(name)} of which {champion} is sure "
+                f"of {changes.words(sure)} of {class_words(name)} of which {champion} is sure "
                 f"{time_words(kept)} are left, most becomes {most}"
             )
 
@@ -106,13 +127,13 @@ def _out_of_proportion(evidence: Evidence) -> Iterator[str]:
     total = changes.minutes.sum()
     for name, before, after in zip(changes.classes, changes.before, changes.after, strict=True):
         if after >= _MANY * total and 0 < before < after / _TIMES:
-            times = f"from {time_words(before)} a day to {time_words(after)}"
+            times = f"from {changes.words(before)} to {time_words(after)}"
             yield f"{class_words(name)} rises {times}"
     before, after = (
         _without_silence(each, changes.classes) for each in (changes.before, changes.after)
     )
     if before >= _MUCH * total and after < _SOUND_LEFT * before:
-        yield f"what is not silence falls from {time_words(before)} a day to {time_words(after)}"
+        yield f"what is not silence falls from {changes.words(before)} to {time_words(after)}"
 
 
 def _without_silence(minutes: Float64, classes: Sequence[str]) -> float:

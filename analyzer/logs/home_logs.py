@@ -68,6 +68,12 @@ class HomeLogs:
         named = ((one.get("model", ""), one.get("model_sha256", "")) for one in records)
         return list(dict.fromkeys(named))
 
+    def first_model(self) -> str:
+        """Return the SHA-256 of the model that labelled the first log of one; empty if none did."""
+        logs = [entry.path for entry in reversed(self.between(0, _NEVER))]
+        records = (one.get("model_sha256", "") for one in latest_records(logs))
+        return next(filter(None, records), "")
+
     @property
     def layers(self) -> list[str]:
         """Names of the models that have relabelled logs."""

@@ -2,30 +2,41 @@
 
 Of a composed home (`python -m hearthlog.tools.home`, labelled by the model) the first day is
 learned from; minutes of the others are drawn at random and reviewed, all of it as it is true.
-Models that have learned so, and models that are harmful in known ways, are judged.
+Models that have learned so, and models that are harmful in known ways, are judged; beside each
+verdict stands how right the model is on other parts of those days, by their truth.
 """
 
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
 
 from hearthlog.analyzer.gate.judge import Verdict, judge
-from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
+from hearthlog.analyzer.gate.recent_time import (
+    RecentLog,
+    choose,
+    recent_logs,
+    sounding_time,
+    unlearned_time,
+)
+from hearthlog.analyzer.gate.two_models import TwoModels, joined_frames
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.logs.spans import one, overlay, pieces
+from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.home.person import true_labelling
@@ -35,6 +46,9 @@ _MINUTE = 60 * NANOSECONDS
 _LONGEST = 10 * NANOSECONDS  # of a mark
 _SHORTEST = NANOSECONDS // 2
 _MARKS = (30, 100)
+_SEED_OF_GRADES = 1
+_BETTER, _WORSE, _DEAF = 0.01, 0.02, 0.1  # of F1
+_TRUTHS = "better", "same", "worse"
 _SWAPS = (("speech", "music"), ("speech", "objects_activity"), ("objects_activity", SILENCE))
 
 
@@ -57,18 +71,72 @@ def gate(
         truth = _truth(home, recent)
         _review_at_random(recent, truth, minutes, np.random.default_rng(seed))
         champion = load_model(model)
-        models = [*_candidates(champion, recent, truth, logs), *map(load_model, other or [])]
+        counts: Counter[tuple[str, bool]] = Counter()
+        models = chain(_candidates(champion, recent, truth, logs), map(load_model, other or []))
         for number, candidate in enumerate(models):
             path = folder / f"model-{number}.safetensors"
             save_model(candidate, path)
-            print(_line(candidate.name, judge(folder, load_model(path), [logs])), flush=True)
+            verdict = judge(folder, load_model(path), [logs])
+            grade = _grade(champion, candidate, recent, truth)
+            counts[grade.truth, verdict.judgement.may_label] += 1
+            print(_line(candidate.name, grade, verdict), flush=True)
+    for what in _TRUTHS:
+        refused, let = (counts[what, may_label] for may_label in (False, True))
+        print(f"{what}: {refused} of {refused + let} refused")
 
 
-def _line(name: str, verdict: Verdict) -> str:
+class _Grade(NamedTuple):
+    """F1 of frames by truth, macro and of silence: of the champion, and of another model."""
+
+    before: tuple[float, float]
+    after: tuple[float, float]
+
+    @property
+    def truth(self) -> str:
+        macro, silence = (b - a for a, b in zip(self.before, self.after, strict=True))
+        if macro < -_WORSE or silence < -_DEAF:
+            return "worse"
+        return "better" if macro > _BETTER and silence > -_WORSE else "same"
+
+
+def _grade(champion: Model, model: Model, logs: Sequence[RecentLog], truth: Labelling) -> _Grade:
+    """Score two models on parts of the days behind the first, other than those they are judged on.
+
+    What is true and no class of the champion counts as unknown.
+    """
+    first = logs[0].start // _DAY * _DAY + _DAY
+    later = [log for log in logs if log.start >= first]
+    two = TwoModels(champion, model)
+    parts = choose(unlearned_time(later, NONE), sounding_time(later), _SEED_OF_GRADES)
+    frames = joined_frames([two.label(*weighted) for weighted in parts])
+    rows = rows_at(Spans(truth.starts, truth.ends), frames.stamps)
+    names = list(dict.fromkeys([*champion.classes, UNKNOWN]))
+    numbers = {name: i for i, name in enumerate(names)}
+    true = np.array([numbers.get(_label(name), numbers[UNKNOWN]) for name in truth.labels])[rows]
+    labels = np.array([numbers.get(name, numbers[UNKNOWN]) for name in two.classes])
+    weight = np.where(rows < 0, 0.0, frames.weight)
+    sides = (_f1(true, labels[side], weight, names) for side in (frames.before, frames.after))
+    return _Grade(*sides)
+
+
+def _f1(
+    true: Indices, labelled: Indices, weight: Float64, names: Sequence[str]
+) -> tuple[float, float]:
+    """Return the macro F1 of the classes that occur, and the F1 of silence."""
+    count = len(names)
+    frames = np.bincount(true * count + labelled, weight, count * count).reshape(count, count)
+    both = frames.sum(axis=0) + frames.sum(axis=1)
+    f1 = 2 * np.diag(frames) / np.maximum(both, 1.0)
+    return float(f1[frames.any(axis=1)].mean()), float(f1[names.index(SILENCE)])
+
+
+def _line(name: str, grade: _Grade, verdict: Verdict) -> str:
     random = None if verdict.evidence is None else verdict.evidence.random
     right = "" if random is None else f"{random.after} of {random.sounds}, not {random.before}"
     says = "; ".join(verdict.judgement.reasons) or "may label"
-    return f"{name:32} {right:20} {says}"
+    (macro, silence), (macro_now, silence_now) = grade
+    f1 = f"{macro:.3f} -> {macro_now:.3f}, silence {silence:.3f} -> {silence_now:.3f}"
+    return f"{name:32} {grade.truth:6} {f1}  {right:20} {says}"
 
 
 def _truth(home: Path, logs: Sequence[RecentLog]) -> Labelling:

@@ -11,7 +11,7 @@ _SHOWN = 8  # changes
 
 
 def print_changes(changes: "Changes", before: str, after: str) -> None:
-    """Print the longest changes, and the minutes a day of each class.
+    """Print the longest changes, and the minutes of each class.
 
     Parameters
     ----------
@@ -29,4 +29,4 @@ def print_changes(changes: "Changes", before: str, after: str) -> None:
         if first or second
     ]
     print()
-    print_table(("a day", before, after), rows)
+    print_table((changes.each.strip() or "in all", before, after), rows)

@@ -78,7 +78,11 @@ def train(
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a model from labelled sound, and measure it on sources it has not heard."""
+    """Learn a model from labelled sound, and measure it on sources it has not heard.
+
+    One of a home is judged there; whatever is found, it is written, and the exit status is 0.
+    `hearthlog models promote` ends with 1 if it may not label.
+    """
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
 
     if not data:
@@ -109,12 +113,12 @@ def train(
         if verdict is not None:
             result["judgement"] = verdict.judgement.model_dump()
         print(json.dumps(result | saved.description.model_dump()))
-        return
-    _print(saved, segments)
-    print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
-    if verdict is not None:
-        print_verdict(verdict)
-        _print_next(verdict, output)
+    else:
+        _print(saved, segments)
+        print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
+        if verdict is not None:
+            print_verdict(verdict)
+            _print_next(verdict, output)
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":

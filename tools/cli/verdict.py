@@ -42,12 +42,14 @@ def refusal(judgement: "Judgement", name: str) -> str:
 def _print_changes(evidence: "Evidence", model: str, champion: str) -> None:
     from hearthlog.analyzer.gate.changes import time_words
 
-    little = "" if evidence.changes.pairs() else " less than half a minute a day"
+    changes = evidence.changes
+    little = "" if changes.pairs() else f" less than half a minute{changes.each}"
+    whole = "" if changes.each else f" of the {time_words(evidence.recorded)} that were recorded"
     print(
         f"\non {time_words(evidence.minutes)} of the last two weeks that it has not learned from, "
-        f"{model} instead of {champion} changes{little}"
+        f"{model} instead of {champion} changes{little}{whole}"
     )
-    print_changes(evidence.changes, champion, model)
+    print_changes(changes, champion, model)
 
 
 def _print_right(what: str, right: "Right", verdict: "Verdict") -> None:
