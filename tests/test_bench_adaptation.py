@@ -1,4 +1,4 @@
-"""What marks of wrong spans teach is measured on time of the home that they are not from."""
+"""What marks of wrong sounds teach is measured on time of the home that they are not from."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.bench.adaptation import Outcome, adaptation, line_of, wrong_spans
+from hearthlog.tools.bench.adaptation import Outcome, adaptation, line_of, wrong_sounds
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition
 from hearthlog.tools.home.person import true_labelling
@@ -45,19 +45,20 @@ def test_a_home_is_corrected_learned_and_scored_before_and_after(home):
     assert not any(read_marks(log.path) for log in recent_logs([home / "logs"]))
 
 
-def test_marks_are_true_of_what_was_wrong_for_half_a_second_and_never_silence(home):
+def test_marks_are_true_of_whole_sounds_that_were_wrong_and_never_of_silence(home):
     logs = recent_logs([home / "logs"])
     rows = [line.split("\t") for line in (home / "truth.txt").read_text().splitlines()]
     truth = true_labelling([(float(a), float(b), c) for a, b, c in rows], START * NANOSECONDS)
-    marks = wrong_spans(logs, truth, logs[2].start)
+    marks = wrong_sounds(logs, truth, logs[2].start)
     assert len(marks) > 4
     assert marks == sorted(marks)
+    true = set(zip(truth.starts.tolist(), truth.ends.tolist(), truth.labels, strict=True))
     for mark in marks:
         assert mark.label != "silence"
-        assert mark.end - mark.start >= NANOSECONDS // 2
+        assert (mark.start, mark.end, mark.label) in true
         assert mark.end <= logs[2].start
     said = true_labelling([(0.0, 14400.0, "silence")], START * NANOSECONDS)
-    assert wrong_spans(logs, said, logs[2].start) == []
+    assert wrong_sounds(logs, said, logs[2].start) == []
 
 
 def test_the_worst_class_is_one_that_was_right_before():

@@ -1,7 +1,7 @@
-"""`python -m hearthlog.tools.bench.adaptation HOME --model FILE`: what marks of wrong spans teach.
+"""`python -m hearthlog.tools.bench.adaptation HOME --model FILE`: what marks of wrong sounds teach.
 
 Of a composed home (`python -m hearthlog.tools.home`, labelled by the model) a person corrects the
-first half: the first spans that are labelled wrongly get their label, silence is never marked. The
+first half: the first sounds that are labelled wrongly get their label, silence is never marked. The
 model is adapted as `train --home` does it, and labels the last quarter, which it never heard.
 """
 
@@ -18,7 +18,6 @@ from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.relabel.home_sound import read_home_sound
 from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
@@ -27,7 +26,7 @@ from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.home_data import home_sequences
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.home_transitions import adapt_transitions
-from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
@@ -35,10 +34,9 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.bench.quarter_scores import scored
-from hearthlog.tools.home.person import true_labelling, write_review
+from hearthlog.tools.home.person import Person, true_labelling, write_review
 
 _DAY = 86_400 * NANOSECONDS
-_SHORTEST = NANOSECONDS // 2  # of a span that is marked
 _RIGHT = 0.3  # F1 of a class that was right before
 MARKS = ((10, 0.0), (30, 0.0), (60, 0.0), (200, 0.0), (60, 0.2))  # how many, and wrong ones
 
@@ -83,7 +81,7 @@ def adaptation(
         Composed, of four logs or more, labelled by the model.
     model : Path
     marks : sequence of (int, float)
-        How many spans are marked, and the share that is marked wrongly.
+        How many sounds are marked, and the share that is marked wrongly.
 
     Yields
     ------
@@ -100,7 +98,7 @@ def adaptation(
     truth = _truth(home, logs)
     early, late = logs[: len(logs) * 3 // 4], logs[len(logs) * 3 // 4 :]
     end = logs[len(logs) // 2].start
-    wrong = wrong_spans(early, truth, end)
+    wrong = wrong_sounds(early, truth, end)
     adapted = [_learned(base, early, _drawn(wrong, base, n, w)) for n, w in marks]
     before, *after = [scored(truth, one) for one in _labelled([base, *adapted], late)]
     known = [name for name in base.classes if name != UNKNOWN]
@@ -109,8 +107,8 @@ def adaptation(
         yield Outcome(min(count, len(wrong)), share, before.f1(known), one.f1(known), *false)
 
 
-def wrong_spans(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[Mark]:
-    """Return marks of what a recorder labelled wrongly, in the order of time.
+def wrong_sounds(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[Mark]:
+    """Return marks of the sounds that a recorder labelled wrongly, in the order of time.
 
     Parameters
     ----------
@@ -123,18 +121,15 @@ def wrong_spans(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[M
     Returns
     -------
     list of Mark
-        Of half a second and more; none of silence, nor of what has no class.
+        As a person sets them; none of silence, nor of what has no class.
     """
     sources = find_labellings(*[log.path for log in logs])
     microphone = sources.microphone(None)
     labelled = sources.read(microphone, LIVE).labelling
-    both = overlay([truth, labelled]).in_all()
-    true = _names(truth)[both.rows[0]]
-    wrong = (true != _names(labelled)[both.rows[1]]) & (true != SILENCE) & (true != UNKNOWN)
-    wrong &= (both.ends - both.starts >= _SHORTEST) & (both.ends <= end)
+    rng = np.random.default_rng(0)  # draws nothing: this person is never wrong
+    corrected = Person(truth).corrections(logs[0].start, end, labelled, rng)
     return [
-        Mark(microphone, int(both.starts[i]), int(both.ends[i]), true[i])
-        for i in np.flatnonzero(wrong)
+        Mark(microphone, *one) for one in corrected if class_name(one[2]) not in {SILENCE, UNKNOWN}
     ]
 
 
@@ -142,13 +137,6 @@ def _truth(home: Path, logs: Sequence[RecentLog]) -> Labelling:
     rows = (line.split("\t") for line in (home / "truth.txt").read_text("utf-8").splitlines())
     start = logs[0].start // _DAY * _DAY
     return true_labelling([(float(a), float(b), label) for a, b, label in rows], start)
-
-
-def _names(labelling: Labelling) -> "np.ndarray[tuple[int], np.dtype[np.object_]]":
-    names = {label: class_name(label) for label in set(labelling.labels)} | {
-        OTHER_NEGATIVE: UNKNOWN
-    }
-    return np.array([names[label] for label in labelling.labels], object)
 
 
 def _drawn(marks: Sequence[Mark], base: Model, count: int, wrong: float) -> list[Mark]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.coverage import Coverage, find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.logs.spans import one, overlay, pieces
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.ranking import USEFUL
@@ -134,7 +134,7 @@ class Person:
         rng = generator(self.seed, made % (1 << 32))
         done = Review([], [], 0.0)
         for item in items:
-            labels = self._corrections(item, labelled, rng)
+            labels = self.corrections(item.start, item.end, labelled.labelling, rng)
             seconds = done.seconds + _seconds(item, len(labels))
             if seconds > 60.0 * minutes:
                 break
@@ -145,14 +145,29 @@ class Person:
             done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
         return done
 
-    def _corrections(
-        self, item: ReviewItem, labelled: NamedLabelling, rng: np.random.Generator
+    def corrections(
+        self, start: int, end: int, labelled: Labelling, rng: np.random.Generator
     ) -> list[tuple[int, int, str]]:
-        """Return the sounds in an item, with their true borders, that are not labelled rightly."""
-        inside, row, _ = pieces(self.truth, one(item.start, item.end))
+        """Return the sounds in a span, with their true borders, that are not labelled rightly.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC.
+        labelled : Labelling
+            By the recorder.
+        rng : numpy.random.Generator
+            Draws which of them get a wrong label.
+
+        Returns
+        -------
+        list of (int, int, str)
+            Start, end and label, in the order of time; those of silence, too.
+        """
+        inside, row, _ = pieces(self.truth, one(start, end))
         labels = self.truth.labels[row]
-        parts = overlay([inside, labelled.labelling]).in_all()
-        true, own = labels[parts.rows[0]], labelled.labelling.labels[parts.rows[1]]
+        parts = overlay([inside, labelled]).in_all()
+        true, own = labels[parts.rows[0]], labelled.labels[parts.rows[1]]
         differs = np.array([not _same(a, b) for a, b in zip(true, own, strict=True)], bool)
         wrong = np.bincount(
             parts.rows[0], (parts.ends - parts.starts) * differs, minlength=len(labels)
