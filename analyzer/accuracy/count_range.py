@@ -118,7 +118,7 @@ def checked_rates(
         return None
     rng = np.random.default_rng(_SEED)
     drawn = rng.integers(0, len(labelled), (_DRAWS, len(labelled)))
-    found = np.minimum(labelled, true)
+    matched = np.minimum(labelled, true)
 
     def total(counts: Int64) -> Int64:
         sums: Int64 = counts[drawn].sum(axis=1)
@@ -127,7 +127,7 @@ def checked_rates(
     missed = np.empty((_DRAWS, 2))
     kinds = (~sounding, _MISSED_IN_QUIET), (sounding, _MISSED_IN_SOUND)
     for each, (own, (events, minutes)) in enumerate(kinds):
-        unheard, checked = total((true - found) * own), total(own.astype(np.int64))
-        missed[:, each] = rng.gamma(unheard + events * share) / (checked + minutes)
-    right = rng.beta(total(found) + _RIGHT, total(labelled - found) + _WRONG)
+        unlabelled, checked = total((true - matched) * own), total(own.astype(np.int64))
+        missed[:, each] = rng.gamma(unlabelled + events * share) / (checked + minutes)
+    right = rng.beta(total(matched) + _RIGHT, total(labelled - matched) + _WRONG)
     return CheckedRates(right, missed, len(labelled), bool(true.any()))
