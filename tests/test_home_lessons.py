@@ -9,7 +9,7 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.confirmed import confirmed_segments, silent_segments
+from hearthlog.analyzer.training.confirmed import confirmed_segments, labelled_segments
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_data import (
     HOME,
@@ -19,6 +19,7 @@ from hearthlog.analyzer.training.home_data import (
 )
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
+from hearthlog.analyzer.training.unreviewed import unreviewed_sounds
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import HearthlogWarning
@@ -87,8 +88,11 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     write(home, halves, [drawn, whole(home)])
     assert not list(lesson_recordings(home))
     assert not home_sequences(home, model.classes)
-    for find in (confirmed_segments, silent_segments):
-        spans = [one.span for one in find(sound(home), model.classes).recordings]
+    for found in (
+        confirmed_segments(sound(home), model.classes),
+        labelled_segments(sound(home), model.classes, model.classes),
+    ):
+        spans = [one.span for one in found.recordings]
         assert spans
         assert all(end <= drawn.start or start >= drawn.end for start, end in spans)
     lessons = home_lessons([home], model)
@@ -97,15 +101,30 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     assert "2 of 2 marks are not learned from" in lessons.notes[0]
 
 
-def test_time_without_a_review_teaches_nothing_but_silence(home, model_file):
+def test_time_without_a_review_teaches_silence_and_what_a_model_is_very_sure_of(home, model_file):
     model = load_model(model_file)
     write(home, [next(one for one in segments(home) if one[2] != "silence")])
     segments_, notes, nothing = home_lessons([home], model)
     assert not nothing
     assert any(note.startswith("no time of this home was looked at") for note in notes)
     kept = segments_.collection == segments_.collection_names.index(CONFIRMED)
-    assert {segments_.classes[number] for number in segments_.target[kept]} == {"silence"}
+    names = {segments_.classes[number] for number in segments_.target[kept]}
+    assert "silence" in names
+    assert len(names) > 1
     assert not kept.all()
+
+
+def test_a_class_that_a_review_left_alone_often_is_not_taken_from_other_time(home, model_file):
+    model = load_model(model_file)
+    names = {one[2] for one in segments(home)} - {"silence", "unknown"}
+    sure = unreviewed_sounds([home], model, names)
+    assert sure
+    for one in sure:
+        middle = (one.span[0] + one.span[1]) // 2
+        assert one.label in {name for a, b, name in segments(home) if a <= middle < b} & names
+    other = min(one.label for one in sure)
+    assert all(one.label != other for one in unreviewed_sounds([home], model, names - {other}))
+    assert unreviewed_sounds([home], model, set()) == []
 
 
 def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(home, model_file):
@@ -148,7 +167,7 @@ def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(
     model = load_model(model_file)
     quiet = next(one for one in segments(home) if one[2] == "silence")
     loud = next(one for one in segments(home) if one[2] != "silence")
-    nowhere = "hearthlog.analyzer.training.home_lessons._silence_anywhere"
+    nowhere = "hearthlog.analyzer.training.home_lessons.unreviewed_silence"
     monkeypatch.setattr(nowhere, lambda *_: [])
     write(home, [loud])
     with pytest.raises(DataError, match="mark some seconds in which nothing sounds as silence"):

@@ -4,7 +4,7 @@ Marks are of what was wrong. A model that learns from them alone forgets what wa
 first: the only windows with the floor of this room in them would be of other classes.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +28,8 @@ from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
 from hearthlog.schemas.times import NANOSECONDS
 
 MOST_CONFIRMED = 60  # segments of a class
-_SURE = 0.5
-_FEWEST = 20  # of a class: the surest, if there are not so many that are sure
+SURE = 0.5
+FEWEST = 20  # of a class
 _ASIDE = NANOSECONDS // 2  # of marks
 SEGMENT_FRAMES = 20
 _MOST_TRIED = 240  # segments of a class in a log
@@ -76,14 +76,18 @@ def confirmed_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
     return _joined(confirmed)
 
 
-def silent_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
-    """Cut out what was labelled as silence, whether anyone has looked at it or not.
+def labelled_segments(
+    sound: HomeSound, classes: Sequence[str], names: Collection[str]
+) -> Candidates:
+    """Cut out what was labelled as some classes, whether anyone has looked at it or not.
 
     Parameters
     ----------
     sound : HomeSound
     classes : sequence of str
-        Of the model, silence among them.
+        Of the model.
+    names : collection of str
+        Of the classes; of sound without labels all may be silence.
 
     Raises
     ------
@@ -92,29 +96,35 @@ def silent_segments(sound: HomeSound, classes: Sequence[str]) -> Candidates:
     """
     if not sound.values.shape[1]:
         return _joined([])
-    silence = classes.index(SILENCE)
     labelling = _labelling(sound, LIVE)
-    if labelling is None:  # the model will tell
-        target = np.full(len(sound.stamps), silence)
-    else:
+    if labelling is not None:
         target = _classes_of(sound, labelling, classes)
-    return _cut(sound, np.where(target == silence, silence, -1), classes)
+    else:  # the model will tell
+        target = np.full(len(sound.stamps), classes.index(SILENCE) if SILENCE in classes else -1)
+    own = [number for number, name in enumerate(classes) if name in names]
+    return _cut(sound, np.where(np.isin(target, own), target, -1), classes)
 
 
-def chosen(candidates: Iterable[Candidates], model: Model) -> list[Recording]:
+def chosen(
+    candidates: Iterable[Candidates], model: Model, least: float = SURE, fewest: int = FEWEST
+) -> list[Recording]:
     """Choose segments of each class of which a model is sure, as evenly spaced as can be.
 
     Parameters
     ----------
     candidates : iterable of Candidates
     model : Model
+    least : float
+        Probability of which it is sure.
+    fewest : int
+        Of a class: the surest ones, if there are not so many of which it is sure.
 
     Returns
     -------
     list of Recording
-        At most 60 of a class: of those with a probability of one half, or else of the 20 surest, if
-        the model labels them so. Silence below the gate of the model, of which it need not be told,
-        is taken only where there is not enough of other silence.
+        At most 60 of a class, all of which the model labels so. Silence below the gate of the
+        model, of which it need not be told, is taken only where there is not enough of other
+        silence.
     """
     recordings, target = _joined(candidates)
     if not recordings:
@@ -127,13 +137,13 @@ def chosen(candidates: Iterable[Candidates], model: Model) -> list[Recording]:
     for number in np.unique(target):
         same = np.flatnonzero((target == number) & (sure > 0.0))
         loud = same[~quiet[same]]
-        if model.classes[number] == SILENCE and len(loud) < _FEWEST:
-            same = np.sort(np.concatenate([loud, same[quiet[same]][: _FEWEST - len(loud)]]))
+        if model.classes[number] == SILENCE and len(loud) < fewest:
+            same = np.sort(np.concatenate([loud, same[quiet[same]][: fewest - len(loud)]]))
         else:
             same = loud
-        enough = same[sure[same] >= _SURE]
-        if len(enough) < _FEWEST:
-            enough = np.sort(same[np.argsort(-sure[same], kind="stable")[:_FEWEST]])
+        enough = same[sure[same] >= least]
+        if len(enough) < fewest:
+            enough = np.sort(same[np.argsort(-sure[same], kind="stable")[:fewest]])
         kept += spread(enough, MOST_CONFIRMED).tolist()
     unknown = model.description.scenario.get(UNKNOWN, [UNKNOWN])[0]  # else it is as if not told
     labels = [unknown if name == UNKNOWN else name for name in model.classes]

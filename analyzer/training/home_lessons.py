@@ -1,43 +1,31 @@
 """What a home teaches a model: its marks, and what was right before and is to stay so."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.recorder_info import read_recorder_info
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.training.adapt import base_classes
 from hearthlog.analyzer.training.confirmed import (
+    FEWEST,
     MOST_CONFIRMED,
     Candidates,
     chosen,
     confirmed_segments,
-    silent_segments,
 )
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.home_data import HOME, marked_recordings, teaching
-from hearthlog.analyzer.training.marked_sound import (
-    HomeSound,
-    read_reviewed_sound,
-    read_sound_of,
-)
+from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
 from hearthlog.analyzer.training.scenario import Scenario, scenario_of
-from hearthlog.models.classes import SILENCE, class_name, meant_by
+from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, meant_by
 from hearthlog.models.classifiers.description import MOST_CLASSES
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.times import NANOSECONDS
 
-_RECENT = 14 * 86_400 * NANOSECONDS
-_SILENT_LOGS = 4  # that are read for silence
-_SILENT_PART = 900 * NANOSECONDS  # of each
 _FEWEST_DAYS = 2  # of a new class
 _FEWEST_SECONDS = 10.0
 _NO_SILENCE = (
@@ -45,8 +33,8 @@ _NO_SILENCE = (
     "sounds alone it would forget silence; mark some seconds in which nothing sounds as silence"
 )
 _NOT_LOOKED_AT = (
-    "no time of this home was looked at: only silence is kept as it is; what a review leaves "
-    "alone, such as `hearthlog review --queue`, keeps the other classes"
+    "no time of this home was looked at: only silence, and what the model is very sure of, is kept "
+    "as it is; what a review leaves alone, such as `hearthlog review --queue`, keeps more"
 )
 
 
@@ -103,9 +91,11 @@ def home_lessons(folders: Sequence[Path], model: Model) -> Lessons:
     if marked:
         kept = chosen(candidates, model)
         if in_room and SILENCE in model.classes and _silent(kept) < MOST_CONFIRMED:
-            kept = chosen([*candidates, *_silence_anywhere(folders, model)], model)
+            kept = chosen([*candidates, *unreviewed_silence(folders, model)], model)
             if not _silent([*kept, *in_room]):
                 raise DataError(_NO_SILENCE)
+        if in_room:
+            kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model))
         if in_room and not counts.looked_at:
             notes.append(_NOT_LOOKED_AT)
     segments = cut_recordings([*marked, *kept], scenario, features)
@@ -180,23 +170,11 @@ def _with_new_classes(
     return Scenario(known.name, {**known.classes, **learned}), notes, unlearned
 
 
+def _seldom_kept(kept: Sequence[Recording], model: Model) -> set[str]:
+    """Name the classes that are hardly among what was left alone; without marks they would go."""
+    amounts = Counter(one.label for one in kept)
+    return {name for name in model.classes if amounts[name] < FEWEST} - {SILENCE, UNKNOWN}
+
+
 def _silent(recordings: Iterable[Recording]) -> int:
     return sum(class_name(one.label) == SILENCE for one in recordings)
-
-
-def _silence_anywhere(folders: Sequence[Path], model: Model) -> Iterator[Candidates]:
-    """Cut silence out of some logs of the last two weeks."""
-    features = feature_set(model.description.feature_set)
-    entries = find_home_logs(folders).between(0, 1 << 62)
-    newest = max((entry.start for entry in entries), default=0)
-    recent = [entry.path for entry in entries if newest - entry.start <= _RECENT]
-    for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
-        log = recent[int(place)]
-        with suppress(LogError):  # why it cannot be read is said when it is labelled
-            info = read_recorder_info(log, "features")
-            if info is None or info.first_frame is None:
-                continue
-            begin = info.first_frame[1]
-            part, names = (begin, begin + _SILENT_PART), {info.microphone}
-            for sound in read_sound_of(log, features, names, part):
-                yield silent_segments(sound, model.classes)
