@@ -20,21 +20,19 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.relabel.home_sound import read_home_sound
-from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.training.adapt import adapt_model
 from hearthlog.analyzer.training.home_data import home_sequences
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.home_transitions import adapt_transitions
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
-from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.bench.labelling import label_logs
 from hearthlog.tools.bench.quarter_scores import scored
-from hearthlog.tools.home.person import Person, true_labelling, write_review
+from hearthlog.tools.home.person import Person, read_truth, write_review
 
 _DAY = 86_400 * NANOSECONDS
 _RIGHT = 0.3  # F1 of a class that was right before
@@ -95,12 +93,13 @@ def adaptation(
         If there is no truth.
     """
     base, logs = load_model(model), recent_logs([home / "logs"])
-    truth = _truth(home, logs)
+    truth = read_truth(home, logs[0].start // _DAY * _DAY)
     early, late = logs[: len(logs) * 3 // 4], logs[len(logs) * 3 // 4 :]
     end = logs[len(logs) // 2].start
     wrong = wrong_sounds(early, truth, end)
     adapted = [_learned(base, early, _drawn(wrong, base, n, w)) for n, w in marks]
-    before, *after = [scored(truth, one) for one in _labelled([base, *adapted], late)]
+    labelled = label_logs([base, *adapted], [log.path for log in late])
+    before, *after = [scored(truth, one) for one in labelled]
     known = [name for name in base.classes if name != UNKNOWN]
     for (count, share), one in zip(marks, after, strict=True):
         false = (sum(each.false_events.values()) for each in (before, one))
@@ -133,12 +132,6 @@ def wrong_sounds(logs: Sequence[RecentLog], truth: Labelling, end: int) -> list[
     ]
 
 
-def _truth(home: Path, logs: Sequence[RecentLog]) -> Labelling:
-    rows = (line.split("\t") for line in (home / "truth.txt").read_text("utf-8").splitlines())
-    start = logs[0].start // _DAY * _DAY
-    return true_labelling([(float(a), float(b), label) for a, b, label in rows], start)
-
-
 def _drawn(marks: Sequence[Mark], base: Model, count: int, wrong: float) -> list[Mark]:
     """Return the first marks, some of them with another label."""
     rng = np.random.default_rng(count)
@@ -162,23 +155,6 @@ def _learned(base: Model, logs: Sequence[RecentLog], marks: Sequence[Mark]) -> M
         model = adapt_model(base, home_lessons([folder], base).segments)
         sequences = home_sequences(folder, model.classes)
         return adapt_transitions(model, sequences, read_home_sound([folder], model).sound)
-
-
-def _labelled(models: Sequence[Model], logs: Sequence[RecentLog]) -> Iterator[Labelling]:
-    """Label logs as recorders with each of some models would have, reading them once."""
-    labellers = [StreamLabeller(Classifier(model)) for model in models]
-    for log in logs:
-        for event in read_sound(info_for_model(log.path, models[0], log.path)[0], 0):
-            for labeller in labellers:
-                labeller.push(event)
-    for labeller, model in zip(labellers, models, strict=True):
-        labeller.close()
-        rows = labeller.segments
-        yield Labelling(
-            np.array([row.start for row in rows]),
-            np.array([row.end for row in rows]),
-            np.array([model.classes[row.run.label] for row in rows], object),
-        )
 
 
 def line_of(outcome: Outcome) -> str:

@@ -32,7 +32,7 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.tools.home.person import true_labelling
+from hearthlog.tools.home.person import read_truth
 
 _DAY = 1440  # minutes
 _CHECKED = (5, 10, 30)
@@ -109,9 +109,7 @@ def read_simulated(folder: Path) -> Home:
     named = sources.read(sources.microphone(None), LIVE)
     labels = unified(named.labelling)
     start = int(labels.starts[0]) // (_DAY * MINUTE) * (_DAY * MINUTE)
-    lines = (folder / "truth.txt").read_text("utf-8").splitlines()
-    rows = [line.split("\t") for line in lines]
-    truth = unified(true_labelling([(float(a), float(b), label) for a, b, label in rows], start))
+    truth = unified(read_truth(folder, start))
     days = round((int(labels.ends[-1]) - start) / (_DAY * MINUTE))
     if days < 2:
         raise DataError(f"{folder}: has no two whole days, one to check and one to count")

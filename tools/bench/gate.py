@@ -39,7 +39,7 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
-from hearthlog.tools.home.person import true_labelling
+from hearthlog.tools.home.person import read_truth
 
 _DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
@@ -68,7 +68,7 @@ def gate(
         shutil.copytree(home / "logs", logs)
         shutil.copy(model, folder / "champion.safetensors")
         recent = recent_logs([logs])
-        truth = _truth(home, recent)
+        truth = read_truth(home, recent[0].start // _DAY * _DAY)
         _review_at_random(recent, truth, minutes, np.random.default_rng(seed))
         champion = load_model(model)
         counts: Counter[tuple[str, bool]] = Counter()
@@ -137,12 +137,6 @@ def _line(name: str, grade: _Grade, verdict: Verdict) -> str:
     (macro, silence), (macro_now, silence_now) = grade
     f1 = f"{macro:.3f} -> {macro_now:.3f}, silence {silence:.3f} -> {silence_now:.3f}"
     return f"{name:32} {grade.truth:6} {f1}  {right:20} {says}"
-
-
-def _truth(home: Path, logs: Sequence[RecentLog]) -> Labelling:
-    rows = (line.split("\t") for line in (home / "truth.txt").read_text().splitlines())
-    start = logs[0].start // _DAY * _DAY
-    return true_labelling([(float(a), float(b), label) for a, b, label in rows], start)
 
 
 def _review_at_random(

@@ -21,9 +21,6 @@ import typer
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.marks.marks import RANDOM
-from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
-from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
@@ -31,6 +28,7 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.bench.labelling import label_logs
 from hearthlog.tools.bench.quarter_picture import line_of, save_picture
 from hearthlog.tools.bench.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored
 from hearthlog.tools.bench.timing import HEARTHLOG
@@ -97,7 +95,8 @@ def live(home: Home) -> Iterator[Week]:
         sources = find_labellings(logs)
         microphone = sources.microphone(None)
         labels = sources.read(microphone, LIVE, begin, end).labelling
-        starter = labels if model == starter_file(GENERAL) else _labelled(recorded)
+        alone = starter_file(GENERAL)
+        starter = labels if model == alone else next(label_logs([load_model(alone)], recorded))
         wrong, models = float(number == WRONG_WEEK), home.folder / "models"
         person = Person(truth, wrong=wrong, seed=home.seed, models=models)
         done = person.review(logs, _MINUTES, end, (begin, end))
@@ -136,23 +135,6 @@ def _record(
         truths.append(true_labelling(truth_of(composition).spans, start))
     arrays = ("starts", "ends", "labels")
     return Labelling(*(np.concatenate([getattr(t, a) for t in truths]) for a in arrays)), logs
-
-
-def _labelled(logs: Sequence[Path]) -> Labelling:
-    """Label logs as the starter model would have."""
-    model = load_model(starter_file(GENERAL))
-    classifier = Classifier(model)
-    labeller = StreamLabeller(classifier)
-    for log in logs:
-        for event in read_sound(info_for_model(log, model, log)[0], 0):
-            labeller.push(event)
-    labeller.close()
-    rows = labeller.segments
-    return Labelling(
-        np.array([row.start for row in rows]),
-        np.array([row.end for row in rows]),
-        np.array([classifier.classes[row.run.label] for row in rows], object),
-    )
 
 
 def _learn(folder: Path) -> tuple[bool, bool, list[str]]:

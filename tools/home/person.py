@@ -200,6 +200,25 @@ def true_labelling(spans: list[LabelledSpan], start: int) -> Labelling:
     return Labelling(times[:, 0], times[:, 1], np.array([span[2] for span in spans], object))
 
 
+def read_truth(home: Path, start: int) -> Labelling:
+    """Read the truth of a composed home.
+
+    Parameters
+    ----------
+    home : Path
+        Folder with a file `truth.txt`.
+    start : int
+        As of `true_labelling`.
+
+    Raises
+    ------
+    OSError
+        If there is no truth.
+    """
+    rows = (line.split("\t") for line in (home / "truth.txt").read_text("utf-8").splitlines())
+    return true_labelling([(float(a), float(b), label) for a, b, label in rows], start)
+
+
 def _same(true: str, label: str) -> bool:
     if true == OTHER_NEGATIVE:
         return label in {OTHER_NEGATIVE, UNKNOWN}

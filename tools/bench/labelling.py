@@ -1,0 +1,47 @@
+"""The labels that models would have given to logs."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
+from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
+from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.model import Model
+
+
+def label_logs(models: Sequence[Model], logs: Sequence[Path]) -> Iterator[Labelling]:
+    """Label logs as recorders with each of some models would have, reading them once.
+
+    Parameters
+    ----------
+    models : sequence of Model
+        Of one feature set.
+    logs : sequence of Path
+        In the order of time.
+
+    Yields
+    ------
+    Labelling
+        Of each model.
+
+    Raises
+    ------
+    LogError
+        If a log cannot be read.
+    """
+    labellers = [StreamLabeller(Classifier(model)) for model in models]
+    for log in logs:
+        for event in read_sound(info_for_model(log, models[0], log)[0], 0):
+            for labeller in labellers:
+                labeller.push(event)
+    for labeller, model in zip(labellers, models, strict=True):
+        labeller.close()
+        rows = labeller.segments
+        yield Labelling(
+            np.array([row.start for row in rows]),
+            np.array([row.end for row in rows]),
+            np.array([model.classes[row.run.label] for row in rows], object),
+        )
