@@ -92,6 +92,18 @@ def find_class(label: str) -> SoundClass | None:
     return _BY_NAME.get(_spelt(label))
 
 
+def in_words(label: str) -> str:
+    """Name a class as people would.
+
+    Parameters
+    ----------
+    label : str
+        A name of the class, in any spelling; that of an unknown class is written without `_`.
+    """
+    row = find_class(label)
+    return label.replace("_", " ").capitalize() if row is None else row.words
+
+
 def class_name(label: str) -> str:
     """Return the name of the class that a label means; the label itself if there is none.
 

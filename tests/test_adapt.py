@@ -32,7 +32,7 @@ from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, ROOM
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
+from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, SvmMachine, home_votes
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21.augmentation import augmented
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
@@ -192,10 +192,27 @@ def test_an_adapted_model_decides_as_scikit_learn_does(world):
     examples = prepare(ROOM, few)._replace(more_inputs=remembered, more_target=target)
     inputs = of_segments(DEFAULT.inputs[ROOM.inputs], rest.windows, rest.floor)
     inputs = inputs.reshape(-1, inputs.shape[-1])
-    decision = ROOM.fit(examples).decide(inputs, 4)
+    again = ROOM.keeping(base.arrays, np.arange(4))
+    decision = again.fit(examples).decide(inputs, 4)
     expected = softmax(adapted.description.inverse_temperature * decision)
     ours = Classifier(adapted).probabilities(inputs)
     np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("adapted", [False, True])
+def test_a_machine_that_is_learned_again_without_anything_new_decides_as_before(adapted):
+    learned, _, scenario = sounds_of(ROOM)
+    uneven = rows(learned, (learned.target > 1) | (learned.group % 6 < 2))
+    base = train_model(uneven, scenario, ignore_progress, ROOM)
+    home = rows(learned, learned.target == 0)
+    model = adapt_model(base, home) if adapted else base
+    remembered, target = ROOM.remembered(model)
+    examples = prepare(ROOM, home)._replace(more_inputs=remembered, more_target=target)
+    again = ROOM.keeping(model.arrays, np.arange(4)).fit(examples, np.empty(0, np.intp))
+    inputs = of_segments(DEFAULT.inputs[ROOM.inputs], learned.windows, learned.floor)
+    inputs = inputs.reshape(-1, inputs.shape[-1])
+    before, _ = SvmMachine(base).decide(inputs)
+    np.testing.assert_allclose(again.decide(inputs, 4), before, rtol=0, atol=0.01)
 
 
 def test_a_model_with_vectors_of_a_home_labels_as_it_did(world):

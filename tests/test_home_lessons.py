@@ -1,6 +1,7 @@
 """A home teaches by its marks and by what a review left alone, not by what was drawn at random."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,11 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.confirmed import confirmed_segments, labelled_segments
+from hearthlog.analyzer.training.confirmed import (
+    chosen,
+    confirmed_segments,
+    labelled_segments,
+)
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_data import (
     HOME,
@@ -20,9 +25,14 @@ from hearthlog.analyzer.training.home_data import (
 from hearthlog.analyzer.training.home_lessons import home_lessons
 from hearthlog.analyzer.training.marked_sound import read_reviewed_sound
 from hearthlog.analyzer.training.unreviewed import unreviewed_sounds
+from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 
@@ -79,6 +89,23 @@ def test_what_a_review_left_alone_is_to_stay_as_it_was_labelled(home, model_file
         assert end + SECOND // 2 <= marked[0] or begin - SECOND // 2 >= marked[1]
 
 
+def test_what_a_model_is_less_than_half_sure_of_confirms_nothing(home, model_file):
+    write(home, reviewed=[whole(home)])
+    model = load_model(model_file)
+    candidates = [confirmed_segments(sound(home), model.classes)]
+
+    def kept(inverse_temperature, fewest):
+        changes = {"inverse_temperature": inverse_temperature}
+        other = replace(model, description=model.description.model_copy(update=changes))
+        found = chosen(candidates, other, fewest=fewest)
+        return [recording.span for recording in found if recording.label != "silence"]
+
+    sure = kept(model.description.inverse_temperature, 0)
+    assert sure
+    assert kept(1e-6, 0) == []
+    assert 0 < len(kept(1e-6, 1)) < len(sure), "the surest of each class"
+
+
 def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home, model_file):
     model = load_model(model_file)
     longest = next(one for one in segments(home) if one[2] != "silence")
@@ -125,6 +152,30 @@ def test_a_class_that_a_review_left_alone_often_is_not_taken_from_other_time(hom
     other = min(one.label for one in sure)
     assert all(one.label != other for one in unreviewed_sounds([home], model, names - {other}))
     assert unreviewed_sounds([home], model, set()) == []
+
+
+def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path):
+    """The blocks of the floor are counted from the first frame of the recorder."""
+    begin, frame = 1_772_348_400 * SECOND, 50_000_000
+    session = RecordingSession(Settings(output=tmp_path), "mic", "test", None)
+    rng = np.random.default_rng(1)
+    floors = []
+    for first, loudness in ((7, 0.001), (900, 0.1)):
+        samples = rng.normal(0, loudness, (800, FRAME_SAMPLES)).astype(np.float32)
+        if first > 7:
+            lost = first - 807
+            start = begin + 807 * frame
+            session.add(Gap(start, start + lost * frame, "overrun", lost))
+        session.add(Frames(first, samples, begin + np.arange(first, first + 800) * frame))
+        powers = DEFAULT.band_powers(DEFAULT.extractor()(samples))
+        tracked = FloorTracker()(powers, first).powers
+        floors += [np.zeros((len(powers) - len(tracked), DEFAULT.bands)), tracked]
+    session.finish()
+    (log,) = find_logs(tmp_path)
+    write_marks(log, [Mark("mic", begin + SECOND, begin + 80 * SECOND, "speech")])
+    found = sound(tmp_path).floors  # as far as there is something to learn from
+    assert len(found) > 1500
+    np.testing.assert_array_equal(found, np.concatenate(floors)[: len(found)])
 
 
 def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(home, model_file):

@@ -88,6 +88,8 @@ def adaptation_curve(data: Dataset, method: Method, progress: Progress) -> Adapt
         scores[place] = rows
         progress((place + 1) / len(splits))
     each = np.nanmean(scores, axis=2).reshape(len(chosen), _SHUFFLES, -1).mean(axis=1)
+    divided = scores.reshape(len(chosen), _SHUFFLES, *scores.shape[1:])
+    scores = np.nansum(divided, axis=1) / np.maximum(np.isfinite(divided).sum(axis=1), 1)
     curves = {names[number]: row.tolist() for number, row in zip(chosen, each, strict=True)}
     lost = np.where(scores[:, :1] >= _RIGHT, scores - scores[:, :1], 0.0)
     of_silence = np.array([name == SILENCE for name in data.classes])
@@ -135,6 +137,9 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float6
     examples = Examples(*arrays)
     target = examples.target
     base = method.fit(examples, split.others)
+    inputs, of_inputs, _ = examples.windows(split.others)
+    joined = examples._replace(more_inputs=inputs, more_target=of_inputs)
+    again = method.keeping(base.arrays(), np.unique(target[split.others]))
     labelled = examples.decide(base, split.pool, classes).argmax(axis=1)
     true = target[split.pool]
     wrong = np.flatnonzero((labelled != true) & (true != split.silence))
@@ -148,8 +153,7 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float6
         weight[home] = HOME_WEIGHT
         learned = base
         if len(home):
-            seen = np.concatenate([split.others, home])
-            learned = method.fit(examples._replace(weight=weight), seen)
+            learned = again.fit(joined._replace(weight=weight), home)
         predicted = examples.decide(learned, split.test, classes).argmax(axis=1)
         scores[place, labels] = f1_score(
             target[split.test], predicted, labels=labels, average=None, zero_division=0

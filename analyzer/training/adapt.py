@@ -72,6 +72,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     if not len(home):
         raise DataError("the home has no segments of a class of the model")
     method = method_named(description.method).as_of(description)
+    method = method.keeping(base.arrays, np.arange(len(base.classes)))
     remembered = method.remembered(base)
     if remembered is not None:
         examples, others = prepare(method, home), 0

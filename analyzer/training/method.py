@@ -247,6 +247,19 @@ class Method(ABC):
         del description
         return self
 
+    def keeping(self, arrays: Mapping[str, NDArray[Any]], classes: Indices) -> Self:
+        """Return this method so that what a machine learned stays, where nothing new is learned.
+
+        Parameters
+        ----------
+        arrays : mapping of str to np.ndarray
+            Of a machine that this method has learned.
+        classes : np.ndarray [shape=(C,)], intp
+            Numbers of its classes.
+        """
+        del arrays, classes
+        return self
+
 
 def prepare(method: Method, data: Dataset) -> Examples:
     """Compute the inputs of segments for a method; the same segments give the same inputs.

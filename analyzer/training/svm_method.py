@@ -1,9 +1,9 @@
 """Methods that learn support vector machines, with scikit-learn."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,28 @@ from hearthlog.analyzer.training.method import Examples, Learned, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
-from hearthlog.schemas.arrays import Float32, Float64, Indices
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 
 _SEED = 20_261_122
 _COST_TIMES = (0.25, 1.0, 4.0)
 _GAMMA_TIMES = (0.5, 1.0, 2.0)
 _ROUNDING = 0.01  # of the standard deviation
+
+
+class Scaling(NamedTuple):
+    """What a machine measures its inputs and errors with.
+
+    Attributes
+    ----------
+    mean, scale : np.ndarray [shape=(width,)], float64
+        Of the inputs.
+    costs : dict of int to float
+        By number of the class, relative to the cost of the method.
+    """
+
+    mean: Float64
+    scale: Float64
+    costs: dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -39,11 +55,14 @@ class SvmMethod(Method):
         Gamma of the kernel, times the number of inputs.
     most_windows : int
         That are learned from; the time that it takes grows with their square.
+    scaling : Scaling, optional
+        Of a machine that is learned again; by default that of the examples.
     """
 
     cost: float = 4.0
     gamma: float = 1.0
     most_windows: int = 12_000
+    scaling: Scaling | None = field(default=None, compare=False)
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -71,17 +90,33 @@ class SvmMethod(Method):
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
             remembered = remembered[kept]
         inputs = rounded(inputs)
+        scaler = self._scaler(inputs)
         machine = SVC(
-            C=self.cost,
-            gamma=self.gamma / inputs.shape[1],
-            class_weight="balanced",
-            decision_function_shape="ovo",
-        )
-        fitted = make_pipeline(StandardScaler(), machine).fit(
-            inputs.astype(np.float64), target, svc__sample_weight=weight
+            C=self.cost, gamma=self.gamma / inputs.shape[1], decision_function_shape="ovo"
+        ).fit(
+            scaler.transform(inputs.astype(np.float64)),
+            target,
+            sample_weight=weight * self._costs(target, remembered >= 0),
         )
         support = machine.support_
-        return LearnedSvm(fitted, inputs[support], np.maximum(remembered[support], -1))
+        learned = make_pipeline(scaler, machine)
+        return LearnedSvm(learned, inputs[support], np.maximum(remembered[support], -1))
+
+    def _scaler(self, inputs: Float32) -> StandardScaler:
+        scaler = StandardScaler().fit(inputs.astype(np.float64))
+        if self.scaling is not None:
+            scaler.mean_, scaler.scale_ = self.scaling.mean, self.scaling.scale
+        return scaler
+
+    def _costs(self, target: Indices, remembered: Bool) -> Float64:
+        """Weigh windows against the number of their class, an earlier machine's as it did."""
+        counts = np.bincount(target)
+        balanced = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
+        if self.scaling is None:
+            return balanced[target]
+        kept = balanced.copy()
+        kept[list(self.scaling.costs)] = list(self.scaling.costs.values())
+        return np.where(remembered, kept[target], balanced[target])
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with another cost or gamma.
@@ -152,11 +187,44 @@ class SvmMethod(Method):
         """
         assert isinstance(learned, LearnedSvm)
         inputs, target = remembered
+        costs = {} if self.scaling is None else self.scaling.costs
+        numbers = range(len(learned.machine.classes_))
         return {
             "base_target": target.astype(np.int64),
+            "base_costs": np.array([costs.get(number, 1.0) for number in numbers]),
             "support_base": learned.remembered.astype(np.int64),
             "base_vectors": inputs[np.setdiff1d(np.arange(len(inputs)), learned.remembered)],
         }
+
+    def keeping(self, arrays: Mapping[str, NDArray[Any]], classes: Indices) -> Self:
+        """Return this method with the scaling of a machine, which its vectors then give again.
+
+        With a scaling of the few vectors and of what is new, all borders would move.
+
+        Parameters
+        ----------
+        arrays : mapping of str to np.ndarray
+            As of `hearthlog.models.classifiers.svm_rbf.SvmKind`.
+        classes : np.ndarray [shape=(C,)], intp
+            Numbers of its classes.
+
+        Returns
+        -------
+        SvmMethod
+            Itself, if it has no copies in other rooms: it learns from all windows again.
+        """
+        if not self.rooms:
+            return self
+        if "base_costs" in arrays:
+            number = int(arrays["base_target"].max()) + 1
+            costs = dict(enumerate(arrays["base_costs"][:number].tolist()))
+        else:  # a coefficient is never above the cost of its class, and on the wrong side just that
+            target = np.repeat(classes, arrays["support_counts"])
+            largest = np.abs(arrays["dual_coefficients"]).max(axis=0) / self.cost
+            own = arrays.get("support_base", np.zeros(len(target))) >= 0
+            numbers = np.unique(target[own]).tolist()
+            costs = {number: float(largest[own & (target == number)].max()) for number in numbers}
+        return replace(self, scaling=Scaling(arrays["scaler_mean"], arrays["scaler_scale"], costs))
 
     def as_of(self, description: Description) -> Self:
         """Return this method with cost, gamma and number of copies of a model.

@@ -56,6 +56,8 @@ class SvmKind(ClassifierKind):
         Which of these each support vector is, from 0 on; -1 for one of the home.
     base_vectors : [shape=(m, width)], float32, optional
         Those of them that are support vectors no more, in their order.
+    base_costs : [shape=(C,)], float64, optional
+        What an error on a window of each class costs, relative to the cost of the method.
     """
 
     name = "svm-rbf"
@@ -74,6 +76,7 @@ class SvmKind(ClassifierKind):
         "base_target": np.dtype(np.int64),
         "support_base": np.dtype(np.int64),
         "base_vectors": np.dtype(np.float32),
+        "base_costs": np.dtype(np.float64),
     }
 
     def shapes(
@@ -111,6 +114,8 @@ class SvmKind(ClassifierKind):
             shapes["base_target"], shapes["support_base"] = (base,), (total,)
             kept = int(np.count_nonzero(arrays.get("support_base", np.empty(0)) >= 0))
             shapes["base_vectors"] = (base - kept, width)
+            if "base_costs" in arrays:
+                shapes["base_costs"] = (classes,)
         return shapes
 
     def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
@@ -133,6 +138,8 @@ class SvmKind(ClassifierKind):
         counts, total = arrays["support_counts"], len(arrays["support_vectors"])
         if (counts < 0).any() or counts.sum() != total:
             return f"support_counts do not add up to the {total} support vectors"
+        if not (arrays.get("base_costs", np.ones(1)) > 0.0).all():
+            return "base_costs has values that are not positive"
         for name in ("home_target", "base_target"):
             target = arrays.get(name, counts[:0])
             if ((target < 0) | (target >= classes)).any():
