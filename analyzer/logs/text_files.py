@@ -1,5 +1,6 @@
 """Text files that people make: read within limits, and refused with the line that is wrong."""
 
+import codecs
 import csv
 import io
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ _LONGEST = 1 << 20  # characters of a record: fields take fifty times as much me
 
 
 def read_text(path: Path, what: str, size_limit: int) -> str:
-    """Read a text file in UTF-8.
+    """Read a text file in UTF-8, or in UTF-16 with a byte order mark.
 
     Parameters
     ----------
@@ -26,14 +27,36 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
     Raises
     ------
     DataError
-        If there is no such file, or it cannot be read, is larger, or is not UTF-8.
+        If there is no such file, or it cannot be read, is larger, or is in neither.
     """
     raw = read_whole(path, what, size_limit, DataError)
+    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        return raw.decode("utf-8-sig")
+        return raw.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise DataError(f"{path}:{line}: is not UTF-8; save the {what} as UTF-8") from error
+
+
+def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are not blank, and their numbers from 1.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+
+    Raises
+    ------
+    DataError
+        If the text has more than a million lines.
+    """
+    _check_lines(path, text)
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.strip():
+            yield number, line
 
 
 def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
@@ -60,20 +83,59 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
     DataError
         If the text is not CSV, has more than a million lines, or a record of more than 1 MiB.
     """
-    count = max(text.count("\n"), text.count("\r"))
-    if count > _MOST_LINES:
-        raise DataError(f"{path}: has {count:,} lines; at most {_MOST_LINES:,} are read")
-    length = 0
+    for line, record in csv_rows(path, text, delimiter):
+        if isinstance(record, csv.Error):
+            raise DataError(f"{path}:{line}: is not CSV ({record})") from record
+        yield line, record
+
+
+def csv_rows(
+    path: Path, text: str, delimiter: str, *, quoted: bool = True
+) -> Iterator[tuple[int, list[str] | csv.Error]]:
+    """Yield the records of CSV that are not blank, and what is wrong where there is none.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        All of it.
+    delimiter : str
+        Between fields.
+    quoted : bool
+        Whether fields may be in quotation marks.
+
+    Yields
+    ------
+    line : int
+        The line in which the record begins, from 1.
+    record : list of str or csv.Error
+        Its fields; after an error, the next record begins in the next line.
+
+    Raises
+    ------
+    DataError
+        If the text has more than a million lines, or a record of more than 1 MiB.
+    """
+    _check_lines(path, text)
+    line, length = 1, 0
 
     def lines() -> Iterator[str]:
         nonlocal length
         for text_line in io.StringIO(text, newline=""):
             length += len(text_line)
             if length > _LONGEST:
-                raise csv.Error(f"a record is longer than {_LONGEST >> 20} MB")
+                raise DataError(
+                    f"{path}:{line}: is not CSV (a record is longer than {_LONGEST >> 20} MB)"
+                )
             yield text_line
 
-    reader = csv.reader(lines(), strict=True, delimiter=delimiter)
+    reader = csv.reader(
+        lines(),
+        strict=True,
+        delimiter=delimiter,
+        quoting=csv.QUOTE_MINIMAL if quoted else csv.QUOTE_NONE,
+    )
     while True:
         length = 0
         line = reader.line_num + 1
@@ -82,6 +144,13 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
         except StopIteration:
             return
         except csv.Error as error:
-            raise DataError(f"{path}:{line}: is not CSV ({error})") from error
+            yield line, error
+            continue
         if any(field.strip() for field in record):
             yield line, record
+
+
+def _check_lines(path: Path, text: str) -> None:
+    count = max(text.count("\n"), text.count("\r"))
+    if count > _MOST_LINES:
+        raise DataError(f"{path}: has {count:,} lines; at most {_MOST_LINES:,} are read")

@@ -1,8 +1,9 @@
 """`hearthlog annotate`: marks of a reviewer, from and to the label files of other programs."""
 
+import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +11,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
+from hearthlog.schemas.text import listed, shortened
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.options import LocalLog, Microphone, reviewer_name
-from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import number, tell, wrong_use
+from hearthlog.tools.cli.table import NAME_WIDTH, print_table
+from hearthlog.tools.cli.text import end_with_warnings, number, tell, wrong_use
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.logs.coverage import Coverage
+    from hearthlog.analyzer.marks.formats.left_out import LeftOut
+    from hearthlog.analyzer.marks.label_import import Folded
     from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
+
+_SHOWN = 10  # names, kinds of labels
 
 annotate = typer.Typer(
     no_args_is_help=True,
@@ -29,28 +36,67 @@ def import_labels(
     log: LocalLog,
     labels: Annotated[Path, typer.Argument(help=f"Labels: {PATTERNS}.")],
     *,
-    microphone: Microphone = None,
+    class_map: Annotated[
+        Path | None,
+        typer.Option("--map", help='What labels mean, as TOML: "Tap Water" = "tap_water".'),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Take Tap Water as tap_water without a question.")
+    ] = False,
+    tier: Annotated[
+        list[str] | None, typer.Option(help="Tier of ELAN to read; may be given again.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Column of a table to read, as label=Species, or start=1 where it has no names; "
+            "may be given again."
+        ),
+    ] = None,
+    microphone: Annotated[
+        str | None, typer.Option(help="Microphone of all labels, whatever the file says.")
+    ] = None,
     reviewer: Annotated[
         str | None,
         typer.Option(help="Who labelled, where the file does not say.", show_default="you"),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Take nothing unless every label can be taken.")
+    ] = False,
 ) -> None:
     """Add the labels of a file as marks to review layers, one beside each log.
 
     Where they overlap older marks, they win; labels that stand there already change nothing. If
     `hearthlog review --queue --save` made the file, spans that still have a label were looked at.
+    Exit status 3: some labels were left out.
     """
     from hearthlog.analyzer.logs.coverage import find_coverage
-    from hearthlog.analyzer.marks.formats.label_files import read_labels
+    from hearthlog.analyzer.marks.formats.class_names import read_class_map
+    from hearthlog.analyzer.marks.formats.labels import Choice
+    from hearthlog.analyzer.marks.label_import import ImportOptions
+    from hearthlog.analyzer.marks.label_import import import_labels as read_labels
     from hearthlog.analyzer.marks.marks import RANDOM, read_marks, read_reviewed, write_marks
     from hearthlog.analyzer.marks.merge_marks import new_marks
-    from hearthlog.analyzer.review.queue.asked import asked_path, looked_at
+    from hearthlog.analyzer.review.queue.asked import asked_path, looked_at, unasked
     from hearthlog.analyzer.review.queue.review_list import read_list
 
     _check_suffix(labels)
     name, now = reviewer_name(reviewer), time.time_ns()
+    choice = Choice(tier or (), _columns(column or []))
+    names = None if class_map is None else read_class_map(class_map)
     coverage = find_coverage(log)
-    by_log = read_labels(labels, coverage, microphone)
+    _check_microphone(log, coverage, microphone)
+    options = ImportOptions(microphone, names, choice, strict)
+    by_log, left_out, moved = read_labels(
+        labels, coverage, options, lambda folded: _agree(labels, folded, yes=yes)
+    )
+    for other, count in moved.items():
+        tell(f"{number(count, 'label')} of {other}, by the file, are taken as of {microphone}")
+    losses = list(_losses(left_out))
+    if not by_log:
+        for line in losses:
+            tell(line)
+        raise typer.Exit(1)
     asked = asked_path(labels)
     spans = read_list(asked) if asked.exists() else []
     said = [mark for marks in by_log.values() for mark in marks]
@@ -80,8 +126,11 @@ def import_labels(
             f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
             f"{number(minutes, 'minute')} drawn at random"
         )
+        if others := unasked(spans, taken):
+            tell(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
     if taken:
         tell(f"next: a model of this home, from these: hearthlog train --home {quote(str(log))}")
+    end_with_warnings(losses)
 
 
 @annotate.command("export")
@@ -92,7 +141,6 @@ def export_labels(
     microphone: Microphone = None,
 ) -> None:
     """Write the marks of review layers to a label file."""
-    from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.coverage import find_coverage
     from hearthlog.analyzer.marks.formats.label_files import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
@@ -101,9 +149,7 @@ def export_labels(
     _check_suffix(output)
     check_new(output)
     coverage = find_coverage(log)
-    if microphone is not None and microphone not in coverage:
-        names = ", ".join(sorted(coverage))
-        raise DataError(f"{log}: no microphone {microphone!r}; there is {names}")
+    _check_microphone(log, coverage, microphone)
     marks = {
         mark
         for name, one in coverage.items()
@@ -118,6 +164,64 @@ def export_labels(
 def _check_suffix(path: Path) -> None:
     if find_format(path) is None:
         wrong_use(f"{path}: a label file is {PATTERNS}")
+
+
+def _check_microphone(
+    log: Path, coverage: "Mapping[str, Coverage]", microphone: str | None
+) -> None:
+    from hearthlog.analyzer.errors import DataError
+
+    if microphone is not None and microphone not in coverage:
+        names = ", ".join(sorted(coverage))
+        raise DataError(f"{log}: no microphone {microphone!r}; there is {names}")
+
+
+def _columns(given: Sequence[str]) -> dict[str, str]:
+    """Read the options --column."""
+    from hearthlog.analyzer.marks.formats.tables import COLUMNS
+
+    pairs = [text.partition("=")[::2] for text in given]
+    for text, (field, name) in zip(given, pairs, strict=True):
+        if field not in COLUMNS or not name:
+            wrong_use(f"--column {text}: say {listed(COLUMNS)}, and the column: label=Species")
+    return dict(pairs)
+
+
+def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
+    """Ask whether labels are taken as the names that are spelt like them."""
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.models.classes import find_class
+
+    texts = [
+        f"{shortened(label, NAME_WIDTH)!r} as {name} ({number(count, 'label')}"
+        f"{'' if find_class(name) else ', a class of your own'})"
+        for label, name, count in folded
+    ]
+    more = [f"{len(texts) - _SHOWN} more"] if len(texts) > _SHOWN else []
+    text = listed([*texts[:_SHOWN], *more], "and")
+    if yes:
+        tell(f"taken: {text}")
+    elif not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise DataError(
+            f"{labels}: not spelt as names of classes are: {text}; --yes takes them so, --map says "
+            "what else they are"
+        )
+    else:
+        tell(f"{labels}: not spelt as names of classes are: {text}")
+        if not typer.confirm("Take them so?", err=True):
+            tell("nothing was taken; --map says what they are")
+            raise typer.Exit(1)
+
+
+def _losses(left_out: "LeftOut") -> Iterator[str]:
+    """Say how many labels of each kind were left out, and which was the first."""
+    kinds = list(left_out.kinds())
+    for count, first in kinds[:_SHOWN]:
+        yield f"{number(count, first.kind)} left out{'' if count == 1 else ', the first'}: {first}"
+    if len(kinds) > _SHOWN:
+        rest = sum(count for count, _ in kinds[_SHOWN:])
+        kinds_more = number(len(kinds) - _SHOWN, "kind")
+        yield f"{number(rest, 'label')} more left out, of {kinds_more}"
 
 
 def _print_amounts(marks: "Sequence[Mark]") -> None:

@@ -5,33 +5,39 @@ from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel
+from hearthlog.analyzer.logs.text_files import numbered_lines
+from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, with_point
+from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import seconds_text
 
 
-def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the labels of a track.
+def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
+    """Yield the labels of a track, whose times may have decimal commas.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        Of the file, for messages.
     text : str
         All of it.
+    choice : Choice
+        Not used.
 
     Raises
     ------
     DataError
-        If a line is not start, end and label with tabs between them.
+        If the text has too many lines.
     """
-    for number, line in enumerate(text.split("\n"), 1):
-        if not line.strip() or line.startswith("\\"):  # the pitch of a spectral selection
+    for number, line in numbered_lines(path, text):
+        if line.startswith("\\"):  # the pitch of a spectral selection
             continue
-        fields = [field.strip() for field in line.rstrip("\r").split("\t")]
-        if len(fields) != 3:
-            raise DataError(f"{path}:{number}: is not start, end and label with tabs between them")
-        yield FileLabel(number, *fields)
+        start, end, label, *_ = [*(field.strip() for field in line.split("\t")), "", ""]
+        if not end:
+            reason = "is not start, end and label with tabs between them"
+            yield LineError(place_text(path, number), UNREADABLE, reason)
+            continue
+        yield FileLabel(number, with_point(start), with_point(end), label)
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:

@@ -18,8 +18,10 @@ from defusedxml.sax import parseString
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
+from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
+from hearthlog.analyzer.marks.formats.left_out import WRONG_TIME, LineError
 from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.schemas.text import listed
 from hearthlog.schemas.times import seconds_text, time_text
 
 _MILLISECOND = 1_000_000  # ns
@@ -46,10 +48,12 @@ class _Wrong(Exception):  # noqa: N818
 
 
 class _Document(ContentHandler):
-    """Gathers the times and labels of a document."""
+    """Gathers the times and labels of some tiers of a document; without any, of the top ones."""
 
-    def __init__(self) -> None:
+    def __init__(self, chosen: Sequence[str]) -> None:
         super().__init__()
+        self._chosen = chosen
+        self.tiers: list[str] = []
         self.start = ""
         self.annotations: dict[str, _Annotation] = {}
         self.origins: dict[str, dict[str, str]] = {kind: {} for kind in _ORIGIN}
@@ -84,6 +88,7 @@ class _Document(ContentHandler):
             self.slots[given.get("TIME_SLOT_ID", "")] = given.get("TIME_VALUE", "")
         elif name == "TIER":
             self._tier = given
+            self.tiers.append(given.get("TIER_ID", ""))
         elif name in {"ALIGNABLE_ANNOTATION", "REF_ANNOTATION", "PROPERTY"}:
             self._open, self._line = given, self.line
             self._text.clear()
@@ -100,7 +105,7 @@ class _Document(ContentHandler):
         text = "".join(self._text).strip()
         if name == "PROPERTY" and self._open.get("NAME") == _START:
             self.start = text
-        elif name == "ALIGNABLE_ANNOTATION" and not depends:
+        elif name == "ALIGNABLE_ANNOTATION" and self._is_read():
             start, end = (self._open.get(f"TIME_SLOT_REF{i}", "") for i in (1, 2))
             identity = self._open.get("ANNOTATION_ID", f"line {self._line}")
             self.annotations[identity] = _Annotation(self._line, self._tier, start, end, text)
@@ -111,24 +116,36 @@ class _Document(ContentHandler):
             self._open = {}
             self._text.clear()
 
+    def _is_read(self) -> bool:
+        if self._chosen:
+            return self._tier.get("TIER_ID") in self._chosen
+        return "PARENT_REF" not in self._tier
 
-def read(path: Path, text: str) -> Iterator[FileLabel]:
-    """Yield the annotations of the top tiers.
+
+def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
+    """Yield the annotations that have a time of their own, of some tiers or of the top ones.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        Of the file, for messages.
     text : str
         All of it.
+    choice : Choice
+        Its tiers.
+
+    Yields
+    ------
+    FileLabel or LineError
+        In the order of the file.
 
     Raises
     ------
     DataError
         If the text is not XML, declares a DTD, is no document of ELAN, has times in another unit
-        or a recording with an offset, or if an annotation has no valid time.
+        or a recording with an offset, or has no such tier.
     """
-    document = _Document()
+    document = _Document(choice.tiers)
     endless = _ENDLESS.search(text)
     if endless is not None:
         line = text.count("\n", 0, endless.start()) + 1
@@ -142,11 +159,22 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
         raise DataError(f"{path}:{document.line}: declares a DTD, as ELAN never does") from error
     except _Wrong as error:
         raise DataError(f"{path}:{document.line}: {error}") from error
+    unknown = [name for name in choice.tiers if name not in document.tiers]
+    if unknown:
+        names = listed([repr(name[:64]) for name in document.tiers[:20]])
+        raise DataError(f"{path}: no tier {unknown[0][:64]!r}; there is {names or 'none'}")
     for identity, each in document.annotations.items():
+        try:
+            start, end = (
+                _seconds(path, each, document.slots.get(slot)) for slot in (each.start, each.end)
+            )
+        except LineError as error:
+            yield error
+            continue
         yield FileLabel(
             each.line,
-            _seconds(path, each, document.slots.get(each.start)),
-            _seconds(path, each, document.slots.get(each.end)),
+            start,
+            end,
             each.label,
             microphone=each.tier.get("PARTICIPANT", ""),
             reviewer=each.tier.get("ANNOTATOR", ""),
@@ -159,9 +187,11 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
 def _seconds(path: Path, annotation: _Annotation, milliseconds: str | None) -> str:
     where = f"{path}:{annotation.line}"
     if not milliseconds:
-        raise DataError(f"{where}: {annotation.label[:64]!r} has no time; align it in ELAN")
+        reason = f"{annotation.label[:64]!r} has no time; align it in ELAN"
+        raise LineError(where, "label without a time", reason)
     if not (milliseconds.isascii() and milliseconds.isdecimal() and len(milliseconds) < 16):
-        raise DataError(f"{where}: {milliseconds[:64]!r} is no number of milliseconds")
+        reason = f"{milliseconds[:64]!r} is no number of milliseconds"
+        raise LineError(where, WRONG_TIME, reason)
     return seconds_text(int(milliseconds) * _MILLISECOND)
 
 

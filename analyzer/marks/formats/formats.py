@@ -18,6 +18,8 @@ class LabelFormat(NamedTuple):
     suffix: str
     module: str
     size_limit: int = 16 * _MEGABYTE  # enough for a hundred thousand labels
+    has_columns: bool = False  # that may be chosen
+    has_tiers: bool = False
 
     @property
     def pattern(self) -> str:
@@ -27,12 +29,13 @@ class LabelFormat(NamedTuple):
 
 
 AUDACITY = LabelFormat("Audacity", ".txt", "audacity")
-RAVEN = LabelFormat("Raven", ".selections.txt", "raven")
+RAVEN = LabelFormat("Raven", ".selections.txt", "raven", has_columns=True)
 FORMATS = (
     AUDACITY,
     RAVEN,
-    LabelFormat("CSV", ".csv", "csvfile"),
-    LabelFormat("ELAN", ".eaf", "elan", 64 * _MEGABYTE),  # XML takes more for as many labels
+    LabelFormat("CSV", ".csv", "csvfile", has_columns=True),
+    # XML takes more for as many labels.
+    LabelFormat("ELAN", ".eaf", "elan", 64 * _MEGABYTE, has_tiers=True),
     LabelFormat("Label Studio", ".json", "labelstudio"),
     LabelFormat("RTTM", ".rttm", "rttm"),
 )

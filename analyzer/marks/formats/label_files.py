@@ -1,4 +1,4 @@
-"""Label files of any format, read as marks and written from marks."""
+"""Label files of any format, read as labels and written from marks."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
@@ -8,15 +8,10 @@ from typing import Protocol, cast
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
 from hearthlog.analyzer.logs.text_files import read_text
-from hearthlog.analyzer.marks.formats import raven
 from hearthlog.analyzer.marks.formats.formats import AUDACITY, RAVEN, LabelFormat, find_format
-from hearthlog.analyzer.marks.formats.labels import (
-    FileLabel,
-    PlacedMark,
-    check_overlaps,
-    make_mark,
-    place_text,
-)
+from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel
+from hearthlog.analyzer.marks.formats.left_out import LineError
+from hearthlog.analyzer.marks.formats.tables import is_table
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.storage.new_files import new_file
 
@@ -26,7 +21,7 @@ _CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # that a name may have
 class LabelCodec(Protocol):
     """The functions of the module of a format."""
 
-    def read(self, path: Path, text: str) -> Iterator[FileLabel]:
+    def read(self, path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
         """Yield the labels of a file.
 
         Parameters
@@ -35,11 +30,12 @@ class LabelCodec(Protocol):
             Of the file, for messages.
         text : str
             All of it.
+        choice : Choice
 
         Yields
         ------
-        FileLabel
-            In the order of the file.
+        FileLabel or LineError
+            In the order of the file; an error for a line that is no label.
 
         Raises
         ------
@@ -66,86 +62,39 @@ class LabelCodec(Protocol):
         """
 
 
-def read_labels(
-    path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
-) -> dict[Path, list[Mark]]:
-    """Read a label file.
+def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
+    """Yield the labels of a file as they are there.
 
     Parameters
     ----------
     path : Path
-        Of one of the formats in `formats.FORMATS`, by its suffix; a `*.txt` is a table of Raven or
-        a label track of Audacity by its first line.
-    coverage : mapping of str to Coverage
-        By microphone.
-    microphone : str, optional
-        The microphone of labels that do not name theirs; not needed if there is only one.
+        Of one of the formats in `formats.FORMATS`, by its suffix; a `*.txt` is a table or a label
+        track of Audacity by its first line.
+    choice : Choice
 
-    Returns
-    -------
-    dict of Path to list of Mark
-        By log; what crosses from one log to the next is split.
+    Yields
+    ------
+    FileLabel or LineError
+        In the order of the file; an error for a line that is no label.
 
     Raises
     ------
     DataError
-        With file and place, if the file cannot be read, is too large, is no label file or holds no
-        labels, if a label cannot be a mark, if labels of one microphone overlap, or if one lies
-        where nothing was recorded.
-    """
-    placed = read_lines(path, coverage, microphone)
-    check_overlaps(path, placed)
-    by_log: dict[Path, list[Mark]] = {}
-    for place, mark in placed:
-        pieces = coverage[mark.microphone].split(mark.start, mark.end)
-        if not pieces:
-            raise DataError(
-                f"{place_text(path, place)}: {mark.label} lies outside of what {mark.microphone} "
-                "heard; `hearthlog info` shows when that was"
-            )
-        for log, start, end in pieces:
-            by_log.setdefault(log, []).append(mark._replace(start=start, end=end))
-    return by_log
-
-
-def read_lines(
-    path: Path, coverage: Mapping[str, Coverage], microphone: str | None = None
-) -> list[PlacedMark]:
-    """Read a label file whose labels may overlap, and may lie where nothing was recorded.
-
-    Parameters
-    ----------
-    path : Path
-        As of `read_labels`.
-    coverage : mapping of str to Coverage
-        By microphone.
-    microphone : str, optional
-        The microphone of labels that do not name theirs; not needed if there is only one.
-
-    Returns
-    -------
-    list of PlacedMark
-        In the order of the file, with their lines, or their places in a file that has none.
-
-    Raises
-    ------
-    DataError
-        With file and place, if the file cannot be read, is too large, is no label file or holds no
-        labels, or if a label cannot be a mark.
+        If the file cannot be read, is too large or no label file, or has nothing to choose from.
     """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
     if format_ in {AUDACITY, RAVEN}:
-        format_ = RAVEN if raven.is_table(text) else AUDACITY
-    labels = _codec(format_).read(path, text)
-    placed = [make_mark(path, label, coverage, microphone) for label in labels]
-    if not placed:
-        raise DataError(f"{path}: holds no labels")
-    return placed
+        format_ = RAVEN if choice.columns or is_table(text) else AUDACITY
+    if choice.columns and not format_.has_columns:
+        raise DataError(f"{path}: has no columns to choose with --column; tables have")
+    if choice.tiers and not format_.has_tiers:
+        raise DataError(f"{path}: has no tiers to choose with --tier; documents of ELAN have")
+    return _codec(format_).read(path, text, choice)
 
 
 def write_labels(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> None:
-    """Write marks as a label file that `read_labels` reads again.
+    """Write marks as a label file that `read_rows` reads again.
 
     Parameters
     ----------

@@ -3,18 +3,26 @@
 import re
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.marks.formats.left_out import (
+    EMPTY,
+    OTHER,
+    POINT,
+    WRONG_TIME,
+    LineError,
+    place_text,
+)
 from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
-from hearthlog.models.classifiers.description import CLASS_NAME
+from hearthlog.schemas.text import shortened
 from hearthlog.schemas.times import NANOSECONDS, read_time, time_text
 
-_SECONDS = re.compile(r"[-+]?[0-9]{1,10}(\.[0-9]{0,18})?([eE][-+]?[0-9]{1,2})?")
+_SECONDS = re.compile(r"[-+]?([0-9]{1,10}(\.[0-9]{0,18})?|\.[0-9]{1,18})([eE][-+]?[0-9]{1,2})?")
+_DECIMAL_COMMA = re.compile(r"([-+]?[0-9]*),([0-9]+([eE][-+]?[0-9]{1,2})?)")
 _LENGTH_TOLERANCE = NANOSECONDS  # between a labelled recording and the logs of it
+_SHOWN = 64  # characters of a text
 
 
 class FileLabel(NamedTuple):
@@ -49,24 +57,26 @@ class FileLabel(NamedTuple):
     length: str = ""
 
 
+class Choice(NamedTuple):
+    """What of a file is read, where it has more than one thing that may be labels.
+
+    Attributes
+    ----------
+    tiers : sequence of str
+        Of ELAN; empty for all.
+    columns : mapping of str to str
+        Names of the columns of a table, by the field that each has.
+    """
+
+    tiers: Sequence[str] = ()
+    columns: Mapping[str, str] = {}
+
+
 class PlacedMark(NamedTuple):
     """A mark, and its line or place in the file."""
 
     place: int | str
     mark: Mark
-
-
-def place_text(path: Path, place: int | str) -> str:
-    """Write the place of a label for an error: `file:line`, or `file: place`.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file.
-    place : int or str
-        The line, or the place in a file without lines.
-    """
-    return f"{path}:{place}" if isinstance(place, int) else f"{path}: {place}"
 
 
 def make_mark(
@@ -86,76 +96,67 @@ def make_mark(
 
     Raises
     ------
-    DataError
-        With file and place, if the microphone is not in the logs or must be named, if a time, the
-        label or a name is invalid, if the label is a point, ends before it starts or starts before
+    LineError
+        With file and place, if the microphone is not in the logs or must be named, if a time or a
+        name is invalid, if the label is empty or a point, ends before it starts or starts before
         the first frame, or if it is of a recording of another length.
     """
     where = place_text(path, label.place)
+    if not label.label:
+        raise LineError(where, EMPTY, "has no text")
     only = next(iter(coverage)) if len(coverage) == 1 else ""
     name = label.microphone or microphone or only
     if name not in coverage:
         names = ", ".join(sorted(coverage))
-        if name:
-            raise DataError(f"{where}: no microphone {name[:64]!r} in the logs; there is {names}")
-        raise DataError(f"{where}: of which microphone? choose one with --microphone ({names})")
+        remedy = "`annotate import --microphone` takes them as of another"
+        unknown = f"no microphone {name[:_SHOWN]!r} in the logs; there is {names}; {remedy}"
+        which = f"of which microphone? choose one with --microphone ({names})"
+        raise LineError(where, OTHER, unknown if name else which, name)
     zero = _zero(where, label, coverage[name])
     start, end = _time(where, label.start, zero), _time(where, label.end, zero)
-    if not CLASS_NAME.fullmatch(label.label):
-        raise DataError(
-            f"{where}: {label.label[:64]!r} cannot be the name of a class: use lower-case letters, "
-            "digits and '_'"
-        )
+    text = shortened(label.label, _SHOWN)
     if start == end:
-        raise DataError(f"{where}: {label.label} is a point; mark a span of time")
+        raise LineError(where, POINT, f"{text} is a point; mark a span of time")
     if start > end:
-        raise DataError(f"{where}: {label.label} ends before it starts")
+        raise LineError(where, WRONG_TIME, f"{text} ends before it starts")
     if start < zero and label.start.startswith("-"):
-        raise DataError(f"{where}: {label.label} starts at {label.start} s, before the first frame")
+        reason = f"{text} starts at {label.start} s, before the first frame"
+        raise LineError(where, WRONG_TIME, reason)
     return PlacedMark(label.place, Mark(name, start, end, label.label, *_origin(where, label)))
 
 
-def check_overlaps(path: Path, placed: Sequence[PlacedMark]) -> None:
-    """Check that marks of one microphone do not overlap.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file, for the message.
-    placed : sequence of PlacedMark
-        In the order of the file.
-
-    Raises
-    ------
-    DataError
-        With file and place, if two of them overlap.
-    """
-    order = sorted(range(len(placed)), key=lambda i: placed[i].mark)
-    for one, other in pairwise(order):
-        earlier, later = placed[one].mark, placed[other].mark
-        if earlier.microphone == later.microphone and later.start < earlier.end:
-            first, last = (placed[i].place for i in sorted((one, other)))
-            name = f"line {first}" if isinstance(first, int) else first
-            raise DataError(f"{place_text(path, last)}: overlaps the label in {name}")
+def is_seconds(text: str) -> bool:
+    """Tell whether a text is a number of seconds that can be read."""
+    return _SECONDS.fullmatch(text) is not None
 
 
-def read_seconds(where: str, text: str) -> Decimal:
-    """Read a number of seconds.
+def with_point(number: str) -> str:
+    """Return a number that has a decimal comma with a point; any other text as it is."""
+    comma = _DECIMAL_COMMA.fullmatch(number)
+    return f"{comma[1]}.{comma[2]}" if comma else number
+
+
+def add_seconds(where: str, start: str, duration: str) -> str:
+    """Return the end of a label of which start and duration are known.
 
     Parameters
     ----------
     where : str
         File and place, for the message.
-    text : str
-        A decimal number, with or without an exponent.
+    start, duration : str
+        Decimal numbers of seconds, with or without an exponent.
 
     Raises
     ------
-    DataError
-        If the text is no number, or has more than 10 digits before the point or 18 behind it.
+    LineError
+        If one is no number, or has more than 10 digits before the point or 18 behind it.
     """
-    if not _SECONDS.fullmatch(text):
-        raise DataError(f"{where}: {text[:64]!r} is no number of seconds")
+    return f"{_seconds(where, start) + _seconds(where, duration):f}"
+
+
+def _seconds(where: str, text: str) -> Decimal:
+    if not is_seconds(text):
+        raise LineError(where, WRONG_TIME, f"{text[:_SHOWN]!r} is no number of seconds")
     return Decimal(text)
 
 
@@ -169,12 +170,14 @@ def _zero(where: str, label: FileLabel, coverage: Coverage) -> int:
     if label.zero:
         return _time(where, label.zero, 0)
     if label.length:
-        labelled = round(read_seconds(where, label.length) * NANOSECONDS)
+        labelled = round(_seconds(where, label.length) * NANOSECONDS)
         recorded = coverage.ends[-1] - coverage.starts[0]
         if abs(labelled - recorded) > _LENGTH_TOLERANCE:
-            raise DataError(
-                f"{where}: labels a recording of {label.length} s, and these logs are of "
-                f"{recorded / NANOSECONDS:.3f} s; name the logs of that recording, no others"
+            raise LineError(
+                where,
+                OTHER,
+                f"labels a recording of {label.length} s, and these logs are of "
+                f"{recorded / NANOSECONDS:.3f} s; name the logs of that recording, no others",
             )
     return coverage.starts[0]
 
@@ -184,10 +187,11 @@ def _origin(where: str, label: FileLabel) -> tuple[str, int, str]:
     reviewer, corrects = label.reviewer.strip(), label.corrects.strip()
     for text in (reviewer, corrects):
         if not PERSON_NAME.fullmatch(text):
-            raise DataError(f"{where}: {text[:64]!r} cannot be a name: use up to 200 characters")
+            reason = f"{text[:_SHOWN]!r} cannot be a name: use up to 200 characters"
+            raise LineError(where, OTHER, reason)
     made = _time(where, label.made, -1) if label.made else 0
     if not 0 <= made <= LATEST:
-        raise DataError(f"{where}: a label cannot be made at {label.made[:64]!r}")
+        raise LineError(where, WRONG_TIME, f"a label cannot be made at {label.made[:_SHOWN]!r}")
     return reviewer, made, corrects
 
 
@@ -198,6 +202,5 @@ def _time(where: str, text: str, zero: int) -> int:
     try:
         return read_time(text)
     except (ValueError, OverflowError) as error:
-        raise DataError(
-            f"{where}: {text[:64]!r} is neither seconds nor a time such as 2026-03-01T07:00:00"
-        ) from error
+        reason = f"{text[:_SHOWN]!r} is neither seconds nor a time such as 2026-03-01T07:00:00"
+        raise LineError(where, WRONG_TIME, reason) from error

@@ -8,28 +8,36 @@ from typing import Any
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, made_text
+from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, made_text
+from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import seconds_text, time_text
 
 _TYPE = "labels"
+_NO_TASK = "unreadable task"
 
 
-def read(path: Path, text: str) -> Iterator[FileLabel]:
+def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the items of a file that Label Studio exports as JSON, or that it would import.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        Of the file, for messages.
     text : str
         All of it.
+    choice : Choice
+        Not used.
+
+    Yields
+    ------
+    FileLabel or LineError
+        In the order of the file; also an error for what is no task.
 
     Raises
     ------
     DataError
-        If the text is not JSON or holds something else than tasks, if a task has no annotations
-        and no predictions, or if an item is no label of a span of sound or has several labels.
+        If the text is not JSON.
     """
     try:
         # Numbers stay text: nothing is lost, and none is too long.
@@ -39,8 +47,10 @@ def read(path: Path, text: str) -> Iterator[FileLabel]:
     for number, task in enumerate(tasks if isinstance(tasks, list) else [tasks], 1):
         place = f"task {number}"
         if not isinstance(task, dict) or not isinstance(task.get("data"), dict):
-            raise DataError(f"{path}: {place}: is no task of Label Studio; export them as JSON")
-        yield from _of_task(path, place, task)
+            reason = "is no task of Label Studio; export them as JSON"
+            yield LineError(place_text(path, place), _NO_TASK, reason)
+        else:
+            yield from _of_task(path, place, task)
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
@@ -92,22 +102,27 @@ def _item(number: int, mark: Mark, zero: int, length: str) -> str:
     return f'{dumps(item)[:-1]}, "original_length": {length}, "value": {value}}}'
 
 
-def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLabel]:
+def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLabel | LineError]:
     """Yield the annotated items of a task; the predicted ones if it has no annotations."""
     kind = next((kind for kind in ("annotations", "predictions") if kind in task), None)
     if kind is None or not isinstance(task[kind], list):
-        raise DataError(f"{path}: {place}: has no annotations and no predictions")
+        reason = "has no annotations and no predictions"
+        yield LineError(place_text(path, place), _NO_TASK, reason)
+        return
     microphone, start = (_text(task["data"].get(name)) for name in ("microphone", "start"))
     for number, annotation in enumerate(task[kind], 1):
         within = f"{place}, {kind[:-1]} {number}"
         if not isinstance(annotation, dict) or not isinstance(annotation.get("result"), list):
-            raise DataError(f"{path}: {within}: has no result")
+            yield LineError(place_text(path, within), UNREADABLE, "has no result")
+            continue
         if annotation.get("was_cancelled") is True:
             continue
         reviewer, made = _completed(annotation) if kind == "annotations" else ("", "")
         for i, item in enumerate(annotation["result"], 1):
             label = _of_item(path, f"{within}, result {i}", item)
-            if label is not None:
+            if isinstance(label, LineError):
+                yield label
+            elif label is not None:
                 yield label._replace(
                     microphone=microphone,
                     zero=start,
@@ -116,7 +131,7 @@ def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLa
                 )
 
 
-def _of_item(path: Path, place: str, item: Any) -> FileLabel | None:
+def _of_item(path: Path, place: str, item: Any) -> FileLabel | LineError | None:
     """Read an item; None for one without a label (a rating, a remark, a relation)."""
     kind = item.get("type") if isinstance(item, dict) else None
     if not isinstance(kind, str) or not kind.endswith(_TYPE):
@@ -124,16 +139,18 @@ def _of_item(path: Path, place: str, item: Any) -> FileLabel | None:
     value = item.get("value")
     names = value.get(_TYPE) if isinstance(value, dict) else None
     if kind != _TYPE or not isinstance(names, list) or not {"start", "end"} <= value.keys():
-        raise DataError(f"{path}: {place}: {kind[:64]!r} is no label of a span of sound")
-    if len(names) != 1:
-        raise DataError(f"{path}: {place}: has {len(names)} labels; choose one")
+        reason = f"{kind[:64]!r} is no label of a span of sound"
+        return LineError(place_text(path, place), UNREADABLE, reason)
+    if len(names) > 1:
+        reason = f"has {len(names)} labels; choose one"
+        return LineError(place_text(path, place), "label of several names", reason)
     meta = item.get("meta")
     origin = meta if isinstance(meta, dict) else {}
     return FileLabel(
         place,
         _text(value["start"]),
         _text(value["end"]),
-        _text(names[0]),
+        _text(names[0]) if names else "",
         reviewer=_text(origin.get("reviewer")),
         made=_text(origin.get("made")),
         corrects=_text(origin.get("corrects")),

@@ -3,9 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.coverage import Coverage
-from hearthlog.analyzer.marks.formats.labels import FileLabel, read_seconds
+from hearthlog.analyzer.logs.text_files import numbered_lines
+from hearthlog.analyzer.marks.formats.labels import Choice, FileLabel, add_seconds
+from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.times import seconds_text
 
@@ -13,33 +14,37 @@ _TYPE = "SPEAKER"
 _FIELDS = 9, 10  # the last one, how far a system listened ahead, came later
 
 
-def read(path: Path, text: str) -> Iterator[FileLabel]:
+def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the labels; lines of other types, and comments, are left out.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        Of the file, for messages.
     text : str
         All of it.
+    choice : Choice
+        Not used.
 
     Raises
     ------
     DataError
-        If a line has fewer than 9 fields or more than 10, or its onset or duration is no number.
+        If the text has too many lines.
     """
-    for number, line in enumerate(text.split("\n"), 1):
-        fields = line.split()
-        if not fields or fields[0].startswith(";;"):
+    for number, line in numbered_lines(path, text):
+        fields, where = line.split(), place_text(path, number)
+        if fields[0].startswith(";;"):
             continue
         if len(fields) not in _FIELDS:
-            raise DataError(f"{path}:{number}: is no line of RTTM, which has 9 or 10 fields")
-        if fields[0] != _TYPE:
-            continue
-        _, microphone, _, onset, duration, _, _, label, *_ = fields
-        where = f"{path}:{number}"
-        end = read_seconds(where, onset) + read_seconds(where, duration)
-        yield FileLabel(number, onset, f"{end:f}", label, microphone)
+            yield LineError(where, UNREADABLE, "is no line of RTTM, which has 9 or 10 fields")
+        elif fields[0] == _TYPE:
+            _, microphone, _, onset, duration, _, _, label, *_ = fields
+            try:
+                end = add_seconds(where, onset, duration)
+            except LineError as error:
+                yield error
+                continue
+            yield FileLabel(number, onset, end, label, microphone)
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001

@@ -1,0 +1,170 @@
+"""Tables of labels: a line for each, in columns that are found by their names."""
+
+import csv
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.text_files import csv_rows
+from hearthlog.analyzer.marks.formats.labels import (
+    Choice,
+    FileLabel,
+    add_seconds,
+    is_seconds,
+    with_point,
+)
+from hearthlog.analyzer.marks.formats.left_out import UNREADABLE, LineError, place_text
+from hearthlog.schemas.text import listed
+
+_NAMES: Mapping[str, Sequence[str]] = {
+    "start": ("start", "start time", "begin", "begin time", "onset", "time"),
+    "end": ("end", "end time", "stop", "offset"),
+    "duration": ("duration",),
+    "label": ("label", "annotation", "species", "common name", "class", "event label"),
+    "microphone": ("microphone",),
+    "reviewer": ("reviewer",),
+    "made": ("made",),
+    "corrects": ("corrects",),
+}
+COLUMNS = tuple(_NAMES)
+_NUMBERS = ("start", "end", "duration")
+_SELECTION = "selection"  # a number, in tables of Raven
+_UNIT = re.compile(r"(\((s|sec)\)|\[(s|sec)\])$")
+
+
+def is_table(text: str) -> bool:
+    """Tell whether the first line of a text names the columns of a table.
+
+    Parameters
+    ----------
+    text : str
+        All of the file.
+    """
+    names = {_plain(name) for name in _first_line(text).split("\t")}
+    start, end, duration = (names.intersection(_NAMES[field]) for field in _NUMBERS)
+    return bool(start and (end or duration))
+
+
+def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
+    """Yield the rows of a table, each once: Raven may list it for every view and channel.
+
+    Fields are separated by tabs, semicolons or commas: by what the first line has most of. Unless
+    it is commas, numbers may have decimal commas.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file, for messages.
+    text : str
+        All of it.
+    choice : Choice
+        Its columns, by their names, or by their numbers from 1 if the first line has no names.
+
+    Yields
+    ------
+    FileLabel or LineError
+        In the order of the file.
+
+    Raises
+    ------
+    DataError
+        If columns that are needed are not found, if several may be one of them, or if the text has
+        too many lines or too long ones.
+    """
+    first = _first_line(text)
+    delimiter = max("\t;,", key=first.count)
+    number_of = str if delimiter == "," else with_point
+    columns: dict[str, int] | None = None
+    width = 0
+    seen: set[tuple[str, ...]] = set()
+    for number, record in csv_rows(path, text, delimiter, quoted=delimiter != "\t"):
+        where = place_text(path, number)
+        if isinstance(record, csv.Error):
+            if columns is None:
+                raise DataError(f"{where}: is not CSV ({record})")
+            yield LineError(where, UNREADABLE, f"is not CSV ({record})")
+            continue
+        values = [value.strip() for value in record]
+        if columns is None:
+            named = not any(is_seconds(number_of(value)) for value in values)
+            names = values if named else [str(i) for i in range(1, len(values) + 1)]
+            columns, width = _find(where, names, choice.columns, named=named), len(values)
+            if named:
+                continue
+        if any(values[width:]):
+            reason = f"has {len(values)} fields, the first line {width}"
+            yield LineError(where, UNREADABLE, reason)
+            continue
+        row = {
+            name: values[i] if i < len(values) else ""  # empty ones may be missing at the end
+            for name, i in columns.items()
+        }
+        if _SELECTION in row:
+            identity = tuple(row.values())
+            if row[_SELECTION] and identity in seen:
+                continue
+            seen.add(identity)
+        yield _label(where, number, row, number_of)
+
+
+def _label(
+    where: str, number: int, row: Mapping[str, str], number_of: Callable[[str], str]
+) -> FileLabel | LineError:
+    start, end, duration = (number_of(row.get(name, "")) for name in _NUMBERS)
+    try:
+        end = end or add_seconds(where, start, duration)
+    except LineError as error:
+        return error
+    others = (row.get(name, "") for name in COLUMNS[3:])
+    return FileLabel(number, start, end, *others)
+
+
+def _find(
+    where: str, names: Sequence[str], chosen: Mapping[str, str], *, named: bool
+) -> dict[str, int]:
+    """Return the column of each field of a label that the table has."""
+    plain = [_plain(name) for name in names]
+    unknown = [name for name in chosen.values() if _plain(name) not in plain]
+    if unknown:
+        raise DataError(f"{where}: no column {unknown[0][:64]!r}; there is {_listed(names)}")
+    found = {field: plain.index(_plain(name)) for field, name in chosen.items()}
+    taken = set(found.values())
+    for field in (field for field in _NAMES if field not in chosen):
+        fitting = [i for i, name in enumerate(plain) if name in _NAMES[field] and i not in taken]
+        if len(fitting) > 1:
+            two = _listed([names[i] for i in fitting])
+            raise DataError(
+                f"{where}: the {field} may be the column {two}: choose it with "
+                f"--column {field}=NAME"
+            )
+        if fitting:
+            found[field] = fitting[0]
+    end = "duration" if "duration" in found else "end"
+    missing = [field for field in ("start", end, "label") if field not in found]
+    if missing and not named:
+        raise DataError(
+            f"{where}: does not name the columns: say which is what, as --column start=1 "
+            "--column end=2 --column label=3"
+        )
+    if missing:
+        raise DataError(
+            f"{where}: no column is called {missing[0]}: choose it with --column "
+            f"{missing[0]}=NAME; there is {_listed(names)}"
+        )
+    if _SELECTION in plain:
+        found[_SELECTION] = plain.index(_SELECTION)
+    return found
+
+
+def _listed(names: Sequence[str]) -> str:
+    return listed([repr(name[:64]) for name in names[:20]])
+
+
+def _plain(name: str) -> str:
+    """Return the name of a column without capitals, underscores and unit."""
+    return _UNIT.sub("", name.strip().casefold().replace("_", " ")).rstrip()
+
+
+def _first_line(text: str) -> str:
+    return text.lstrip().split("\n", 1)[0]
