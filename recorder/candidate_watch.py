@@ -92,4 +92,5 @@ class CandidateWatch:
     def _refuse(self, reason: str) -> None:
         text = f"candidate refused: {reason}"
         self._results.put(text)
+        self._results.put(None)
         say(text)

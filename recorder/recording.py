@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
@@ -224,7 +225,8 @@ class RecordingSession:
         self._candidates = candidates
         self._model: Model | None
         self._model, classifier = (None, None) if watch is None else watch.first
-        self._candidate, candidate = self._other(None if candidates is None else candidates.first)
+        self._offered = None if candidates is None else candidates.first  # as a candidate
+        self._candidate, candidate = self._other(self._offered)
         features = _configured_features(settings, classifier)
         self._pipeline = Pipeline(
             microphone, features, classifier, settings.statistics_every, candidate
@@ -236,7 +238,6 @@ class RecordingSession:
             settings.sync_seconds,
         )
         self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
-        self._news: list[Loaded | None] = []  # candidates that no log has begun for yet
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
 
@@ -255,10 +256,8 @@ class RecordingSession:
         if isinstance(event, Gap):
             self.summary.gaps += 1
             self.summary.frames_lost += event.frames_lost
-        if isinstance(event, Frames) and self._watch is not None:
-            self._look_for_model(self._watch, event)
-        if isinstance(event, Frames) and self._candidates is not None:
-            self._look_for_candidate(self._candidates, event)
+        if isinstance(event, Frames):
+            self._look_for_models(event)
         notices = self._clips.before(event)
         self._log.write(self._pipeline.push(event))
         notices += self._clips.after(event, self._pipeline.last_labels)
@@ -283,34 +282,44 @@ class RecordingSession:
             for message in self._pipeline.report("clips", self._now, notice)
         ]
 
-    def _look_for_model(self, watch: ModelWatch, frames: Frames) -> None:
-        """Report models that were refused, and let one that is ready label from these frames on.
+    def _look_for_models(self, frames: Frames) -> None:
+        """Report models that were refused, and let others label from these frames on."""
+        stamp = int(frames.stamps[0])
+        if self._watch is not None:
+            self._report_refused(self._watch.refusals(), stamp)
+        if self._candidates is not None:
+            for candidate in self._candidates.news():
+                self._offered = candidate
+            self._report_refused(self._candidates.refusals(), stamp)
+        ready = None if self._watch is None else self._watch.ready
+        if (ready is not None or self._trial_changes()) and self._log.may_begin(stamp):
+            self._change_models(ready, frames.first, stamp)
 
-        Its labels begin a log of their own: the names of the classes belong to the channel, and
+    def _change_models(self, ready: Loaded | None, frame: int, stamp: int) -> None:
+        """Let the model that is ready label from a frame on, and the candidate that there is then.
+
+        Their labels begin a log of their own: the names of the classes belong to the channel, and
         the model card to the file.
         """
-        stamp = int(frames.stamps[0])
-        self._report_refused(watch.refusals(), stamp)
-        if watch.ready is not None and self._log.may_begin(stamp):
-            self._model, classifier = watch.ready
-            watch.ready = None
-            messages = self._pipeline.change_model(self._model, classifier, frames.first, stamp)
-            self._begin_log(*messages)
+        closing: list[EncodedMessage] = []
+        opening: list[EncodedMessage] = []
+        if ready is not None and self._watch is not None:
+            self._model, self._watch.ready = ready.model, None
+            last, first = self._pipeline.change_model(*ready, frame, stamp)
+            closing, opening = [*closing, *last], [*opening, *first]
+        if self._trial_changes():
+            self._candidate, classifier = self._other(self._offered)
+            last, first = self._pipeline.change_model(
+                self._candidate, classifier, frame, stamp, CANDIDATE
+            )
+            closing, opening = [*closing, *last], [*opening, *first]
+        closing.sort(key=attrgetter("log_time"))
+        self._log.begin_anew(self._describe(), closing)
+        self._log.write(opening)
 
-    def _look_for_candidate(self, candidates: CandidateWatch, frames: Frames) -> None:
-        """Report candidates that were refused, and let another one label from these frames on."""
-        stamp = int(frames.stamps[0])
-        self._news += candidates.news()
-        self._report_refused(candidates.refusals(), stamp)
-        if self._news and self._log.may_begin(stamp):
-            model, classifier = self._other(self._news[-1])
-            self._news.clear()
-            if model is not self._candidate:
-                self._candidate = model
-                messages = self._pipeline.change_model(
-                    model, classifier, frames.first, stamp, CANDIDATE
-                )
-                self._begin_log(*messages)
+    def _trial_changes(self) -> bool:
+        model, _ = self._other(self._offered)
+        return _identity(model) != _identity(self._candidate)
 
     def _report_refused(self, reasons: Iterable[str], stamp: int) -> None:
         for reason in reasons:
@@ -322,16 +331,14 @@ class RecordingSession:
         in_use = "" if self._model is None else self._model.sha256
         return (None, None) if candidate is None or candidate.model.sha256 == in_use else candidate
 
-    def _begin_log(
-        self, closing: Sequence[EncodedMessage], opening: Sequence[EncodedMessage]
-    ) -> None:
-        self._log.begin_anew(self._describe(), closing)
-        self._log.write(opening)
-
     def _describe(self) -> LogDescription:
         features = self._pipeline.feature_set
         info = stream_info(self._pipeline.microphone, self._device, features, self._model)
         return describe_log(self._settings, info, features, self._model, self._candidate)
+
+
+def _identity(model: Model | None) -> tuple[str, str] | None:
+    return None if model is None else (model.name, model.sha256)
 
 
 def _configured_features(settings: Settings, classifier: Classifier | None) -> FeatureSet:

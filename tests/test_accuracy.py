@@ -1,7 +1,7 @@
 """How right labels are in a home, by minutes drawn at random: what is read and promised."""
 
 import re
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -255,6 +255,11 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     assert re.search(r"talking, in all</td><td>[^<]+, as labelled<", text)
     assert re.search(r"\d+ to \d+ \(8 labelled\)", text)
     assert "not checked here" not in text
+    assert "“Right here”: how many" in text
+    make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 7, UTC), tmp_path / "week.html")
+    week = (tmp_path / "week.html").read_text()
+    assert "In 6 minutes of this week" in week
+    assert "Right here" not in week, "a week has no such column"
     accuracy = Accuracy(find_home_logs([tmp_path / "home"]))
     lines = list(accuracy.lines())
     assert "at most ten seconds between them count once" in lines[1]
@@ -284,6 +289,11 @@ def test_what_is_missed_in_a_quiet_minute_stands_for_more_than_in_one_with_sound
     assert accuracy.weight == pytest.approx((1428 / 2) / (12 / 6))
     checked = accuracy.minutes.check("coughing")
     assert checked == (6, 6, 7, 1, 1)
+    noise = [(at(f"{h:02}:{m:02}:05"), 30, "music", 0.9) for h in range(24) for m in range(60)]
+    loud = write_day(tmp_path, DAY + timedelta(days=1), noise)
+    begin = midnight(DAY + timedelta(days=1))
+    write_marks(loud[0], [], reviewed=[ReviewedSpan("mic", begin, begin + MINUTE, chosen=QUEUE)])
+    assert Accuracy(find_home_logs([tmp_path])).weight == accuracy.weight, "nothing drawn that day"
     assert checked.miss_rate(1)[1] < 0.5
     assert checked.miss_rate(accuracy.weight)[1] > 0.9
     whole = ClassCheck(40, 30, 50, 20, 2)

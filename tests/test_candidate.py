@@ -1,24 +1,38 @@
 """A candidate labels beside the model in use: it comes, speaks, goes, and is only a candidate."""
 
 import json
+import shutil
 import signal
 from contextlib import suppress
+from pathlib import Path
+from queue import SimpleQueue
 
+import numpy as np
 import pytest
+import soundfile
 from kept import keep_models
 from logreader import LogReader
 from logs import read
 from spliced import run
-from test_swap import count, labels_by, recording, said, wait_for
+from test_swap import block, count, labels_by, recording, said, wait_for
 
+from hearthlog.analyzer.gate.evidence import right_at_random
+from hearthlog.analyzer.gate.on_trial import compare_on_trial
+from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import promote
+from hearthlog.models.modelfile.registry import promote, target
+from hearthlog.recorder.candidate_watch import CandidateWatch
+from hearthlog.recorder.config import Settings
+from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
 
+OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
 OF_CANDIDATE = ["/mic/candidate/label", "/mic/candidate/segment"]
 
 
@@ -76,7 +90,7 @@ def test_relabelling_with_the_candidate_gives_its_segments(folder, logs, capfd):
     assert spoken
 
 
-def test_a_candidate_comes_changes_and_goes_while_the_recorder_runs(folder, tmp_path, day):
+def test_a_candidate_comes_changes_and_goes_while_the_recorder_runs(folder, tmp_path, day, capfd):
     promote(folder, "one")
     logs = tmp_path / "logs"
     with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00") as process:
@@ -88,6 +102,7 @@ def test_a_candidate_comes_changes_and_goes_while_the_recorder_runs(folder, tmp_
         before = count(logs, "label")
         wait_for(lambda: count(logs, "label") > before + 10)
     assert (process.returncode, process.errors) == (0, "")
+    assert "), was on trial: " in run(capfd, "info", logs).stdout
     first, second, third = find_logs(logs)
     assert [bool(candidate_labels(log)) for log in (first, second, third)] == [False, True, False]
     found, wanted = candidate_labels(second), labels_by(folder / "two.safetensors", logs)
@@ -122,6 +137,112 @@ def test_the_champion_is_no_candidate(folder, tmp_path, day, capfd):
     assert count(tmp_path / "logs", "candidate/label") == 0
 
 
+class CountingWatch(CandidateWatch):
+    """Counts what it has told."""
+
+    told = 0
+
+    def news(self):
+        found = super().news()
+        self.told += len(found)
+        return found
+
+
+def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("hearthlog.recorder.candidate_watch.LOOK_SECONDS", 0.01)
+    promote(folder, "two", "candidate")
+    watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
+    candidates = CountingWatch(folder, DEFAULT)
+    session = RecordingSession(Settings(output=tmp_path), "mic", "test", watch, candidates)
+    frames = iter(range(0, 100_000, 30))
+
+    def told():
+        session.add(block(next(frames), 30))
+        return candidates.told
+
+    shutil.copy(folder / "two.safetensors", folder / "copy")
+    (folder / "copy").replace(folder / "two.safetensors")
+    wait_for(lambda: told() == 1)
+    told()
+    assert len(list(tmp_path.rglob("*.mcap*"))) == 1
+    promote(folder, "broad", "candidate")
+    wait_for(lambda: told() == 2)
+    told()
+    session.finish()
+    watch.close()
+    candidates.close()
+    assert len(session.summary.logs) == 2
+
+
+def test_a_microphone_is_heard_on_while_candidates_fail_and_the_champion_vanishes(
+    folder, tmp_path, labmic, capfd
+):
+    rng = np.random.default_rng(5)
+    labmic.configure(data=rng.normal(0, 3000, 16_000 * 7 + 311).astype(np.int16))
+    logs = tmp_path / "logs"
+    shutil.copy(OLD_MODEL, folder / "old.safetensors")
+    promote(folder, "two", "candidate")
+    with recording(folder, logs, "--device", labmic.device, env=labmic.env) as process:
+        wait_for(lambda: count(logs, "candidate/label") > 10)
+        promote(folder, "old", "candidate")
+        wait_for(lambda: count(logs, "info") == 2)
+        promote(folder, "broad", "candidate")
+        wait_for(lambda: count(logs, "info") == 3)
+        (folder / "one.safetensors").unlink()
+        before = count(logs, "label")
+        wait_for(lambda: len(said(logs, level=30)) == 2 and count(logs, "label") > before + 10)
+        refused = run(capfd, "models", "promote", "broad", "--folder", folder, "--logs", logs)
+        assert (refused.returncode, target(folder, "champion")) == (1, "one")
+        (line,) = refused.stderr.splitlines()
+        assert "one (" in line
+        assert "which labels now, is neither in" in line
+        assert "`hearthlog models promote broad --anyway`" in line
+        run(capfd, "models", "promote", "--anyway", "--folder", folder)
+        wait_for(lambda: count(logs, "info") == 4)
+        before = count(logs, "label")
+        wait_for(lambda: count(logs, "label") > before + 10)
+    assert process.returncode == 3
+    assert said(logs, level=30) == [
+        "candidate refused: it is for feature set auros21, not home33",
+        f"model champion refused: {folder}/one.safetensors: no such model file; going on with one",
+    ]
+    about = [LogReader(log).metadata["hearthlog"] for log in find_logs(logs)]
+    assert [(one["model"], one.get("candidate")) for one in about] == [
+        ("one", "two"), ("one", None), ("one", "broad"), ("broad", None),
+    ]  # fmt: skip
+    assert [bool(candidate_labels(log)) for log in find_logs(logs)] == [True, False, True, False]
+    frames = [message.frame for message in read(logs, "features")]
+    assert frames == list(range(len(frames)))
+
+
+def test_a_champion_that_is_returned_to_has_its_candidate_again(folder, tmp_path, day):
+    promote(folder, "two", "candidate")
+    logs = tmp_path / "logs"
+    with recording(folder, logs, day, "--realtime", "--start", "2026-03-01T07:00:00"):
+        wait_for(lambda: count(logs, "candidate/label") > 10)
+        promote(folder, "two")
+        wait_for(lambda: count(logs, "info") == 2)
+        promote(folder, "one")
+        wait_for(lambda: count(logs, "info") == 3)
+    about = [LogReader(log).metadata["hearthlog"] for log in find_logs(logs)]
+    assert [(one["model"], one.get("candidate")) for one in about] == [
+        ("one", "two"), ("two", None), ("one", "two"),
+    ]  # fmt: skip
+
+
+def test_a_model_that_could_not_label_beside_the_champion_becomes_no_candidate(folder, capfd):
+    shutil.copy(OLD_MODEL, folder / "old.safetensors")
+    done = run(capfd, "models", "promote", "old", "--to", "candidate", "--folder", folder)
+    assert (done.returncode, target(folder, "candidate")) == (1, None)
+    assert done.stderr == (
+        "hearthlog: old is for feature set auros21, and one, the champion, for home33: it cannot "
+        "label beside it\n"
+    )
+    (folder / "one.safetensors").unlink()
+    done = run(capfd, "models", "promote", "old", "--to", "candidate", "--folder", folder)
+    assert done.returncode == 0  # the recorder says what it makes of it
+
+
 def test_a_candidate_of_a_killed_recorder_is_recovered(folder, tmp_path, day, capfd):
     promote(folder, "one")
     promote(folder, "two", "candidate")
@@ -144,7 +265,9 @@ def test_a_candidate_is_shown_as_one_and_taken_for_nothing_else(logs, tmp_path, 
     (log,) = find_logs(logs)
     info = json.loads(run(capfd, "info", logs, "--json").stdout)
     assert info["streams"][-1]["model"] == "one"
-    assert "candidate: two" in run(capfd, "info", logs).stdout
+    (line,) = (one for one in run(capfd, "info", logs).stdout.splitlines() if "trial" in one)
+    assert line.startswith("candidate: two (")
+    assert line.endswith(f"), on trial: `hearthlog models compare --live --logs {logs}`")
     assert set(info["segments"]) == {"mic", "mic/candidate"}
     assert run(capfd, "doctor", logs).returncode == 0
     apart = run(capfd, "diff", logs, "live", "candidate")
@@ -213,6 +336,23 @@ def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd)
     assert "`hearthlog models promote two` makes it champion" in said.stdout
 
 
+def test_a_minute_in_a_quiet_that_ends_hours_later_is_known(folder, tmp_path, capfd):
+    promote(folder, "two", "candidate")
+    quiet = np.random.default_rng(2).normal(0, 1e-4, 16_000 * 240)
+    soundfile.write(tmp_path / "quiet.wav", quiet, 16_000)
+    begin = ["--start", "2026-03-01T07:00:00", "--model", folder / "champion.safetensors"]
+    wav, logs = tmp_path / "quiet.wav", tmp_path / "logs"
+    run(capfd, "record", wav, "-o", logs, *begin, "--max-bag-duration", 60)
+    log = find_logs(logs)[1]
+    start = find_coverage(log)["mic"].starts[0] + 10 * NANOSECONDS
+    drawn = ReviewedSpan("mic", start, start + 40 * NANOSECONDS, chosen=RANDOM)
+    write_marks(log, [], reviewed=[drawn])
+    trial = compare_on_trial([logs])
+    assert (trial.random.sounds, trial.losses) == (1, [])
+    models = (load_model(folder / f"{name}.safetensors") for name in ("one", "two"))
+    assert right_at_random(*models, recent_logs([logs])).sounds == 1
+
+
 def review_as_the_candidate_says(logs):
     """Go through a minute in which the candidate is right about everything."""
     (log,) = find_logs(logs)
@@ -240,6 +380,20 @@ def test_logs_in_which_no_candidate_spoke_say_what_lets_one_speak(folder, tmp_pa
     assert "`hearthlog models promote NAME --to candidate`" in done.stderr
     wrong = run(capfd, "models", "compare", "one", "two", "--live")
     assert wrong.returncode == 2
+
+
+def test_a_candidate_that_has_just_begun_cannot_be_compared_yet(folder, tmp_path, capfd):
+    promote(folder, "two", "candidate")
+    watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
+    candidates = CandidateWatch(folder, DEFAULT)
+    session = RecordingSession(Settings(output=tmp_path), "mic", "test", watch, candidates)
+    session.add(block(0, 30))
+    done = run(capfd, "models", "compare", "--live", "--logs", tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("hearthlog: nothing to compare two with one by yet: /mic/")
+    session.finish()
+    watch.close()
+    candidates.close()
 
 
 def test_a_candidate_of_the_folder_models_speaks_beside_a_starter(

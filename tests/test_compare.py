@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
@@ -26,6 +27,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
+OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
 SECOND = 1_000_000_000
 DAY = 86_400 * SECOND
 START = 1_772_348_400 * SECOND
@@ -134,6 +136,8 @@ def test_models_that_have_learned_from_everything_are_compared_with_a_warning(fo
     assert result.returncode == 3
     assert result.stderr.count("\n") == 1
     assert "have learned from" in result.stderr
+    assert "says" not in result.stdout.splitlines()[1]
+    assert "min" not in row_of("silence", result.stdout)[-1]
 
 
 def test_the_champion_and_the_candidate_are_compared_on_reviewed_logs(folder, days, capfd):
@@ -210,6 +214,10 @@ def test_what_cannot_be_compared_is_an_error_of_one_line(folder, days, unheard, 
     assert "there is no candidate" in refusal("--logs", days)
     assert "does not fit" in refusal("one", "two", "--data", unheard, "--scenario", "bathroom")
     assert "no log" in refusal("one", "two", "--logs", tmp_path)
+    shutil.copy(OLD_MODEL, folder / "old.safetensors")
+    unlike = "one is for feature set home33, old for auros21: they cannot be compared"
+    assert unlike in refusal("one", "old", "--logs", days)
+    assert unlike in refusal("one", "old", "--data", unheard)
     with pytest.raises(DataError, match="no segment"):
         compare(folder, ["one", "two"], [])
     assert run(capfd, "models", "compare", "one", "two", "--folder", folder).returncode == 2

@@ -22,9 +22,19 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import NONE
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
-from hearthlog.analyzer.review.queue.judgeable_spans import judgeable_spans, other_labels
+from hearthlog.analyzer.review.queue.judgeable_spans import (
+    border_pieces,
+    judgeable_spans,
+    other_labels,
+)
 from hearthlog.analyzer.review.queue.ranking import make_queue
-from hearthlog.analyzer.review.queue.review_list import REASONS, ReviewSpan, read_list, write_list
+from hearthlog.analyzer.review.queue.review_list import (
+    REASONS,
+    ReviewSpan,
+    queued,
+    read_list,
+    write_list,
+)
 from hearthlog.analyzer.review.queue.uncertainty import uncertainty
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -348,7 +358,7 @@ def test_what_the_model_is_unsure_of_or_finds_new_comes_first(logs, uncertain, r
     assert queue.scores[1] < queue.scores[0]
 
 
-def write_home(path, rows, probabilities):
+def write_home(path, rows, probabilities, novelty=np.nan):
     """Write a log of segments, in seconds from midnight on, with a label at every second."""
     seconds = np.concatenate([np.arange(start, end) for start, end, _ in rows])
     stamps = MIDNIGHT + seconds * NANOSECONDS
@@ -361,7 +371,7 @@ def write_home(path, rows, probabilities):
         "frame": seconds.astype(np.uint64),
         "label": said,
         "confidence": np.full(len(stamps), 0.5, np.float32),
-        "novelty": np.full(len(stamps), np.nan, np.float32),
+        "novelty": np.full(len(stamps), novelty, np.float32),
         "probabilities": np.array(
             [probabilities(*each) for each in zip(seconds, said, strict=True)], "f4"
         ),
@@ -454,6 +464,35 @@ def test_flicker_is_one_span_and_what_is_too_short_to_be_judged_is_none():
         [third, 2 * third, 25.0, 26.3, 30.0, 35.0]
     )
     assert windows.labels.tolist() == [0, 0, 0, 2, 0, 0]
+
+
+def test_a_short_piece_of_a_border_is_no_span_to_judge_and_a_cough_in_silence_is():
+    silence, water, ring, cough = range(4)
+    windows = judgeable_spans(
+        events(
+            (0, 4 * NANOSECONDS, water),
+            (4 * NANOSECONDS, 47 * NANOSECONDS // 10, ring),
+            (47 * NANOSECONDS // 10, 6 * NANOSECONDS, silence),
+            (6 * NANOSECONDS, 67 * NANOSECONDS // 10, cough),
+            (67 * NANOSECONDS // 10, 9 * NANOSECONDS, silence),
+        )
+    )
+    pieces = border_pieces(windows, np.array([True, False, False, False]))
+    assert windows.labels[pieces].tolist() == [ring]
+
+
+def test_the_reason_of_each_span_is_what_the_queue_is_ranked_by(tmp_path):
+    """Speech is in doubt, and at once as novel as can be."""
+    rows = [(0, 4, "speech"), (4, 8, "coughing")]
+    sources = find_labellings(
+        write_home(tmp_path / "home.mcap", rows, lambda *_: [0.0, 0.6, 0.4], novelty=1.0)
+    )
+    live = sources.read("mic", "live")
+    for ranking, reason in (("uncertain", "uncertainty"), ("novel", "novelty")):
+        queue = make_queue(
+            sources, "mic", live, other=None, reviewed=NONE, count=9, ranking=ranking
+        )
+        assert {span.reason for span in queued(queue, "mic", "live")} == {reason}
 
 
 def test_disagreement_is_the_share_of_the_span_in_which_the_other_says_something_else():

@@ -266,7 +266,7 @@ def test_the_champion_itself_is_compared_with_what_labelled_the_logs():
     champion = Path("models/champion.safetensors")
     champion.unlink()
     champion.symlink_to("alike.safetensors")
-    other = find_champion(Path("models"), [Path("logs")], model.sha256)
+    other = find_champion(Path("models"), [Path("logs")], model)
     assert other is not None
     assert other.name == "one"
 

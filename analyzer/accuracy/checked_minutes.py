@@ -1,6 +1,6 @@
 """Minutes that were drawn at random and gone through: what labels say in them, and what is true."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -181,13 +181,18 @@ def read_checked_minutes(
         What cannot be read is appended.
     """
     reviewed = read_reviewed_labels(logs, labelling, start, end, losses)
-    minutes = [
-        one for one in reviewed if one.span.chosen == RANDOM and start <= one.span.start < end
-    ]
-    return _counted(minutes)
+    return checked_minutes(one for one in reviewed if start <= one.span.start < end)
 
 
-def _counted(minutes: Sequence[ReviewedLabels]) -> CheckedMinutes:
+def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
+    """Count the events of the minutes that were drawn at random, and gone through by a person.
+
+    Parameters
+    ----------
+    reviewed : iterable of ReviewedLabels
+        Others are left out.
+    """
+    minutes = [one for one in reviewed if one.span.chosen == RANDOM]
     names = {
         name for one in minutes for part in (one.labels, one.true) for name in set(part.labels)
     }

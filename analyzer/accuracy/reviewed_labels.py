@@ -45,23 +45,18 @@ class ReviewedLabels(NamedTuple):
     model: str
 
 
-def count_unchanged(logs: HomeLogs, labelling: str, losses: list[str]) -> tuple[int, int]:
+def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
     """Count the spans that a person has looked at, but not because they were drawn at random.
 
     Parameters
     ----------
-    logs : HomeLogs
-    labelling : str
-        `live`, or the name of the model of relabel layers.
-    losses : list of str
-        What cannot be read is appended.
+    reviewed : iterable of ReviewedLabels
 
     Returns
     -------
     unchanged, number : int
         Spans that marks change in less than half, and all.
     """
-    reviewed = read_reviewed_labels(logs, labelling, 0, _EVER, losses)
     spans = [one for one in reviewed if one.span.chosen != RANDOM]
     return sum(2 * _changed(one) < one.span.end - one.span.start for one in spans), len(spans)
 

@@ -86,15 +86,11 @@ def compare_models(
         If the classes of a model are not those of the scenario, the models are for different
         feature sets, or there is no segment.
     """
+    check_features(a, b)
     check_classes(a, scenario)
     check_classes(b, scenario)
     first, second = Classifier(a), Classifier(b)
     features = first.feature_set
-    if features != second.feature_set:
-        raise DataError(
-            f"{a.name} is for feature set {features.name}, {b.name} for {second.feature_set.name}: "
-            "they cannot be compared on the same features; evaluate each of them on clips"
-        )
     data = cut_recordings(recordings, scenario, features)
     if not len(data):
         reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
@@ -126,6 +122,26 @@ def compare_models(
         held_out=not learned.all(),
         skipped=data.skipped,
     )
+
+
+def check_features(a: Model, b: Model) -> None:
+    """Check that two models can be compared on the same features.
+
+    Parameters
+    ----------
+    a, b : Model
+
+    Raises
+    ------
+    DataError
+        If they are for different feature sets.
+    """
+    own, theirs = (one.description.feature_set for one in (a, b))
+    if own != theirs:
+        raise DataError(
+            f"{a.name} is for feature set {own}, {b.name} for {theirs}: they cannot be compared on "
+            "the same features; evaluate each of them on clips"
+        )
 
 
 def _probabilities(classifier: Classifier, inputs: Float32, classes: Sequence[str]) -> Float64:

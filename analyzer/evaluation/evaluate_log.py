@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_cla
 from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import Selection, select
 from hearthlog.analyzer.logs.spans import common, joined
-from hearthlog.analyzer.marks.formats.label_files import read_lines
+from hearthlog.analyzer.marks.label_import import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.schemas.arrays import Int64

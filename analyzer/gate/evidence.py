@@ -184,10 +184,10 @@ def _label(
 def _known_sounds(
     logs: Sequence[RecentLog], losses: list[str]
 ) -> list[tuple[RecentLog, list[Sound]]]:
-    known = []
-    for log in logs:
+    known, paths = [], [log.path for log in logs]
+    for place, log in enumerate(logs, 1):
         try:
-            known.append((log, reference(log.path)))
+            known.append((log, reference(log.path, paths[place:])))
         except (DataError, LogError) as error:
             losses.append(str(error))
     return known

@@ -61,7 +61,7 @@ def judge(
         If the model that labels now cannot be found or used, a feature set is not installed, or the
         judgement cannot be written.
     """
-    champion = find_champion(folder, home, model.sha256)
+    champion = find_champion(folder, home, model)
     evidence, reasons = None, list[str]()
     if champion is None:
         reasons = [f"there are no labels in {_names(home)} to compare its own with"]
@@ -85,7 +85,7 @@ def judge(
     return Verdict(judgement, model.name, "" if champion is None else champion.name, evidence)
 
 
-def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | None:
+def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | None:
     """Find the model that labels a home now.
 
     Parameters
@@ -94,8 +94,8 @@ def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | No
         Folder of models, whose champion it is, unless that is the model that is judged or is gone.
     home : sequence of Path
         Folders of logs, the latest of which it else has labelled.
-    sha256 : str
-        Of the model that is judged.
+    model : Model
+        The one that is judged.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | No
     """
     with suppress(ModelError):
         champion = load(folder, CHAMPION)
-        if champion.sha256 != sha256:
+        if champion.sha256 != model.sha256:
             return champion
     with suppress(LogError):
         for name, labelled_by in find_home_logs(home).latest_models():
@@ -119,7 +119,7 @@ def find_champion(folder: Path, home: Sequence[Path], sha256: str) -> Model | No
                     raise ModelError(
                         f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
                         "nor a starter model of this version: put its file there to compare with "
-                        "it, or insist: `hearthlog models promote --anyway`"
+                        f"it, or insist: `hearthlog models promote {model.name} --anyway`"
                     )
                 return load_model(path)
     return None
@@ -171,7 +171,7 @@ def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgemen
     with suppress(ModelError):
         if load(folder, CHAMPION).sha256 == model.sha256:
             return judgement
-    champion = find_champion(folder, home, model.sha256)
+    champion = find_champion(folder, home, model)
     sha256 = "" if champion is None else champion.sha256
     return judgement if judgement.champion == sha256 else None
 

@@ -68,7 +68,8 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
     Raises
     ------
     DataError
-        If no candidate labelled in these logs, or there are several microphones.
+        If no candidate labelled in these logs, or both models not long enough for a segment, or
+        there are several microphones.
     LogError
         If there is no log.
     """
@@ -85,12 +86,16 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
     logs = [log for log, one in tried if all(one.get(k) == last.get(k) for k in key)]
     sources = find_labellings(*logs)
     name = sources.microphone(microphone)
-    live, candidate = (sources.read(name, each) for each in (LIVE, CANDIDATE))
+    try:
+        live, candidate = (sources.read(name, each) for each in (LIVE, CANDIDATE))
+    except LogError as error:
+        names = f"{last.get('candidate', '')} with {last.get('model', '')}"
+        raise DataError(f"nothing to compare {names} by yet: {error}") from error
     difference = compare_labellings(live, candidate)
     known: list[Sound] = []
-    for log in logs:
+    for place, log in enumerate(logs, 1):
         try:
-            known += reference(log)
+            known += reference(log, logs[place:])
         except LogError as error:
             losses.append(str(error))
     sides = [unified(side.labelling) for side in (live, candidate)]

@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.logs.labellings import Labellings, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, joined, remains
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.schemas.times import NANOSECONDS
 
 _SHORTEST = NANOSECONDS // 2  # sound that counts
+_FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
 class Sound(NamedTuple):
@@ -32,12 +33,14 @@ class Sound(NamedTuple):
     random: bool
 
 
-def reference(log: Path) -> list[Sound]:
+def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
     """Return the sounds of a log whose labels are known.
 
     Parameters
     ----------
     log : Path
+    following : sequence of Path, optional
+        The logs after it, in the order of time: what goes on in the next one is labelled there.
 
     Returns
     -------
@@ -50,7 +53,8 @@ def reference(log: Path) -> list[Sound]:
         If its review layer is damaged, or what was looked at has gone.
     """
     marks, drawn = read_marks(log), _drawn(read_reviewed(log))
-    inside = [sound for span in drawn for sound in _true(log, span, marks)]
+    labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
+    inside = [sound for span in drawn for sound in _true(labellings, span, marks)]
     others = [
         Sound(mark.start, mark.end, mark.label, random=False)
         for mark in marks
@@ -59,12 +63,11 @@ def reference(log: Path) -> list[Sound]:
     return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST]
 
 
-def _true(log: Path, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
+def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
     """Yield what is true of a reviewed span: the labelling, and the marks over it."""
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
         yield Sound(max(mark.start, span.start), min(mark.end, span.end), mark.label, random=True)
-    labellings = find_labellings(log)
     name = labellings.find(span.microphone, span.corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling
     rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))

@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from hearthlog.analyzer.accuracy.checked_minutes import (
     CheckedMinutes,
     ClassCheck,
-    read_checked_minutes,
+    checked_minutes,
 )
 from hearthlog.analyzer.accuracy.count_range import FEWEST
 from hearthlog.analyzer.accuracy.minute_kinds import quiet_weight
-from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged
+from hearthlog.analyzer.accuracy.reviewed_labels import count_unchanged, read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.report.class_words import in_words
+from hearthlog.models.classes import in_words
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.text import number
@@ -29,9 +29,10 @@ class Accuracy:
 
     def __init__(self, logs: HomeLogs) -> None:
         self.losses: list[str] = []
-        self.minutes: CheckedMinutes = read_checked_minutes(logs, LIVE, 0, _EVER, self.losses)
+        reviewed = list(read_reviewed_labels(logs, LIVE, 0, _EVER, self.losses))
+        self.minutes: CheckedMinutes = checked_minutes(reviewed)
         self.weight = quiet_weight(logs, LIVE, self.minutes.sounding)
-        self.right, self.looked_at = count_unchanged(logs, LIVE, self.losses)
+        self.right, self.looked_at = count_unchanged(reviewed)
 
     def lines(self) -> Iterator[str]:
         """Say what was checked, and how much of it was right."""

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -72,10 +73,15 @@ def _candidate(summary: "Summary", path: Path) -> str | None:
 
     if not any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics):
         return None
-    records = find_home_logs([path]).records()
-    record = next((one for one in records if one.get("candidate")), {})
-    name, sha256 = record.get("candidate", "unknown"), record.get("candidate_sha256", "")
-    return f"candidate: {name} ({sha256[:12]}), on trial: `hearthlog models compare --live`"
+    later: set[str] = set()  # recorders that had no candidate any more
+    for record in find_home_logs([path]).records():
+        node = record.get("node", "")
+        if name := record.get("candidate"):
+            sha256, was = record.get("candidate_sha256", "")[:12], "was " * (node in later)
+            compare = f"hearthlog models compare --live --logs {quote(str(path))}"
+            return f"candidate: {name} ({sha256}), {was}on trial: `{compare}`"
+        later.add(node)
+    return None
 
 
 def _accuracy(summary: "Summary", path: Path) -> "Accuracy | None":

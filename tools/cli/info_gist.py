@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.logs.summary import Summary
-from hearthlog.analyzer.report.class_words import in_words
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import REVIEW

@@ -98,7 +98,7 @@ def compare(
     Sources that one of them has learned from are left out. Exit status 3: there are no others. Of
     logs it is also said how much of a day each model gives to each class.
     """
-    from hearthlog.analyzer.evaluation.compare_models import compare_models
+    from hearthlog.analyzer.evaluation.compare_models import check_features, compare_models
     from hearthlog.analyzer.training.scenario import load_scenario, scenario_of
     from hearthlog.models.features.installed import feature_set
 
@@ -111,12 +111,15 @@ def compare(
         wrong_use("give either --data or --logs, or --live")
     place = models_folder(folder)
     first, second = _named(place, a), _named(place, b)
+    check_features(first, second)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     features = feature_set(first.description.feature_set)
     recordings = _recordings(data, logs, chosen, features)
     if logs is not None and not recordings:
         tell("nothing is marked: it is said how the models differ, not which is better")
         shares = _minutes_in_logs(first, second, logs)
+        if not shares:
+            tell("there are no recent logs that they have not learned from: record for some hours")
         if as_json:
             print(json.dumps({"said": _shares_json(shares)}, indent=2))
         else:
@@ -164,6 +167,8 @@ def promote(
     place = models_folder(folder)
     if to == "champion":
         _check_harmless(place, name, logs or [_logs_folder()], anyway=anyway)
+    else:
+        _check_beside_champion(place, name)
     model, before = promote_model(place, name, to)
     if model.name == before:
         print(f"{model.name} is the {to} already")
@@ -200,6 +205,24 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
         judgement = verdict.judgement
     if not judgement.may_label:
         raise ModelError(refusal(judgement, model.name))
+
+
+def _check_beside_champion(folder: Path, name: str) -> None:
+    """End with a line if a candidate cannot label what the champion does, if there is one."""
+    from hearthlog.models.errors import ModelError
+    from hearthlog.models.modelfile.registry import CHAMPION, load
+
+    model = load(folder, name)
+    try:
+        champion = load(folder, CHAMPION)
+    except ModelError:
+        return
+    own, theirs = (one.description.feature_set for one in (model, champion))
+    if own != theirs:
+        raise ModelError(
+            f"{model.name} is for feature set {own}, and {champion.name}, the champion, for "
+            f"{theirs}: it cannot label beside it"
+        )
 
 
 def _compare_live(logs: Path, *, as_json: bool) -> None:
@@ -263,14 +286,17 @@ def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
 
 
 def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
-    """Return how many minutes of a mean day each model gives to each class."""
+    """Return how many minutes of a mean day each model gives to each class, where that is seen."""
     from hearthlog.analyzer.gate.changes import time_words
     from hearthlog.analyzer.gate.evidence import gather_evidence
     from hearthlog.analyzer.gate.recent_time import recent_logs
     from hearthlog.tools.cli.progress import share_done
 
     with share_done("listening to the logs with both") as report:
-        changes = gather_evidence(a, b, recent_logs([logs]), report).changes
+        evidence = gather_evidence(a, b, recent_logs([logs]), report)
+    if not evidence.minutes:
+        return []
+    changes = evidence.changes
     times = zip(changes.classes, changes.before.tolist(), changes.after.tolist(), strict=True)
     return [
         _ClassShare(name, before, after, time_words(before), time_words(after))
@@ -304,16 +330,17 @@ def _print_shares(
     rows = []
     for name in names:
         time = times.get(name, _ClassShare(name, 0.0, 0.0, "", ""))
-        scores = [share(one[name]) if name in one else "" for one in f1]
-        if any(scores) or time.a or time.b:
-            rows.append((name, *scores, time.a_text, time.b_text))
+        scores = [one.get(name) for one in f1]
+        if any(score is not None for score in scores) or time.a or time.b:
+            rows.append((name, *map(share, scores), time.a_text, time.b_text))
     if comparison is not None:
         totals = [(one.scores.macro_f1, one.expected_calibration_error) for one in sides]
         macro, calibration = zip(*totals, strict=True)
         rows += [("macro F1", *map(share, macro), "", "")]
         rows += [("calibration error", *map(share, calibration), "", "")]
-    head = () if comparison is None else (f"F1 {a}", f"F1 {b}")
-    print_table(("", *head, f"{a} says", f"{b} says"), rows)
+    head = ["", *(f"F1 {side.name}" for side in sides), f"{a} says", f"{b} says"]
+    columns = len(head) if shares else len(head) - 2
+    print_table(head[:columns], [row[:columns] for row in rows])
 
 
 def _verdict(comparison: "Comparison") -> str:

@@ -58,7 +58,7 @@ def _verdict(trial: Trial) -> str:
     if not random.sounds:
         return (
             "no minutes drawn at random are reviewed since: which is better cannot be told; "
-            "`hearthlog review LOGS --queue` asks for some"
+            "`hearthlog review logs --queue` asks for some"
         )
     low, high = gain_interval(random)
     where = f"right where {trial.champion} is not {random.gained} times, the reverse {random.lost}"
