@@ -7,7 +7,6 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Callable
-from datetime import UTC
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -170,7 +169,7 @@ def by_timeline(_: Run) -> Any:
 
 
 def by_watching(_: Run) -> Any:
-    live = LiveTimeline(UTC)
+    live = LiveTimeline()
     logs = [path for path in find_logs(Path("logs")) if not is_layer(path)]
     return [
         plain(news)

@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from hearthlog.analyzer.colours import colour
-from hearthlog.analyzer.report.class_words import in_words, several_in_words
+from hearthlog.analyzer.report.class_words import several_in_words
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.transitions import (
     default_transitions,
@@ -19,6 +19,7 @@ from hearthlog.models.classes import (
     CLASSES,
     class_name,
     find_class,
+    in_words,
     meant_by,
     translation,
 )

@@ -285,6 +285,7 @@ def make_home(folder):
     (folder / "labels.txt").write_text("2.0\t9.0\tspeech\n11.0\t14.5\tcoughing\n")
     for name in ("day.txt", "ten.txt"):
         shutil.copy("labels.txt", name)
+    write_foreign_labels(folder)
     do("annotate import logs labels.txt")
     shutil.copytree("logs", "homes/anna")
     made.write_esc50(folder / "ESC-50-master")
@@ -305,6 +306,26 @@ def make_home(folder):
     for name in ("a.mcap", "b.mcap"):
         shutil.copy(log, name)
     (folder / "damaged.mcap").write_bytes(log.read_bytes()[:-5000])
+
+
+def write_foreign_labels(folder):
+    """Write label files of other programs, and what their labels mean."""
+    (folder / "labels.toml").write_text('Cough = "coughing"\nSPEAKER_00 = "speech"\n')
+    (folder / "noises.txt").write_text("2,0\t9,0\tCough\n")
+    (folder / "day.BirdNET.results.csv").write_text(
+        "Start (s),End (s),Scientific name,Common name\n2,5,,Cough\n"
+    )
+    (folder / "regions.csv").write_text("2.0,1,7.0,speech\n")
+    (folder / "day.rttm").write_text("SPEAKER day 1 2.0 7.0 <NA> <NA> SPEAKER_00 <NA> <NA>\n")
+    times = "".join(
+        f'<TIME_SLOT TIME_SLOT_ID="t{time}" TIME_VALUE="{time}000"/>' for time in (2, 9)
+    )
+    (folder / "sounds.eaf").write_text(
+        f"<ANNOTATION_DOCUMENT><TIME_ORDER>{times}</TIME_ORDER>"
+        '<TIER TIER_ID="sounds"><ANNOTATION><ALIGNABLE_ANNOTATION ANNOTATION_ID="a" '
+        'TIME_SLOT_REF1="t2" TIME_SLOT_REF2="t9"><ANNOTATION_VALUE>speech</ANNOTATION_VALUE>'
+        "</ALIGNABLE_ANNOTATION></ANNOTATION></TIER></ANNOTATION_DOCUMENT>"
+    )
 
 
 def do_copy(source, target):

@@ -21,6 +21,7 @@ from hearthlog.analyzer.review.queue.random_minutes import (
     draw_minutes,
     whole_minutes,
 )
+from hearthlog.analyzer.review.queue.ranking import worth
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model, span_sounds
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
@@ -145,6 +146,16 @@ def test_of_too_many_spans_those_that_weigh_more_are_kept_more_often():
     assert (rows.tolist(), shares.tolist()) == ([1, 2], [2.0, 1.0])
 
 
+def test_a_span_of_a_rare_class_weighs_more_and_all_of_a_common_class_too():
+    starts = np.arange(10) * 10 * NANOSECONDS
+    labels = np.repeat([0, 1], [8, 2])
+    spans = JudgeableSpans(starts, starts + 2 * NANOSECONDS, labels, np.arange(10))
+    common, rare = np.split(worth(spans, np.zeros(10)), [8])
+    assert rare == pytest.approx(np.full(2, 2 * common[0]))
+    assert common.sum() == pytest.approx(2 * rare.sum())
+    assert worth(spans, np.where(labels, 0.1, 0.9))[0] > worth(spans, np.full(10, 0.1))[0]
+
+
 def test_alike_sounds_are_near_with_the_model_and_without_it(recorded):
     sources = find_labellings(recorded)
     said = sources.read(*LIVE).labelling
@@ -257,6 +268,19 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     before = written(home, read_reviewed)
     again = run(capfd, "annotate", "import", home, path)
     assert (again.returncode, written(home, read_reviewed)) == (0, before)
+
+
+def test_labels_where_a_queue_did_not_ask_are_told_apart(home, tmp_path, capfd):
+    path = tmp_path / "ten.txt"
+    run(capfd, "review", home, "--queue", "--save", path)
+    zero = find_coverage(home)["mic"].starts[0]
+    first = min(item.start for item in items(home))
+    end = (first - zero) / NANOSECONDS
+    assert end > 0.5
+    path.write_text(f"{end - 0.5}\t{end}\tmusic\n{path.read_text()}")
+    done = run(capfd, "annotate", "import", home, path)
+    assert f"1 mark in no span of {path.with_suffix('.queue.csv')}: of your own" in done.stderr
+    assert "8 spans of the queue, 2 minutes drawn at random" in done.stderr
 
 
 def test_a_list_of_a_saved_queue_is_gone_through_as_it_was_chosen(home, tmp_path, capfd):

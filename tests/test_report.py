@@ -276,6 +276,19 @@ def test_what_a_reviewer_says_replaces_what_the_model_said_and_is_certain(tmp_pa
     assert day.count("crying").labelled == 1
 
 
+def test_what_no_model_listens_for_is_not_said_to_be_absent_though_a_person_marked_it(tmp_path):
+    earlier = DAY - timedelta(days=1)
+    logs = write_day(tmp_path / "logs", earlier, hours=[10])
+    write_day(tmp_path / "logs", DAY)
+    start = midnight(earlier) + 10 * HOUR * NANOSECONDS
+    write_marks(logs[0], [Mark("mic", start + 10**9, start + 61 * 10**9, "flushing_water")])
+    assert look(tmp_path / "logs").count("flushing_water") is None
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "Not heard: talking" in page
+    assert "toilet flush" not in re.search("Not heard: [^<]*", page)[0]
+    assert "Cannot be told: the model of this home does not know these sounds" in page
+
+
 def test_a_relabelling_is_read_in_place_of_what_the_recorder_said(tmp_path):
     log, *_ = write_day(tmp_path, DAY, [(at("10:00"), 60, "crying", 0.6)], hours=[10])
     layer = log.with_name(f"{log.stem}.relabel-new-2.mcap")

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -245,6 +246,7 @@ class Screen:
         self.at = None
         self.answers = self.draws = True
         self.shown = []
+        self.asked = []
         self.played = []
         self.lane = None
 
@@ -263,14 +265,17 @@ class Screen:
         self.marked = (start, end)
         self.shown.append((start, end, margin))
 
+    def ask(self, start, end, text):
+        self.asked.append((start, end, text))
+
     def play(self, start):
         self.played.append(start)
 
-    def redraw_marks(self, microphone, marks):
+    def redraw_marks(self, microphone, marks, reviewed):
         assert microphone == "mic"
         if not self.draws:
             raise TimeoutError
-        self.lane = as_rows(marks)
+        self.lane, self.reviewed = as_rows(marks), as_rows(reviewed)
 
 
 class Sitting:
@@ -458,6 +463,19 @@ def test_in_a_queue_the_span_that_is_dragged_counts(home):
     assert [(m.start, m.end) for m in layers(home)] == [(START + SECOND, START + 2 * SECOND)]
 
 
+def test_undo_in_a_queue_goes_back_to_the_span_that_was_undone(home):
+    items = items_of(4)
+    sitting = Sitting(home, items)
+    assert sitting.run("2n3z" + "1") == 2
+    shown = [start for start, _, _ in sitting.screen.shown]
+    assert shown == [items[k].start for k in (0, 1, 2, 3, 2, 3)]
+    assert [(m.start, m.label) for m in layers(home)] == [
+        (items[0].start, "speech"),
+        (items[2].start, "silence"),
+    ]
+    assert sitting.screen.asked[-2] == (*items[2][:2], "music? 5.0 s")
+
+
 def minute_of(start):
     return ReviewItem(start, start + 60 * SECOND, "speech", "a minute", RANDOM)
 
@@ -543,13 +561,13 @@ def test_every_key_is_offered_once_with_what_it_does(home):
 
 def test_the_sound_of_a_span_is_that_of_the_clips_in_it():
     clips = [
-        SoundClip(START, 100, np.arange(500, dtype=np.float32)),
-        SoundClip(START + 10 * SECOND, 100, np.arange(1000, 1500, dtype=np.float32)),
-        SoundClip(START + 11 * SECOND, 44_100, np.zeros(5, np.float32)),
+        SoundClip(START, 100, np.arange(500, dtype=np.int16)),
+        SoundClip(START + 10 * SECOND, 100, np.arange(1000, 1500, dtype=np.int16)),
+        SoundClip(START + 11 * SECOND, 44_100, np.zeros(5, np.int16)),
     ]
     rate, samples = sound_of(clips, START + 4 * SECOND, START + 12 * SECOND)
     assert rate == 100
-    assert samples.tolist() == [*range(400, 500), *range(1000, 1200)]
+    assert (samples * 32768).tolist() == [*range(400, 500), *range(1000, 1200)]
     assert len(sound_of(clips, START + 6 * SECOND, START + 7 * SECOND)[1]) == 0
 
 
@@ -748,9 +766,9 @@ def programs_of(review):
 
 
 def listening(processes):
-    """Addresses at which processes listen."""
+    """Addresses and ports at which processes listen."""
     return {
-        connection.laddr.ip
+        (connection.laddr.ip, connection.laddr.port)
         for process in processes
         for connection in process.net_connections("inet")
         if connection.status == psutil.CONN_LISTEN
@@ -760,8 +778,11 @@ def listening(processes):
 def check_privacy(review):
     """Check that nothing is sent, and that only this machine is listened to."""
     processes = programs_of(review)
-    assert listening(processes) == {"127.0.0.1"}
     (viewer,) = [process for process in processes if process.name() == "rerun"]
+    (hidden,) = {address for address, _ in listening([viewer])}
+    assert hidden.startswith("127.")
+    assert hidden != "127.0.0.1"
+    assert {address for address, _ in listening(processes)} <= {"127.0.0.1", hidden}
     configuration = Path(viewer.environ()["XDG_CONFIG_HOME"], "rerun", "analytics.json")
     assert json.loads(configuration.read_text())["analytics_enabled"] is False
 
@@ -814,6 +835,25 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
             assert review.process.wait(60) == 0
+
+
+def test_a_page_that_lets_its_name_point_to_this_machine_reads_nothing(home, tmp_path):
+    rebound = ["--host-resolver-rules=MAP stranger.test 127.0.0.1"]
+    with reviewing(home, "--web", BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        ours = line[line.index("http:") :].split()[0]
+        with browsing(ours, tmp_path / "reviewer"):
+            review.wait_for("drag a span")
+            ports = {port for _, port in listening(programs_of(review))}
+            assert len(ports) == 3  # data, files of the viewer, page
+            with browsing("about:blank", tmp_path / "stranger", flags=rebound) as page:
+                answering = []
+                for port in ports:
+                    found = page.call("Page.navigate", url=f"http://stranger.test:{port}/")
+                    answering += [] if "errorText" in found else [port]
+                assert answering == [urlsplit(ours).port]
+                page.call("Page.navigate", url=ours.replace("127.0.0.1", "stranger.test"))
+                assert "404" in patiently(lambda: page.evaluate("document.body.textContent"), bool)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -5,13 +5,14 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from itertools import pairwise
 from threading import Event as Flag
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
+import rerun as rr
 from blobs import blobs
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,23 +22,31 @@ from rerun.chunk import RrdReader
 from spliced import run, write_log
 from viewers import rerun_home, shown, viewer
 
-from hearthlog.analyzer.colours import GAP, colour
+from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
-from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans, time_shares
-from hearthlog.analyzer.review.timeline.lanes import changes, clock
+from hearthlog.analyzer.review.timeline.disagreements import disagreements
+from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
+from hearthlog.analyzer.review.timeline.home_clock import home_clock
+from hearthlog.analyzer.review.timeline.lanes import reviewed_lane, timeline_lanes
 from hearthlog.analyzer.review.timeline.model import (
     GridSeries,
     LabelledSpans,
     LabellingTimeline,
+    LogLines,
+    MicrophoneTimeline,
+    Timeline,
     no_spans,
 )
-from hearthlog.analyzer.review.timeline.overview import BLOCKS, disagreements, overview
 from hearthlog.analyzer.review.timeline.plots import timeline_plots
 from hearthlog.analyzer.review.timeline.read_timeline import SHARES, read_timeline
+from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.analyzer.review.viewer.drawing import DrawnLane
 from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.models.classes import in_words
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
@@ -352,8 +361,9 @@ def test_names_of_classes_that_are_markup_or_paths_are_only_names(tmp_path):
     path = labels_log(tmp_path / "a.mcap", {"probabilities": hostile}, 2000, 3)
     timeline = read_timeline([path])
     save_timeline(timeline, tmp_path / "a.rrd")
-    assert lane(tmp_path / "a.rrd", "/exact/mic/1_live")[0] == (START, hostile[0])
-    assert set(entities(tmp_path / "a.rrd")) >= {"/mic/live/shares/0", "/lanes/mic/1_live"}
+    strip = "/mic/lanes/live/00/1/000000"
+    assert fixed(tmp_path / "a.rrd", strip, "SeriesLines:names") == [in_words(hostile[0])]
+    assert "/mic/live/shares" in entities(tmp_path / "a.rrd")
 
 
 def test_a_damaged_log_is_a_loss_and_the_others_are_shown(tmp_path, folder):
@@ -463,8 +473,8 @@ def test_kept_sound_is_chained_to_clips_that_are_heard_where_they_were(tmp_path)
     one, two = read_timeline([labels]).microphones["mic"].clips
     assert (one.start, one.end) == (times[0], times[1] + SECOND // 2)
     assert (two.start, two.rate) == (times[2], 16_000)
-    np.testing.assert_array_equal(one.samples, samples[:24_000].astype(np.float32))
-    np.testing.assert_array_equal(two.samples, samples[24_000:].astype(np.float32))
+    np.testing.assert_array_equal(one.samples, samples[:24_000] * 32768)
+    np.testing.assert_array_equal(two.samples, samples[24_000:] * 32768)
 
 
 def test_of_more_sound_than_can_be_shown_the_first_is_shown_and_the_rest_a_loss(
@@ -545,33 +555,7 @@ def labelled(draw, grid, names="abc"):
     return LabelledSpans(*columns, np.array(texts, object))
 
 
-@given(grids(), st.data())
-def test_shares_of_time_are_those_that_a_loop_adds_up(grid, data):
-    spans = data.draw(labelled(grid))
-    labels = np.array(["abc".index(text) for text in spans.texts], np.intp)
-    found = time_shares(spans.starts, spans.ends, labels, 3, grid)
-    expected = np.zeros((grid.count, 3))
-    for i, (first, last) in enumerate(pairwise(grid.edges.tolist())):
-        for start, end, text in as_list(spans):
-            inside = max(min(end, last) - max(start, first), 0)
-            expected[i, "abc".index(text)] += inside / (last - first)
-    slack = 1e-9 + 600 * (grid.end + 1) / 2**53 / np.diff(grid.edges).min()
-    np.testing.assert_allclose(found, expected, atol=slack)
-
-
 # Lanes
-
-
-@given(grids(), st.data())
-def test_a_lane_is_at_every_time_what_the_spans_say(grid, data):
-    spans = data.draw(labelled(grid))
-    lane_ = changes(spans)
-    assert (np.diff(lane_.times) > 0).all()
-    probes = {*spans.starts.tolist(), *spans.ends.tolist(), grid.start, *(spans.ends - 1).tolist()}
-    for time in probes:
-        said = [text for a, b, text in as_list(spans) if a <= time < b]
-        place = int(np.searchsorted(lane_.times, time, side="right")) - 1
-        assert (lane_.states[place] if place >= 0 else None) == (said[0] if said else None)
 
 
 @given(grids(), st.data())
@@ -583,7 +567,7 @@ def test_labellings_differ_where_both_say_something_else(grid, data):
     )
     for time in edges:
         said = [[t for a, b, t in as_list(spans) if a <= time < b] for spans in (one, other)]
-        expected = [f"{a} / {b}" for a, b in zip(*said, strict=False) if a != b]
+        expected = [b for a, b in zip(*said, strict=False) if a != b]
         assert [text for a, b, text in found if a <= time < b] == expected
     assert all(a < b for a, b, _ in found)
     assert all(a[1] <= b[0] for a, b in pairwise(found))
@@ -595,51 +579,78 @@ def test_two_names_of_one_sound_are_no_difference():
     other = LabelledSpans(
         times[:-1], times[1:], np.array(["crying_sobbing", "shout", "music"], object)
     )
-    assert as_list(disagreements(one, other)) == [(10, 20, "speech / shout")]
+    assert as_list(disagreements(one, other)) == [(10, 20, "shout")]
 
 
-def test_from_afar_a_block_says_what_was_heard_the_most_and_silence_counts_a_quarter():
-    grid = Grid(START, START + BLOCKS * 100 * SECOND, SHARES)
-    rng = np.random.default_rng(2)
-    edges = np.sort(rng.choice(np.arange(1, BLOCKS * 100), 3000, replace=False))
-    starts, ends = START + edges[:-1] * SECOND, START + edges[1:] * SECOND
-    texts = rng.choice(["silence", "silence", "silence", "speech", "crying"], len(starts))
-    heard = rng.random(len(starts)) < 0.8
-    spans = LabelledSpans(starts[heard], ends[heard], texts[heard].astype(object))
-    found = overview(LabellingTimeline("live", spans), grid)
-    assert all(a[1] < b[0] or a[2] != b[2] for a, b in pairwise(as_list(found)))
-    block = (grid.end - grid.start) // BLOCKS
-    for i in range(BLOCKS):
-        first, last = grid.start + i * block, grid.start + (i + 1) * block
-        weights = Counter()
-        for a, b, text in as_list(spans):
-            if a < last and b > first:
-                inside = min(b, last) - max(a, first)
-                weights[text] += inside * (0.25 if text == "silence" else 1.0)
-        middle = (first + last) // 2
-        said = [text for a, b, text in as_list(found) if a <= middle < b]
-        best = weights.most_common(2)
-        if len(best) == 2 and best[0][1] - best[1][1] < SECOND // 100:
-            assert said[0] in weights
-        else:
-            assert said == [text for text, _ in best[:1]]
+def spans_at(*rows):
+    """Spans of (start, end, text), in seconds."""
+    starts, ends, texts = zip(*rows, strict=True)
+    times = (np.array(column) * SECOND for column in (starts, ends))
+    return LabelledSpans(*times, np.array(texts, object))
 
 
-def test_from_afar_a_labelling_without_spans_is_what_was_most_probable():
-    grid = Grid(START, START + 2400 * SECOND, 2400)
-    values = np.full((2400, 2), np.nan)
-    values[:600] = [0.2, 0.8]
-    values[1200:] = [0.9, 0.1]
-    found = overview(LabellingTimeline("m", no_spans(), GridSeries(("a", "b"), values)), grid)
-    assert found.texts.tolist() == ["b", "a"]
-    near = 2 * 2400 // BLOCKS * SECOND
-    expected = [START, START + 600 * SECOND, START + 1200 * SECOND, grid.end]
-    np.testing.assert_allclose(
-        [found.starts[0], found.ends[0], found.starts[1], found.ends[1]],
-        expected,
-        atol=near,
-        rtol=0,
+def lanes_of(*labellings, **more):
+    """The lanes of a microphone, as (labelling, name, spans)."""
+    nothing = dict.fromkeys(("reviewed", "gaps", "troubles"), no_spans())
+    empty = dict.fromkeys(("features", "level", "floor")) | {"level_frames": [], "clips": []}
+    microphone = MicrophoneTimeline("mic", list(labellings), **(nothing | empty | more))
+    lines = LogLines(*(np.empty(0, kind) for kind in (np.int64, np.int64, object)))
+    timeline = Timeline(Grid(0, 100 * SECOND, 10), {"mic": microphone}, lines, "UTC", {})
+    return [(lane.labelling, lane.name, as_list(lane.spans)) for lane in timeline_lanes(timeline)]
+
+
+def knowing(*classes):
+    return GridSeries(classes, np.zeros((10, len(classes))))
+
+
+def test_rare_classes_are_on_top_and_what_was_not_heard_is_below():
+    spans = spans_at(
+        (0, 30, "speech"), (30, 31, "coughing"), (31, 90, "silence"), (90, 95, "music")
     )
+    classes = knowing("silence", "speech", "shower", "music", "coughing")
+    found = lanes_of(LabellingTimeline("live", spans, classes))
+    assert [name for _, name, _ in found] == ["Coughing", "Music", "Talking", "Shower", "Reviewed"]
+    assert found[0][2] == [(30 * SECOND, 31 * SECOND, "Coughing")]
+    assert found[3][2] == []
+
+
+def test_two_spellings_of_a_class_share_a_lane():
+    spans = spans_at((0, 1, "crying"), (2, 3, "crying_sobbing"), (4, 5, "my_own"))
+    found = lanes_of(LabellingTimeline("live", spans))
+    assert [(name, len(rows)) for _, name, rows in found[:2]] == [("My own", 1), ("Crying", 2)]
+
+
+def test_a_candidate_has_lanes_of_its_own_and_one_for_where_it_differs():
+    live = LabellingTimeline("live", spans_at((0, 10, "speech"), (10, 20, "music")))
+    other = LabellingTimeline("candidate", spans_at((0, 10, "speech"), (10, 20, "crying")))
+    found = lanes_of(live, other)
+    assert ("candidate", "Crying", [(10 * SECOND, 20 * SECOND, "Crying")]) in found
+    assert ("candidate", "Music", []) in found
+    assert ("", "candidate differs", [(10 * SECOND, 20 * SECOND, "Crying")]) in found
+    assert [name for mine, name, _ in found if mine == "live"] == ["Crying", "Music", "Talking"]
+
+
+def test_marks_lie_in_the_lane_of_what_is_reviewed():
+    marks = LabellingTimeline("review", spans_at((5, 6, "yelling")))
+    found = lanes_of(marks, reviewed=spans_at((0, 60, "random")))
+    rows = [(0, 60 * SECOND, "Reviewed"), (5 * SECOND, 6 * SECOND, "Shouting")]
+    assert found == [("", "Reviewed", rows)]
+
+
+def test_what_was_not_heard_has_a_lane_while_the_recorder_is_off_too(tmp_path, model_file, day):
+    for hour in (7, 9):
+        settings = Settings(output=tmp_path, model=model_file)
+        start = at(2026, 3, 1, hour, zone="UTC")
+        record(settings, settings.microphone[0], LossySource(FileSource([day], start), {}), Flag())
+    timeline = read_timeline([tmp_path], *(at(2026, 3, 1, hour, zone="UTC") for hour in (6, 12)))
+    ends = timeline.coverage["mic"].ends
+    off = [(6, 7), (ends[0], 9), (ends[1], 12)]
+    expected = [tuple(t if t > 24 else at(2026, 3, 1, t, zone="UTC") for t in span) for span in off]
+    (lane,) = [lane for lane in timeline_lanes(timeline) if lane.name == "Not heard"]
+    assert [row[:2] for row in as_list(lane.spans)] == expected
+
+
+# The clock of the home
 
 
 def at(*moment, zone):
@@ -647,44 +658,30 @@ def at(*moment, zone):
 
 
 @pytest.mark.parametrize(
-    ("zone", "day", "hours"),
+    ("zone", "day", "name"),
     [
-        ("UTC", (2026, 3, 1), 24),
-        ("Europe/Vienna", (2026, 3, 29), 23),
-        ("Europe/Vienna", (2026, 10, 25), 25),
-        ("Asia/Kolkata", (2026, 3, 29), 24),
-        ("Australia/Lord_Howe", (2026, 4, 5), 24.5),
-        ("Australia/Lord_Howe", (2026, 10, 4), 23.5),
+        ("UTC", (2026, 3, 1), "clock of the home (UTC)"),
+        ("Europe/Vienna", (2026, 3, 1), "clock of the home (UTC+01:00)"),
+        ("Europe/Vienna", (2026, 7, 1), "clock of the home (UTC+02:00)"),
+        ("Asia/Kolkata", (2026, 3, 29), "clock of the home (UTC+05:30)"),
+        ("America/New_York", (2026, 1, 5), "clock of the home (UTC-05:00)"),
+        ("Europe/Vienna", (2026, 3, 29), "clock of the home (UTC+02:00 throughout)"),
+        ("Europe/Vienna", (2026, 10, 25), "clock of the home (UTC+01:00 throughout)"),
     ],
 )
-def test_the_clock_shows_full_hours_of_the_home_on_days_of_any_length(zone, day, hours):
-    start = at(*day, zone=zone)
-    grid = Grid(start, start + round(hours * HOUR), SHARES)
-    found = clock(grid, ZoneInfo(zone))
-    assert (found.starts[0], found.ends[-1]) == (grid.start, grid.end)
-    np.testing.assert_array_equal(found.ends[:-1], found.starts[1:])
-    assert (np.diff(found.starts) > 0).all()
-    wall = [
-        datetime.fromtimestamp(t // SECOND, UTC).astimezone(ZoneInfo(zone)) for t in found.starts
-    ]
-    assert [f"{moment:%H:%M}" for moment in wall] == list(found.texts)
-    assert all(moment.minute in {0, 30} for moment in wall)
-    assert set(found.ends - found.starts) <= {HOUR // 2, HOUR, HOUR * 3 // 2, 2 * HOUR}
-    assert found.texts[0] == "00:00"
-    assert found.texts[-1] == "23:00"
-    assert len(found) >= 23
-
-
-@given(st.integers(0, 2**60), st.integers(1, 40 * 86_400 * SECOND))
-def test_the_clock_has_few_blocks_and_covers_all(start, length):
-    grid = Grid(start, start + length, SHARES)
-    found = clock(grid, ZoneInfo("Europe/Vienna"))
-    assert len(found) <= 42
-    assert (found.starts[0], found.ends[-1]) == (grid.start, grid.end)
-    assert (found.ends > found.starts).all()
+def test_the_axis_shows_the_clock_of_the_home_and_its_name_says_so(zone, day, name):
+    start, end = day_span(date(*day), ZoneInfo(zone))
+    clock = home_clock(ZoneInfo(zone), start, end)
+    assert clock.name == name
+    noon = at(*day, 12, zone=zone)
+    shown = datetime.fromtimestamp(clock.shown(noon) // SECOND, UTC)
+    assert (shown.year, shown.month, shown.day, shown.hour) == (*day, 12)
+    assert clock.utc(clock.shown(noon)) == noon
 
 
 # What is in the recording
+
+AXIS = "clock of the home (UTC)"
 
 
 def entities(path):
@@ -698,7 +695,7 @@ def column(path, entity, name):
     for chunk in RrdReader(path).stream():
         if str(chunk.entity_path) == entity and not chunk.is_static:
             batch = chunk.to_record_batch()
-            times += batch.column("time").cast("int64").to_pylist()
+            times += batch.column(AXIS).cast("int64").to_pylist()
             cells += batch.column(name).to_pylist()
     order = np.argsort(times, kind="stable")
     return np.array(times)[order], [cells[i] for i in order]
@@ -712,52 +709,74 @@ def fixed(path, entity, name):
     return cell
 
 
-def lane(path, entity):
-    """States as (time, text), None where nothing is."""
-    times, cells = column(path, entity, "StateChange:state")
-    return [(int(time), cell[0] if cell else None) for time, cell in zip(times, cells, strict=True)]
+def test_everything_is_in_the_recording_and_nothing_else(recording, timeline):
+    expected = {"/mic/live/shares", "/mic/live/novelty", "/mic/level", "/mic/floor"}
+    expected |= {"/mic/features", "/events", "/mic/frames/live", "/mic/frames/level"}
+    names = {lane.name for lane in timeline_lanes(timeline)}
+    expected |= {"/words/nothing", *(f"/mic/words/{number:02}" for number in range(len(names)))}
+    views = ("How_probable_each_class_is/live", "Level", "Novelty", "Features")
+    expected |= {f"/mic/words/{view}" for view in views}
+    found = {name for name in entities(recording) if "/lanes/" not in name}
+    assert found == expected
 
 
-def test_everything_is_in_the_recording_and_nothing_else(recording):
-    lanes = ["0_Etc-UTC", "mic/1_live", "mic/8_review", "mic/9_not_heard"]
-    expected = {f"/{root}/{name}" for root in ("lanes", "exact") for name in lanes}
-    expected |= {f"/mic/live/shares/{layer}" for layer in range(4)}
-    expected |= {"/mic/live/novelty", "/mic/level", "/mic/floor", "/mic/features", "/events"}
-    expected |= {"/mic/frames/live", "/mic/frames/level"}
-    assert entities(recording) == expected
+def test_every_sound_is_a_strip_in_the_lane_of_its_class_and_in_its_colour(recording, timeline):
+    strips = {name for name in entities(recording) if "/lanes/" in name}
+    names = list(dict.fromkeys(lane.name for lane in timeline_lanes(timeline)))
+    drawn = set()
+    for entity in strips:
+        _, _, labelling, number, _, _ = entity.strip("/").split("/")
+        times, heights = column(recording, entity, "Scalars:scalars")
+        (text,) = fixed(recording, entity, "SeriesLines:names")
+        (shade,) = fixed(recording, entity, "SeriesLines:colors")
+        red, green, blue = shade >> 24, shade >> 16 & 255, shade >> 8 & 255
+        place = len(names) - int(number) - 0.5
+        assert [height for (height,) in heights[1:3]] == [place, place]
+        for start, end in zip(times[1::4].tolist(), times[2::4].tolist(), strict=True):
+            drawn.add((labelling, names[int(number)], start, end, text, (red, green, blue)))
+    expected = {
+        (lane.labelling or "all", lane.name, start, end, text, lane.colours[text])
+        for lane in timeline_lanes(timeline)
+        for start, end, text in as_list(lane.spans)
+    }
+    assert drawn == expected
+    assert {text for _, _, _, _, text, _ in drawn} >= {"Shouting", "My own", "Not heard"}
 
 
-@pytest.mark.parametrize("root", ["lanes", "exact"])
-def test_lanes_are_what_the_timeline_says_in_the_colours_of_the_classes(recording, timeline, root):
-    live, review = timeline.microphones["mic"].labellings
-    spans = live.spans if root == "exact" else overview(live, timeline.grid)
-    expected = changes(spans)
-    found = lane(recording, f"/{root}/mic/1_live")
-    assert found == list(zip(expected.times.tolist(), expected.states, strict=True))
-    marks = changes(review.spans)
-    found = lane(recording, f"/{root}/mic/8_review")
-    assert found == list(zip(marks.times.tolist(), marks.states, strict=True))
-    names = fixed(recording, f"/{root}/mic/1_live", "StateConfiguration:values")
-    colours = fixed(recording, f"/{root}/mic/1_live", "StateConfiguration:colors")
-    assert set(names) >= {*live.spans.texts, *review.spans.texts}
-    assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [colour(n) for n in names]
-    gap = fixed(recording, f"/{root}/mic/9_not_heard", "StateConfiguration:colors")
-    assert {(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in gap} == {GAP}
+def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_path):
+    stream = rr.RecordingStream("test")
+    sink = rr.binary_stream(stream)
+    canvas = Canvas(stream, home_clock(UTC, 0, HOUR))
+    drawn = DrawnLane("mic/lanes/all/00", 0.5, 10 * SECOND)
+    first, second = (0, 20, "yelling"), (30, 31, "yelling")
+    for marks in ((first,), (first, second), (second,)):
+        drawn.show(reviewed_lane("mic", spans_at(*marks), no_spans()), canvas)
+    path = tmp_path / "a.rrd"
+    path.write_bytes(sink.read())
+    root = "/mic/lanes/all/00/1/"
+    assert entities(path) == {f"{root}000000", f"{root}000001"}
+    hidden = [
+        str(chunk.entity_path)
+        for chunk in RrdReader(path).stream()
+        if "SeriesLines:visible_series" in chunk.to_record_batch().schema.names
+    ]
+    assert hidden == [f"{root}000000"]
+    assert column(path, f"{root}000001", "Scalars:scalars")[0][1] == 30 * SECOND
 
 
-def test_bands_are_the_probabilities_one_on_the_other(recording, timeline):
+def test_bands_are_filled_from_one_probability_to_the_next(recording, timeline):
     names, values = timeline.microphones["mic"].labellings[0].probabilities
-    for layer in range(4):
-        _, middles = column(recording, f"/mic/live/shares/{layer}", "Measurements:values")
-        _, variances = column(recording, f"/mic/live/shares/{layer}", "Measurements:variances")
-        half = np.sqrt(np.array(variances, float))
-        np.testing.assert_allclose(np.array(middles, float) + half, np.cumsum(values, 1), atol=1e-6)
-        np.testing.assert_allclose(2 * half, values, atol=1e-6)
-        colours = fixed(recording, f"/mic/live/shares/{layer}", "Measurements:colors")
-        assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [
-            colour(n) for n in names
-        ]
-    assert fixed(recording, "/mic/live/shares/0", "Measurements:names") == list(names)
+    times, cells = column(recording, "/mic/live/shares", "Scalars:scalars")
+    lower, upper = np.array(cells).reshape(-1, 2, len(names)).swapaxes(0, 1)
+    heights = np.where(np.isnan(lower), 0.0, upper - lower)
+    expected = np.nan_to_num(values)
+    np.testing.assert_allclose(heights, np.where(expected < 0.004, 0.0, expected), atol=1e-6)
+    np.testing.assert_allclose(upper, np.cumsum(values, axis=1), atol=1e-6)
+    middles = times.reshape(-1, 2).mean(axis=1)
+    np.testing.assert_allclose(middles, timeline.grid.middles, atol=1e3)
+    colours = fixed(recording, "/mic/live/shares", "SeriesLines:colors")
+    assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [colour(n) for n in names]
+    assert fixed(recording, "/mic/live/shares", "SeriesLines:names") == list(names)
 
 
 def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, folder, model_file):
@@ -765,14 +784,35 @@ def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, fo
     times, cells = column(recording, "/mic/frames/live", "Scalars:scalars")
     values = np.array(cells)
     hole = np.isnan(values).any(axis=1)
-    np.testing.assert_array_equal(times[~hole], stamps_of(labels))
-    np.testing.assert_array_equal(values[~hole], [m.probabilities for m in labels])
+    stamps = stamps_of(labels)
+    assert np.isin(times[~hole], stamps).all()
+    for heights, said in zip(values.T, np.array([m.probabilities for m in labels]).T, strict=True):
+        drawn = np.interp(stamps, times[~hole], heights[~hole])
+        np.testing.assert_allclose(drawn, said, atol=0.0101)
     after_gaps = stamps_of(labels)[1:][np.diff(stamps_of(labels)) > 2 * FRAME_NANOSECONDS]
     assert len(after_gaps) == 2
     for start in after_gaps:
         assert hole[np.searchsorted(times, start) - 1]
     names = fixed(recording, "/mic/frames/live", "SeriesLines:names")
     assert names == list(load_model(model_file).classes)
+
+
+def test_the_frames_of_a_long_time_are_read_when_they_are_needed(folder, timeline, monkeypatch):
+    monkeypatch.setattr(reading, "MOST_FRAMES", 60 * SECOND)
+    monkeypatch.setattr(reading, "_PART", 50 * SECOND)
+    long = read_timeline([folder])
+    one, before = (each.microphones["mic"] for each in (long, timeline))
+    assert not one.level_frames
+    for found, expected in zip(one.labellings, before.labellings, strict=True):
+        assert not found.frames
+        assert as_list(found.spans) == as_list(expected.spans)
+    parts = [part.microphones["mic"] for part in reading.read_frames(long)]
+    assert len(parts) > 3
+    frames = [each for part in parts for each in part.labellings[0].frames]
+    for column in (1, 2):  # times, values
+        found = np.concatenate([each[column] for each in frames])
+        expected = np.concatenate([each[column] for each in before.labellings[0].frames])
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_the_heat_map_is_brighter_where_a_feature_is_higher(recording, timeline):
@@ -842,6 +882,7 @@ def test_what_cannot_be_written_or_read_is_one_line_and_leaves_nothing(tmp_path,
 _SAVE = """
 import pathlib, resource, sys
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])
@@ -887,10 +928,11 @@ def test_the_command_prints_the_file_and_how_to_open_it(tmp_path, folder, capfd)
 
 def test_the_viewer_shows_every_view_without_complaint(viewer, recording):
     picture, state = shown(viewer, recording, views=5)
-    classes = Counter(view.view_class for view in state.views)
-    assert classes == {"StateTimeline": 2, "TimeSeries": 6, "TextLog": 1}
+    shown_ = Counter(view.view_class for view in state.views)
+    assert shown_.pop("TextDocument") > 5
+    assert shown_ == {"TimeSeries": 7, "TextLog": 1}
     assert [report for view in state.views for report in view.reports] == []
     (loaded,) = state.recordings
-    assert loaded.current_timeline == "time"
-    assert [(t.name, t.time_type) for t in loaded.timelines] == [("time", "timestamp")]
+    assert loaded.current_timeline == AXIS
+    assert [(t.name, t.time_type) for t in loaded.timelines] == [(AXIS, "timestamp")]
     assert picture.startswith(b"\x89PNG")

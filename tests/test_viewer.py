@@ -2,10 +2,15 @@
 
 import os
 import shutil
-from contextlib import suppress
+import subprocess
+import sys
+from contextlib import contextmanager, suppress
+from datetime import UTC, date
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from homelife import GENERAL, at, write_day
 from realday import START
 from viewers import (
     Window,
@@ -20,11 +25,13 @@ from viewers import (
 )
 
 from hearthlog.analyzer.colours import GAP, colour
+from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.timeline.overview import overview
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
+from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.web import open_page
+from hearthlog.analyzer.review.viewer.window import WindowViewer
 from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["display", "viewer"]  # fixtures
@@ -32,8 +39,18 @@ __all__ = ["display", "viewer"]  # fixtures
 HOUR = 3600 * 1_000_000_000
 MARKED = (START + 2 * HOUR, START + 3 * HOUR)
 _NEAR = 14  # of 255: how far a colour may be off
-_LANE, _BAND = 0.7, 0.4  # how much of a colour is left where the viewer draws it darker
-_LONG = 900 * 1_000_000_000  # a block that is seen at any size
+_BAND = 0.4  # how much of a colour is left where the viewer draws it darker
+_CAP = 7  # pixels by which a strip is longer than its sound, and what is rounded
+_WHITE = 110
+_LONG = 300 * 1_000_000_000
+_SAVING = """
+import re, sys
+from pathlib import Path
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.viewer.file import save_timeline
+save_timeline(read_timeline([Path(sys.argv[1])]), Path(sys.argv[2]))
+print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+"""
 
 
 @pytest.fixture(scope="module")
@@ -52,50 +69,67 @@ def timeline(reviewed_day):
 
 
 class Picture:
-    """What is seen of a timeline, whose lanes are as wide as the picture."""
+    """What is seen of a timeline; each view begins where its scale ends."""
 
     def __init__(self, png, timeline):
-        self._image = pixels(png)
+        self.image = pixels(png)
         self._grid = timeline.grid
-        self._left = 0
+        self.begin_at_cursor(slice(0, self.image.shape[0] * 7 // 10))
 
-    def begin_right_of_scale(self, row):
-        """Take the place from which on something is drawn in a row for the first time."""
-        self._left = int(np.argmax((self._image[row] > 40).any(axis=1)))
+    def begin_at_cursor(self, rows):
+        """Take the column of the cursor, which is at the start, in these rows."""
+        words = self.image.shape[1] // 10 + 2
+        white = (self.image[rows, words : 2 * words] > _WHITE).all(axis=2)
+        self._left = words + int(white.sum(axis=0).argmax())
 
-    def column(self, time):
-        """The colours of a column, from above."""
+    def place(self, time):
+        """The number of a column."""
         share = (time - self._grid.start) / (self._grid.end - self._grid.start)
-        width = self._image.shape[1] - self._left
-        return self._image[:, self._left + int(share * width)]
+        return self._left + int(share * (self.image.shape[1] - self._left))
 
     def is_coloured(self, time, wanted, darkest):
         """For each row, whether it has a colour at a time, mixed with black to some extent."""
-        found, wanted = self.column(time), np.array(wanted)
+        found, wanted = self.image[:, self.place(time)], np.array(wanted)
         light = found @ wanted / (wanted @ wanted)
         off = np.abs(found - light[:, np.newaxis] * wanted).max(axis=1)
         return (off <= _NEAR) & (light > darkest) & (light < 1.1)
 
+    def strip(self, start, end, wanted):
+        """The rows and columns of a strip of a colour around a span of time."""
+        first, last = self.place(start) - _CAP, self.place(end) + _CAP
+        near = np.abs(self.image[:, max(first, 0) : last] - wanted).max(axis=2) <= _NEAR
+        rows, columns = np.nonzero(near)
+        return rows, columns
+
 
 def blocks_of(timeline):
-    """Long blocks of the lane seen from afar: their middles, and what they say."""
-    live = overview(timeline.microphones["mic"].labellings[0], timeline.grid)
-    rows = zip(live.starts.tolist(), live.ends.tolist(), live.texts, strict=True)
-    return [((start + end) // 2, text) for start, end, text in rows if end - start > _LONG]
+    """Where a class was the most probable one for long: times, and the class."""
+    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    best = np.nan_to_num(values).argmax(axis=1)
+    edges = np.flatnonzero(np.diff(best, prepend=-1, append=-1))
+    for first, last in pairwise(edges.tolist()):
+        if timeline.grid.edges[last] - timeline.grid.edges[first] > _LONG:
+            yield int(timeline.grid.middles[(first + last) // 2]), names[best[first]]
 
 
 def lanes_are_right(png, timeline):
-    """Whether there is a row in which every long block has its colour, and so on."""
+    """Whether the longest sound of each class is in a lane of its own, and so on."""
     picture = Picture(png, timeline)
-    blocks = blocks_of(timeline)
-    live = np.all([picture.is_coloured(time, colour(text), _LANE) for time, text in blocks], axis=0)
-    ((start, end),) = zip(*timeline.microphones["mic"].gaps[:2], strict=True)
-    missing = picture.is_coloured((start + end) // 2, GAP, _LANE)
-    review = picture.is_coloured(sum(MARKED) // 2, colour("yelling"), _LANE)
-    elsewhere = picture.is_coloured(MARKED[1] + HOUR, colour("yelling"), _LANE)
-    rows = [np.flatnonzero(rows) for rows in (live, review & ~elsewhere, missing)]
+    microphone = timeline.microphones["mic"]
+    live, bottoms = microphone.labellings[0].spans, []
+    for name in sorted(set(live.texts) - {"silence"}):
+        own = np.flatnonzero(live.texts == name)
+        row = own[(live.ends - live.starts)[own].argmax()]
+        rows, _ = picture.strip(live.starts[row], live.ends[row], colour(name))
+        bottoms.append(rows.min() if len(rows) else -1)
+    ((start, end),) = zip(*microphone.gaps[:2], strict=True)
+    missing, _ = picture.strip(start, end, GAP)
+    review, _ = picture.strip(*MARKED, colour("yelling"))
+    elsewhere, _ = picture.strip(MARKED[1] + HOUR, MARKED[1] + 2 * HOUR, colour("yelling"))
+    if min(bottoms) < 0 or not len(missing) or not len(review) or len(elsewhere):
+        return False
     # From above: what the recorder says, the review, what was not heard.
-    return all(len(each) for each in rows) and rows[0][0] < rows[1][0] < rows[2][-1]
+    return max(bottoms) < review.min() < missing.max() and len(set(bottoms)) == len(bottoms)
 
 
 def check_bands(png, timeline):
@@ -113,7 +147,7 @@ def check_bands(png, timeline):
     height = len(run) / silence
     assert height > 30
     plot = slice(int(run[-1] - height), run[-1] + 1)
-    picture.begin_right_of_scale(run[len(run) // 2])
+    picture.begin_at_cursor(plot)
     checked = set()
     for time, text, share in found:
         if share > 0.4 and time < START + 17 * HOUR:  # the legend is over the evening
@@ -138,10 +172,18 @@ def picture_of(take, timeline, path):
 
 def test_a_saved_day_is_drawn_as_it_was_heard(timeline, viewer, tmp_path):
     save_timeline(timeline, tmp_path / "day.rrd")
-    _, state = shown(viewer, tmp_path / "day.rrd", views=5)
+    _, state = shown(viewer, tmp_path / "day.rrd", views=12)
     assert [report for view in state.views for report in view.reports] == []
     assert all(view.visible for view in state.views)
     picture_of(viewer.take_screenshot, timeline, tmp_path / "saved.png")
+
+
+def test_a_day_is_saved_within_the_memory_and_the_space_of_a_small_machine(reviewed_day, tmp_path):
+    path = tmp_path / "day.rrd"
+    command = [sys.executable, "-c", _SAVING, str(reviewed_day), str(path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert int(done.stdout) < 450_000  # kilobytes; with every frame of the day it was 630,000
+    assert path.stat().st_size < 100_000_000
 
 
 def test_the_window_shows_a_day_as_it_was_heard(reviewed_day, timeline, display, tmp_path):
@@ -161,3 +203,93 @@ def test_the_page_shows_a_day_as_it_was_heard(timeline, tmp_path):
         assert viewer.wait_until_drawn().errors == []
         picture_of(page.picture, timeline, tmp_path / "page.png")
         assert viewer.state().errors == []
+
+
+# What one looks for: short sounds in a long day
+
+DAY = date(2026, 3, 1)
+SOUGHT = {
+    "coughing": [(at("02:06") + 137 * number, 0.5) for number in range(14)],
+    "flushing_water": [(at("03:48"), 6)],
+    "crying": [(at("16:54"), 20)],
+    "yelling": [(at("17:21"), 2), (at("17:41"), 2)],
+}
+SIZES = [(1366, 768), (1920, 1080)]
+
+
+@pytest.fixture(scope="module")
+def short_sounds(tmp_path_factory):
+    """Logs of a day in which little is heard but an evening of talk and music."""
+    folder = tmp_path_factory.mktemp("short") / "logs"
+    evening = [(at("19:30") + 60 * i, 60, ("speech", "music")[i % 2], 0.9) for i in range(150)]
+    sought = [(*span, name, 0.9) for name, spans in SOUGHT.items() for span in spans]
+    classes = [*GENERAL, "flushing_water"]
+    hours = [hour for hour in range(24) if hour != 13]
+    write_day(folder, DAY, sought + evening, classes=classes, hours=hours)
+    return folder
+
+
+@contextmanager
+def hidden(size):
+    """A viewer without a screen, of some size."""
+    size = "x".join(map(str, size))
+    process = ViewerProcess(["--hide-welcome-screen", "--headless", "--window-size", size])
+    with WindowViewer(process) as viewer:
+        yield viewer
+
+
+def check_seen(png, timeline):
+    """Check that each sound is seen in the lane of its class, and that there is nothing else."""
+    picture = Picture(png, timeline)
+    lanes = {}
+    for name, spans in SOUGHT.items():
+        everywhere = np.abs(picture.image - colour(name)).max(axis=2) <= _NEAR
+        for start, seconds in spans:
+            begin = timeline.grid.start + round(start * 1e9)
+            rows, columns = picture.strip(begin, begin + round(seconds * 1e9), colour(name))
+            assert len(rows) >= 6, f"{name} at {start / 3600:.2f} h"
+            assert np.ptp(columns) >= 2
+            lanes.setdefault(name, set()).update(rows.tolist())
+            everywhere[:, picture.place(begin) - _CAP : picture.place(begin) + _CAP + 1] = False
+        assert max(lanes[name]) - min(lanes[name]) < 12, "one lane"
+        lane = everywhere[min(lanes[name]) : max(lanes[name]) + 1]
+        assert lane.sum() <= 12, f"{name} where there was none"
+    tops = sorted((min(rows), max(rows)) for rows in lanes.values())
+    assert all(one[1] < other[0] for one, other in pairwise(tops)), "lanes of their own"
+    off = timeline.grid.start + 13 * HOUR
+    rows, columns = picture.strip(off, off + HOUR, GAP)
+    assert np.ptp(columns) > 40
+    assert rows.min() > tops[-1][1]
+
+
+def is_seen(png, timeline, path):
+    path.write_bytes(png)
+    with suppress(AssertionError):
+        check_seen(png, timeline)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_short_sound_of_a_day_is_seen_in_the_window(short_sounds, size, tmp_path):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    with hidden(size) as viewer:
+        viewer.draw(timeline, close_up=False)
+        assert viewer.wait_until_drawn().errors == []
+        path = tmp_path / "short.png"
+        with suppress(AssertionError):
+            patiently(viewer.picture, lambda png: is_seen(png, timeline, path))
+        check_seen(path.read_bytes(), timeline)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_short_sound_of_a_day_is_seen_in_the_page(short_sounds, size, tmp_path):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    size = ",".join(map(str, size))
+    with open_page() as viewer, browsing(viewer.address, tmp_path / "browser", size) as page:
+        viewer.draw(timeline, close_up=False)
+        assert viewer.wait_until_drawn().errors == []
+        path = tmp_path / "short.png"
+        with suppress(AssertionError):
+            patiently(page.picture, lambda png: is_seen(png, timeline, path))
+        check_seen(path.read_bytes(), timeline)

@@ -193,13 +193,22 @@ def reviewing(*arguments, **environment):
         review.close()
 
 
+def address_of(port):
+    """Address at which something listens at a port; None if nothing does."""
+    for connection in psutil.net_connections("inet"):
+        if connection.status == psutil.CONN_LISTEN and connection.laddr.port == port:
+            return connection.laddr.ip
+    return None
+
+
 class Window:
     """The window of a viewer on a screen in memory."""
 
     def __init__(self, display, port):
         self._display = display
+        address = patiently(lambda: address_of(port), bool)
         self._client = patiently(
-            lambda: ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            lambda: ViewerClient.connect(f"rerun+http://{address}:{port}/proxy")
         )
 
     def state(self):
@@ -233,12 +242,15 @@ class Window:
 class Page:
     """A page in a browser without a screen, over the protocol of its developer tools."""
 
-    def __init__(self, address, folder, size):
+    def __init__(self, address, folder, size, flags=()):
         _need("chromium")
         folder.mkdir(parents=True, exist_ok=True)
         self._log = (folder / "chromium.log").open("wb")
         self._browser = subprocess.Popen(
-            ["chromium", *_CHROMIUM, f"--window-size={size}", f"--user-data-dir={folder}", address],
+            [
+                *("chromium", *_CHROMIUM, *flags),
+                *(f"--window-size={size}", f"--user-data-dir={folder}", address),
+            ],
             stdout=self._log,
             stderr=self._log,
         )
@@ -323,9 +335,9 @@ class Page:
 
 
 @contextmanager
-def browsing(address, folder, size="1100,760"):
+def browsing(address, folder, size="1100,760", flags=()):
     """Open a page; a large one is drawn slowly."""
-    page = Page(address, folder, size)
+    page = Page(address, folder, size, flags)
     try:
         yield page
     finally:

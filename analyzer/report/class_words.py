@@ -5,7 +5,7 @@ from datetime import date, tzinfo
 import numpy as np
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.models.classes import find_class
+from hearthlog.models.classes import find_class, in_words
 from hearthlog.schemas.arrays import Int64
 
 _WEEKDAYS = ("Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday")
@@ -13,18 +13,6 @@ _MONTHS = (
     *("January", "February", "March", "April", "May", "June"),
     *("July", "August", "September", "October", "November", "December"),
 )
-
-
-def in_words(label: str) -> str:
-    """Name a class as people would.
-
-    Parameters
-    ----------
-    label : str
-        A name of the class, in any spelling; that of an unknown class is written without `_`.
-    """
-    row = find_class(label)
-    return label.replace("_", " ").capitalize() if row is None else row.words
 
 
 def several_in_words(label: str) -> str:

@@ -7,7 +7,7 @@ whose text is licensed. Most questions of the form are about the last three days
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hearthlog.analyzer.report.class_words import in_words, several_in_words
+from hearthlog.analyzer.report.class_words import several_in_words
 from hearthlog.analyzer.report.daily_metrics import Day
 from hearthlog.analyzer.report.values import Count, Minutes
 from hearthlog.models.classes import (
@@ -18,6 +18,7 @@ from hearthlog.models.classes import (
     SHOWER,
     SPEECH,
     YELLING,
+    in_words,
 )
 
 DAYS = 3

@@ -9,7 +9,6 @@ from hearthlog.analyzer.report import class_words, interrai
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.class_words import (
     clock_text,
-    in_words,
     several_in_words,
     times_in_words,
 )
@@ -33,7 +32,7 @@ from hearthlog.analyzer.report.summary_text import (
     plain,
 )
 from hearthlog.analyzer.report.values import Count, Minutes, Value
-from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, in_words
 from hearthlog.schemas.text import listed
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes

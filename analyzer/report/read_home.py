@@ -256,7 +256,10 @@ def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int
 
 
 def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) -> None:
-    """Find which classes there may be: those that logs name, and those that there are."""
+    """Find which classes there may be: those that logs name, and those that are labelled.
+
+    What is marked alone was not heard elsewhere for no model knows it, unless nothing is labelled.
+    """
     names: dict[Source, dict[str, None]] = {source: {} for source in home.segments}
     for entry in entries:
         try:
@@ -269,6 +272,7 @@ def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) ->
                 own = array_names(channel.metadata, "probabilities")
                 names[node, microphone] |= dict.fromkeys(own)
     for source, segments in home.segments.items():
-        names[source] |= dict.fromkeys(sorted(set(segments.labels.tolist())))
+        said = set(home.labelled[source].labels.tolist()) or set(segments.labels.tolist())
+        names[source] |= dict.fromkeys(sorted(said))
         classes = [class_name(name) for name in names[source] if CLASS_NAME.fullmatch(name)]
         home.classes[source] = list(dict.fromkeys(classes))[:MOST_CLASSES]

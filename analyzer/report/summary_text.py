@@ -9,7 +9,6 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.report.class_words import (
     clock_text,
-    in_words,
     several_in_words,
     short_day,
 )
@@ -17,7 +16,7 @@ from hearthlog.analyzer.report.daily_metrics import HOUR, Day
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.sections import Figure, events_of, sections
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER
+from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, TAP_WATER, in_words
 from hearthlog.schemas.text import listed
 
 _SHOWN = 4  # changes in one sentence

@@ -13,10 +13,10 @@ from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import Spans, lengths, without
 from hearthlog.analyzer.report.baseline import Usual, usual
-from hearthlog.analyzer.report.class_words import in_words, short_day
+from hearthlog.analyzer.report.class_words import short_day
 from hearthlog.analyzer.report.daily_metrics import EVENING, HOUR, MORNING, Day
 from hearthlog.analyzer.report.values import Minutes
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64
 
 _DAY_BINS, _WEEK_BINS = 20, 6  # an hour

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _QUEUE = "--queue"
-_ALL_FRAMES = 3 * 3600 * NANOSECONDS  # of more, the viewer would take a gigabyte
 
 
 def review(
@@ -182,7 +181,11 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.session.session import Session
     from hearthlog.analyzer.review.session.sound import listen
-    from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+    from hearthlog.analyzer.review.timeline.read_timeline import (
+        MOST_FRAMES,
+        read_frames,
+        read_timeline,
+    )
 
     microphone = _microphone(timeline, choice.microphone)
     items, marking = _work(timeline, logs, choice, microphone)
@@ -193,7 +196,8 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
 
     def look_closely(start: int, end: int) -> None:
         if not items:
-            viewer.draw_frames(timeline, start, end)
+            for part in read_frames(timeline, start, end):
+                viewer.draw_frames(part, start, end)
             return
         coverage = timeline.coverage[microphone]
         spans = zip(coverage.logs, coverage.starts, coverage.ends, strict=True)
@@ -217,7 +221,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         show_page(viewer.address)
     viewer.wait_until_drawn()
     grid = timeline.grid
-    if not items and grid.end - grid.start <= _ALL_FRAMES:
+    if not items and grid.end - grid.start <= MOST_FRAMES:
         look_closely(grid.start, grid.end)
     print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):

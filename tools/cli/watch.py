@@ -34,8 +34,12 @@ def watch(
         typer.Option(min=1, max=65535, help="Where viewers connect, or, with --web, of the page."),
     ] = None,
     bind: Annotated[
-        str, typer.Option(help="With --serve: address of this machine to listen on.")
-    ] = _LOOPBACK,
+        str | None,
+        typer.Option(
+            help="With --serve: address of this machine to listen on; by default one of loopback "
+            "that nobody guesses."
+        ),
+    ] = None,
     minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 5,
     timezone: Timezone = None,
 ) -> None:
@@ -45,7 +49,7 @@ def watch(
     """
     if web and serve:
         wrong_use("--web opens a viewer here, --serve opens none: choose one")
-    if bind != _LOOPBACK and not serve:
+    if bind is not None and not serve:
         wrong_use("--bind goes with --serve")
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -57,7 +61,7 @@ def watch(
     newest = last_time(logs)
     home_zone(timezone)
     with ExitStack() as opened:
-        server = opened.enter_context(_server(port, bind, minutes, serve=serve, web=web))
+        server = opened.enter_context(_server(port, bind, minutes, web=web))
         viewer = None
         if serve:
             _say_where(server.url, bind)
@@ -74,15 +78,14 @@ def watch(
         raise typer.Exit(3)
 
 
-def _server(port: int | None, bind: str, minutes: int, *, serve: bool, web: bool) -> "LiveServer":
+def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "LiveServer":
     from hearthlog.analyzer.review.viewer.live import PORT, LiveServer
-    from hearthlog.analyzer.review.viewer.process import free_port
+    from hearthlog.analyzer.review.viewer.process import free_port, hidden_address
 
-    if serve:
-        port = port or PORT
-    elif web or port is None:
-        port = free_port()
-    return LiveServer(port, bind, minutes)
+    if bind is not None:
+        return LiveServer(port or PORT, bind, minutes)
+    bind = hidden_address()
+    return LiveServer(free_port(None if web else port, bind), bind, minutes)
 
 
 def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
@@ -96,12 +99,17 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
     return viewer
 
 
-def _say_where(url: str, bind: str) -> None:
+def _say_where(url: str, bind: str | None) -> None:
+    from urllib.parse import urlsplit
+
+    place = urlsplit(url).netloc
     tell(f"look with: rerun --bind {_LOOPBACK} --connect {url}")
-    if bind != _LOOPBACK:
+    if bind is None:
+        tell(f"from another machine, first: ssh -L {place}:{place} and the name of this one")
+    else:
         tell(
-            f"listening on {bind}: whoever reaches this port sees what is heard here; "
-            "without --bind, only those who log in to this machine do"
+            f"listening on {bind}: whoever reaches this port, perhaps a web page in a browser, "
+            "sees what is heard here; without --bind, only those who log in to this machine do"
         )
 
 
@@ -127,11 +135,11 @@ def _follow(
             told.append(str(error))
             tell(str(error))
 
-    live: LiveTimeline | None = None
+    live, zone = LiveTimeline(), None
     for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell_once):
-        live = live or LiveTimeline(zone_of([logs], timezone))
+        zone = zone or zone_of([logs], timezone)
         try:
-            server.show(live.take(path, batch))
+            server.show(live.take(path, batch), zone)
         except LogError as error:
             tell_once(error)
         if stop.is_set():

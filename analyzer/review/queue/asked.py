@@ -93,13 +93,24 @@ def looked_at(
     """
     reviewed: dict[Path, list[ReviewedSpan]] = {}
     for span in asked:
-        answers = (
-            mark.microphone == span.microphone and mark.start < span.end and mark.end > span.start
-            for mark in marks
-        )
-        if span.microphone in coverage and any(answers):
+        if span.microphone in coverage and any(_answers(mark, span) for mark in marks):
             origin = reviewer, made, corrected_name(span.a), chosen_as(span)
             for log, first, last in coverage[span.microphone].split(span.start, span.end):
                 part = ReviewedSpan(span.microphone, first, last, *origin)
                 reviewed.setdefault(log, []).append(part)
     return reviewed
+
+
+def unasked(asked: Sequence[ReviewSpan], marks: Iterable[Mark]) -> list[Mark]:
+    """Return the marks that lie in no span that was asked.
+
+    Parameters
+    ----------
+    asked : sequence of ReviewSpan
+    marks : iterable of Mark
+    """
+    return [mark for mark in marks if not any(_answers(mark, span) for span in asked)]
+
+
+def _answers(mark: Mark, span: ReviewSpan) -> bool:
+    return mark.microphone == span.microphone and mark.start < span.end and mark.end > span.start

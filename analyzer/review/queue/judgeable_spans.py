@@ -88,6 +88,30 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     return JudgeableSpans(begins, stops, segments.labels[longest][source], source)
 
 
+def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which spans are less than a second of the border of another sound.
+
+    Where one sound goes over into the next the label wavers, and a person hears only the two. What
+    is as short and stands alone, such as a cough, can be judged.
+
+    Parameters
+    ----------
+    spans : JudgeableSpans
+    silent : np.ndarray [shape=(classes,)], bool
+        Which labels are silence.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], bool
+    """
+    touching = spans.starts[1:] == spans.ends[:-1]
+    sounds = ~silent[spans.labels]
+    beside = np.zeros(len(spans), bool)
+    beside[1:] |= touching & sounds[:-1]
+    beside[:-1] |= touching & sounds[1:]
+    return beside & (spans.ends - spans.starts < _FLICKER)
+
+
 def without(segments: Events, reviewed: Spans) -> Events:
     """Return the parts of segments outside of some time.
 

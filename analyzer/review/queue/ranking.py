@@ -14,12 +14,14 @@ from hearthlog.analyzer.logs.spans import Spans
 from hearthlog.analyzer.review.queue.coverage import cover, sample
 from hearthlog.analyzer.review.queue.judgeable_spans import (
     JudgeableSpans,
+    border_pieces,
     judgeable_spans,
     other_labels,
     without,
 )
 from hearthlog.analyzer.review.queue.span_sounds import SpanSounds, labelling_model, span_sounds
 from hearthlog.analyzer.review.queue.uncertainty import ModelUncertainty
+from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
@@ -53,8 +55,8 @@ class ReviewQueue:
         The number of spans that these were chosen from.
     has_uncertainty : bool
         False if the logs have no probabilities.
-    useful : bool
-        Whether the spans are in the order in which they teach most, not in that of their scores.
+    ranking : str or None
+        As of `make_queue`: the order of the spans, and the reason of each.
     """
 
     spans: JudgeableSpans
@@ -65,7 +67,14 @@ class ReviewQueue:
     novelty: Float64
     candidates: int
     has_uncertainty: bool
-    useful: bool
+    ranking: str | None
+
+    @property
+    def reasons(self) -> Int64:
+        """The row of `weighted` for which each span was chosen; shape (n,)."""
+        if self.ranking in _ALONE:
+            return np.full(len(self.spans), _ALONE[self.ranking])
+        return np.argmax(self.weighted, axis=0)
 
     @property
     def weighted(self) -> Float64:
@@ -107,7 +116,8 @@ def make_queue(  # noqa: PLR0913
         Number of spans, at most.
     ranking : str, optional
         One of `RANKINGS`, to rank by it alone; by default uncertainty, disagreement and novelty are
-        weighed. What is mostly silence is not `uncertain`, for there is nothing to judge. The most
+        weighed, without `border_pieces`. What is mostly silence is not `uncertain`, for there is
+        nothing to judge. The most
         `useful` spans are those that sound like most of what the model is uncertain of, those of
         rare classes before others.
     models : Path, optional
@@ -161,7 +171,9 @@ def make_queue(  # noqa: PLR0913
 
         rows = _useful(spans, parts[0], count, sounds)
     else:
-        rows = _ranked(np.stack(parts), ranking, spans, means.silence.values(), count)
+        silent = np.array([class_name(name) == SILENCE for name in classes])
+        scored = np.where(border_pieces(spans, silent), 0.0, np.stack(parts))
+        rows = _ranked(scored, ranking, spans, means.silence.values(), count)
         if not len(rows):
             raise DataError(f"{side.name}: no span is {ranking}")
     return ReviewQueue(
@@ -173,7 +185,7 @@ def make_queue(  # noqa: PLR0913
         novelty=parts[2][rows],
         candidates=len(spans),
         has_uncertainty=means.uncertainty.exist,
-        useful=ranking == USEFUL,
+        ranking=ranking,
     )
 
 
@@ -184,17 +196,35 @@ def _useful(
     sounds: Callable[[JudgeableSpans], SpanSounds],
 ) -> Int64:
     """Choose spans that sound like most of what a model is uncertain of, in rare classes more."""
-    lengths = spans.ends - spans.starts
-    worth = np.minimum(lengths, _LONGEST_WEIGHED) / NANOSECONDS
-    of_class = np.bincount(spans.labels, worth)[spans.labels]
-    weights = worth * (uncertain if uncertain.any() else 1.0) / np.sqrt(of_class)
-    rows, shares = sample(weights)
+    rows, shares = sample(worth(spans, uncertain))
     some = spans.take(rows)
     points, gamma = sounds(some)
-    eligible = lengths[rows] >= _LONG_ENOUGH
+    eligible = some.ends - some.starts >= _LONG_ENOUGH
     if not eligible.any():
         eligible[:] = True
     return rows[cover(points, gamma, shares, eligible, count)]
+
+
+def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:
+    """Weigh spans by their length, and by how uncertain a model is of them.
+
+    Together, the spans of a class weigh as the square root of how much of it there is, so that what
+    is heard rarely is asked for, and what is heard often more so.
+
+    Parameters
+    ----------
+    spans : JudgeableSpans
+    uncertain : np.ndarray [shape=(n,)], float64
+        0 to 1; where all are 0, all spans are as uncertain.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], float64
+    """
+    seconds = np.minimum(spans.ends - spans.starts, _LONGEST_WEIGHED) / NANOSECONDS
+    of_class = np.bincount(spans.labels, seconds)[spans.labels]
+    weights: Float64 = seconds * (uncertain if uncertain.any() else 1.0) / np.sqrt(of_class)
+    return weights
 
 
 def _ranked(

@@ -99,19 +99,19 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
     Returns
     -------
     list of ReviewSpan
-        With the score, to three digits, and as the reason the part that weighs most in it;
-        `useful` ones have no score.
+        With the score, to three digits, and as the reason what they are ranked by, or what weighs
+        most in the score; `useful` ones have no score.
     """
-    most = np.argmax(queue.weighted, axis=0).tolist()
+    reasons = queue.reasons.tolist()
     columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
     rows = zip(
-        *(column.tolist() for column in columns), queue.labels, queue.others, most, strict=True
+        *(column.tolist() for column in columns), queue.labels, queue.others, reasons, strict=True
     )
     spans = [
         ReviewSpan(microphone, start, end, a, label, b, other, score, _PARTS[reason])
         for start, end, score, label, other, reason in rows
     ]
-    if queue.useful:
+    if queue.ranking == USEFUL:
         return [span._replace(score=None, reason=USEFUL) for span in spans]
     return spans
 

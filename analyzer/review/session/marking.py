@@ -55,6 +55,7 @@ class Marking:
     labelled: LabelledSpans
     _done: list[list[_Change]] = field(default_factory=list)
     _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as they were read last
+    _reviewed: dict[Path, list[ReviewedSpan]] = field(default_factory=dict)
 
     def mark(self, start: int, end: int, label: str, chosen: str = "") -> list[Mark]:
         """Label a span of time, in place of the marks that it has.
@@ -103,6 +104,7 @@ class Marking:
         changes = [self._change(*piece, now, chosen) for piece in self._pieces(start, end)]
         for change in changes:
             write_marks(change.log, [], reviewed=change.reviewed)
+            self._read_layer(change.log)
         self._done.append(changes)
 
     def confirm(self, start: int, end: int) -> list[Mark]:
@@ -195,16 +197,36 @@ class Marking:
         LogError
             If a layer is damaged.
         """
-        for log in self.coverage.logs:
-            if log not in self._marks:
-                self._marks[log] = read_marks(log)
+        self._read()
         marks = (mark for same in self._marks.values() for mark in same)
         own = sorted(mark for mark in marks if mark.microphone == self.microphone)
-        return LabelledSpans(
-            np.array([mark.start for mark in own], np.int64),
-            np.array([mark.end for mark in own], np.int64),
-            np.array([mark.label for mark in own], object),
-        )
+        return _spans([(mark.start, mark.end, mark.label) for mark in own])
+
+    def reviewed(self) -> LabelledSpans:
+        """Return what was looked at of the microphone in these logs, with how it was chosen.
+
+        Returns
+        -------
+        LabelledSpans
+            In the order of time; they may overlap.
+
+        Raises
+        ------
+        LogError
+            If a layer is damaged.
+        """
+        self._read()
+        spans = (span for same in self._reviewed.values() for span in same)
+        own = sorted(span for span in spans if span.microphone == self.microphone)
+        return _spans([(span.start, span.end, span.chosen) for span in own])
+
+    def _read(self) -> None:
+        for log in self.coverage.logs:
+            if log not in self._marks:
+                self._read_layer(log)
+
+    def _read_layer(self, log: Path) -> None:
+        self._marks[log], self._reviewed[log] = read_marks(log), read_reviewed(log)
 
     def _pieces(self, start: int, end: int) -> list[tuple[Path, int, int]]:
         """Divide a span of time among the logs, each with its start and end."""
@@ -251,7 +273,7 @@ class Marking:
     ) -> None:
         span = instead_of or change.span
         write_marks(change.log, marks, [span], reviewed=reviewed, not_reviewed=not_reviewed)
-        self._marks[change.log] = read_marks(change.log)
+        self._read_layer(change.log)
 
     def _change(  # noqa: PLR0913
         self, log: Path, start: int, end: int, now: int, chosen: str, *, deleted: bool = False
@@ -276,6 +298,14 @@ class Marking:
     def _looked_at(self, start: int, end: int, now: int, chosen: str) -> list[ReviewedSpan]:
         origin = self.reviewer, now, self.corrects, chosen
         return [ReviewedSpan(self.microphone, start, end, *origin)] if chosen else []
+
+
+def _spans(rows: Sequence[tuple[int, int, str]]) -> LabelledSpans:
+    return LabelledSpans(
+        np.array([start for start, _, _ in rows], np.int64),
+        np.array([end for _, end, _ in rows], np.int64),
+        np.array([text for _, _, text in rows], object),
+    )
 
 
 def _outside(span: ReviewedSpan, start: int, end: int) -> list[ReviewedSpan]:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import tzinfo
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol
@@ -70,6 +70,17 @@ class Screen(Protocol):
             On either side, in nanoseconds.
         """
 
+    def ask(self, start: int, end: int, text: str) -> None:
+        """Draw which span is asked, in place of the one before.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC.
+        text : str
+            What is asked.
+        """
+
     def play(self, start: int) -> None:
         """Let the time cursor run from a time on.
 
@@ -79,13 +90,13 @@ class Screen(Protocol):
             In nanoseconds of UTC.
         """
 
-    def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Draw the marks of a microphone again.
+    def redraw_marks(self, microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> None:
+        """Draw what is reviewed of a microphone again.
 
         Parameters
         ----------
         microphone : str
-        marks : LabelledSpans
+        marks, reviewed : LabelledSpans
             All that it has now.
         """
 
@@ -122,7 +133,7 @@ class Session:
     listen: Callable[[int, int], str]
     items: Sequence[ReviewItem] = ()
     _at: int = -1
-    _marked: int = 0
+    _judged: list[int] = field(default_factory=list)  # the item of each change
     _began: float = 0.0
     _begin: int | None = None  # of a span whose end is not set yet
 
@@ -169,7 +180,7 @@ class Session:
                 break
             self.press(key)
         self._conclude()
-        return self._marked
+        return len(self._judged)
 
     def press(self, key: str) -> None:
         """Obey one key. An error is shown to the reviewer, and changes nothing.
@@ -248,7 +259,7 @@ class Session:
             self._go(1)
 
     def _done(self, start: int, end: int, text: str) -> None:
-        self._marked += 1
+        self._judged.append(self._at)
         self.say(f"{self._text(start, end)}  {text}")
         self._redraw()
 
@@ -257,14 +268,16 @@ class Session:
         if span is None:
             self.say("nothing to undo")
             return
-        self._marked -= 1
+        judged = self._judged.pop()
         self.say(f"{self._text(*span)}  undone")
         self._redraw()
+        if judged != self._at:
+            self._go(judged - self._at)
 
     def _redraw(self) -> None:
-        marks = self.marking.marks()
+        marks, reviewed = self.marking.marks(), self.marking.reviewed()
         with self._unless_silent():
-            self.screen.redraw_marks(self.marking.microphone, marks)
+            self.screen.redraw_marks(self.marking.microphone, marks, reviewed)
 
     @contextmanager
     def _unless_silent(self) -> Iterator[None]:
@@ -323,6 +336,7 @@ class Session:
         margin = _margin(item.start, item.end)
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
+            self.screen.ask(item.start, item.end, _question(item))
             self.screen.show(item.start, item.end, margin)
 
     def _text(self, start: int, end: int) -> str:
@@ -331,8 +345,14 @@ class Session:
 
     def _conclude(self) -> None:
         minutes = (time.monotonic() - self._began) / 60
-        spans = "1 span" if self._marked == 1 else f"{self._marked} spans"
-        self.say(f"{spans} reviewed in {minutes:.1f} min, {self._marked / minutes:.1f} a minute")
+        count = len(self._judged)
+        spans = "1 span" if count == 1 else f"{count} spans"
+        self.say(f"{spans} reviewed in {minutes:.1f} min, {count / minutes:.1f} a minute")
+
+
+def _question(item: ReviewItem) -> str:
+    length = (item.end - item.start) / NANOSECONDS
+    return "all of this minute?" if item.chosen == RANDOM else f"{item.label}? {length:.1f} s"
 
 
 def _margin(start: int, end: int) -> int:

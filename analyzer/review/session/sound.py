@@ -8,6 +8,8 @@ from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
+_FULL_SCALE = np.float32(32768.0)
+
 
 def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
     """Start to play the kept sound of a span of time.
@@ -60,5 +62,6 @@ def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Flo
         if clip.start < end and clip.end > start and rate in {0, clip.rate}:
             rate = clip.rate
             first, last = ((t - clip.start) * rate // NANOSECONDS for t in (start, end))
-            parts.append(clip.samples[max(first, 0) : max(last, 0)])
+            samples = clip.samples[max(first, 0) : max(last, 0)].astype(np.float32)
+            parts.append(samples / _FULL_SCALE)
     return rate, np.concatenate(parts)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.health import MicrophoneState, lasting
-from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.review.timeline.decode import (
     ENERGY,
     FeatureRows,
@@ -70,6 +70,7 @@ class _Microphone:
     label_frames: dict[str, list[FrameValues]] = field(default_factory=dict)
     novelty: dict[str, GridMeans] = field(default_factory=dict)
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
+    reviewed: list[LabelledSpans] = field(default_factory=list)
     gaps: list[LabelledSpans] = field(default_factory=list)
     states: list[MicrophoneState] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
@@ -93,12 +94,15 @@ class Collector:
     ----------
     grid : Grid
     sampled : bool
-        Whether only a part of the rows comes: then no single frames are kept.
+        Whether only a part of the rows comes.
+    frames : bool
+        Whether single frames are kept.
     """
 
-    def __init__(self, grid: Grid, *, sampled: bool) -> None:
+    def __init__(self, grid: Grid, *, sampled: bool, frames: bool) -> None:
         self._grid = grid
         self._sampled = sampled
+        self._frames = frames
         self._microphones: dict[str, _Microphone] = {}
         self._lines: list[LogLines] = []
 
@@ -122,6 +126,7 @@ class Collector:
                 self._add_labels(rows)
             case SegmentRows():
                 self._spans(rows.microphone, rows.labelling).append(rows.spans)
+                self._forget_frames(rows.microphone, rows.labelling)
             case GapRows():
                 self._microphone(rows.microphone).gaps.append(rows.spans)
 
@@ -142,6 +147,18 @@ class Collector:
                 span = np.array([mark.start]), np.array([mark.end])
                 label = np.array([mark.label], object)
                 self._spans(mark.microphone, REVIEW).append(LabelledSpans(*span, label))
+
+    def add_reviewed(self, spans: Iterable[ReviewedSpan]) -> None:
+        """Add spans that a person has looked at.
+
+        Parameters
+        ----------
+        spans : iterable of ReviewedSpan
+            Of any microphones, in any order.
+        """
+        for one in spans:
+            span = np.array([one.start]), np.array([one.end]), np.array([one.chosen], object)
+            self._microphone(one.microphone).reviewed.append(LabelledSpans(*span))
 
     def add_clip(self, microphone: str, clip: SoundClip) -> None:
         """Add kept sound."""
@@ -188,7 +205,7 @@ class Collector:
     def _add_features(self, rows: FeatureRows) -> None:
         microphone = self._microphone(rows.microphone)
         microphone.features.add(rows.names, rows.times, rows.values)
-        if not self._sampled and ENERGY in rows.names:
+        if self._frames and ENERGY in rows.names:
             level = decibel(rows.values[:, rows.names.index(ENERGY)])
             frames = FrameValues(("level",), rows.times, level[:, np.newaxis])
             microphone.level_frames.append(frames)
@@ -200,10 +217,18 @@ class Collector:
         if not self._sampled:
             frames = FrameValues(rows.names, rows.times, rows.probabilities)
             microphone.label_frames.setdefault(name, []).append(frames)
+            self._forget_frames(rows.microphone, name)
         finite = np.isfinite(rows.novelty)
         if finite.any():
             novelty = microphone.novelty.setdefault(name, GridMeans(self._grid, 1))
             novelty.add(rows.times[finite], rows.novelty[finite, np.newaxis])
+
+    def _forget_frames(self, name: str, labelling: str) -> None:
+        """Forget the frames whose segments are known, unless single frames are kept."""
+        microphone = self._microphone(name)
+        spans, frames = microphone.spans.get(labelling), microphone.label_frames.get(labelling)
+        while not self._frames and spans and frames and frames[0].times[-1] < spans[-1].ends[-1]:
+            del frames[0]
 
     def _timeline(self, name: str, rows: _Microphone) -> MicrophoneTimeline:
         features = rows.features.series()
@@ -217,6 +242,7 @@ class Collector:
             level=level,
             level_frames=rows.level_frames,
             floor=_floor(rows.states, self._grid, features),
+            reviewed=self._join(rows.reviewed),
             gaps=self._join(rows.gaps),
             troubles=_trouble_spans(rows.states, self._grid.end),
             clips=_join_clips(rows.clips),
@@ -225,16 +251,16 @@ class Collector:
     def _labelling(self, rows: _Microphone, name: str) -> LabellingTimeline:
         means, frames = rows.labels.get(name), rows.label_frames.get(name, [])
         parts = rows.spans.get(name, [])
-        if name == LIVE and self._sampled and means is not None:
-            parts = []  # the segments of a sample have holes between them
         end = max((int(spans.ends.max()) for spans in parts), default=0)
-        parts = [*parts, *_runs(frames, end)]  # what is open at the end is no segment yet
+        parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]  # what is open is no segment yet
+        if not parts and means is not None:
+            parts = list(_runs(_shares(means, self._grid), 0, self._grid.step))
         return LabellingTimeline(
             name,
             self._join(parts),
             None if means is None else means.series(),
             rows.novelty[name].values[:, 0] if name in rows.novelty else None,
-            frames,
+            frames if self._frames else (),
         )
 
     def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
@@ -249,19 +275,27 @@ class Collector:
         return LabelledSpans(starts[order], ends[order], spans.texts[order])
 
 
-def _runs(parts: Sequence[FrameValues], after: int) -> Iterator[LabelledSpans]:
-    """Join successive frames from some time on whose most probable class is the same."""
+def _shares(means: _NamedMeans, grid: Grid) -> Iterator[FrameValues]:
+    """Yield the shares of a grid as if they were frames, without those that have no values."""
+    for names, part in means.means.items():
+        values = part.values
+        present = ~np.isnan(values[:, 0])
+        yield FrameValues(names, grid.edges[:-1][present], values[present].astype(np.float32))
+
+
+def _runs(parts: Iterable[FrameValues], after: int, step: int) -> Iterator[LabelledSpans]:
+    """Join successive frames, `step` apart, from some time on whose likeliest class is the same."""
     for names, all_times, all_values in parts:
         later = all_times >= after
         times, values = all_times[later], all_values[later]
         if not len(times):
             continue
         best = values.argmax(axis=1)
-        broken = np.diff(times, prepend=times[0]) > 1.5 * FRAME_NANOSECONDS
+        broken = np.diff(times, prepend=times[0]) > 1.5 * step
         first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
         last = np.append(first[1:], len(times)) - 1
         texts = np.array(names, object)[best[first]]
-        yield LabelledSpans(times[first], times[last] + FRAME_NANOSECONDS, texts)
+        yield LabelledSpans(times[first], times[last] + step, texts)
 
 
 def _floor(
@@ -286,8 +320,8 @@ def _trouble_spans(states: Sequence[MicrophoneState], end: int) -> LabelledSpans
     return LabelledSpans(np.array(starts), np.array(ends), np.array(texts, object))
 
 
-def _join_clips(parts: Sequence[SoundClip]) -> list[SoundClip]:
-    """Join clips that follow each other without a hole."""
+def _join_clips(parts: list[SoundClip]) -> list[SoundClip]:
+    """Join clips that follow each other without a hole; forget the parts, which are large."""
     runs: list[list[SoundClip]] = []
     for part in sorted(parts, key=lambda clip: clip.start):
         last = runs[-1][-1] if runs else None
@@ -295,7 +329,10 @@ def _join_clips(parts: Sequence[SoundClip]) -> list[SoundClip]:
             runs[-1].append(part)
         else:
             runs.append([part])
-    return [
-        SoundClip(run[0].start, run[0].rate, np.concatenate([part.samples for part in run]))
-        for run in runs
-    ]
+    parts.clear()
+    clips = []
+    for run in runs:
+        samples = np.concatenate([part.samples for part in run])
+        clips.append(SoundClip(run[0].start, run[0].rate, samples))
+        run.clear()
+    return clips

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.spans import Spans, lengths
 from hearthlog.schemas.arrays import Float64, Int64
 
 
@@ -30,6 +29,11 @@ class Grid:
         """Starts of the shares, and the end of the last one; shape (count + 1,)."""
         shares = np.arange(self.count + 1) / self.count
         return self.start + np.round(shares * (self.end - self.start)).astype(np.int64)
+
+    @property
+    def step(self) -> int:
+        """Length of a share in nanoseconds, but for rounding."""
+        return (self.end - self.start) // self.count
 
     @property
     def middles(self) -> Int64:
@@ -90,31 +94,3 @@ class GridMeans:
         """The means, shape (count, width); NaN in shares without a row."""
         with np.errstate(invalid="ignore"):
             return self._sums / self._counts[:, np.newaxis]
-
-
-def time_shares(
-    starts: Int64, ends: Int64, labels: NDArray[np.intp], width: int, grid: Grid
-) -> Float64:
-    """Measure how much of each share of a grid each label covers.
-
-    Parameters
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        Spans in nanoseconds of UTC, in the order of time; those of one label do not overlap.
-    labels : np.ndarray [shape=(n,)], int
-        The label of each span, 0 to `width` - 1.
-    width : int
-        Number of labels.
-    grid : Grid
-
-    Returns
-    -------
-    np.ndarray [shape=(grid.count, width)], float64
-        0 to 1.
-    """
-    edges = grid.edges
-    covered = [
-        lengths(Spans(starts[labels == label], ends[labels == label]), edges)
-        for label in range(width)
-    ]
-    return np.stack(covered, axis=1) / np.diff(edges)[:, np.newaxis]

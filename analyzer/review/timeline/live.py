@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from datetime import tzinfo
 from pathlib import Path
 
 import numpy as np
@@ -23,19 +22,6 @@ from hearthlog.analyzer.review.timeline.decode import (
     decibel,
     read_rows,
 )
-from hearthlog.analyzer.review.timeline.grid import Grid
-from hearthlog.analyzer.review.timeline.lanes import (
-    CLOCK,
-    GAPS,
-    NOT_HEARD,
-    RECORDER,
-    TROUBLE,
-    TROUBLES,
-    Changes,
-    Lane,
-    changes,
-    clock,
-)
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, LogLines
 from hearthlog.analyzer.review.timeline.plots import (
     FEATURES,
@@ -44,6 +30,16 @@ from hearthlog.analyzer.review.timeline.plots import (
     NOVELTY,
     SHARES,
     Plot,
+)
+from hearthlog.analyzer.review.timeline.state_lanes import (
+    GAPS,
+    NOT_HEARD,
+    RECORDER,
+    TROUBLE,
+    TROUBLES,
+    Changes,
+    StateLane,
+    changes,
 )
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
@@ -59,7 +55,7 @@ _SPREAD = 2.0  # standard deviations from its middle to its ends
 _MOST_OPEN = 100_000  # seconds of a segment that may be shown before it closes
 _TINY = np.finfo(np.float64).tiny
 
-Update = Plot | Lane | LogLines
+Update = Plot | StateLane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
@@ -100,17 +96,9 @@ def last_time(folder: Path) -> int | None:
 
 
 class LiveTimeline:
-    """Turns messages into updates of lanes and plots.
+    """Turns messages into updates of lanes and plots."""
 
-    Parameters
-    ----------
-    zone : tzinfo
-        Time zone of the home.
-    """
-
-    def __init__(self, zone: tzinfo) -> None:
-        self._zone = zone
-        self._newest: int | None = None
+    def __init__(self) -> None:
         self._ends: dict[tuple[str, ...], int] = {}  # of the last frame, by topic and names
         self._scales: dict[tuple[str, ...], _Scale] = {}
         self._open: dict[str, Int64] = {}  # seconds without a segment yet, by microphone
@@ -127,7 +115,7 @@ class LiveTimeline:
 
         Yields
         ------
-        Plot, Lane or LogLines
+        Plot, StateLane or LogLines
             What is new in it.
 
         Raises
@@ -148,7 +136,6 @@ class LiveTimeline:
             case StateRows():
                 yield from _states(rows)
             case FeatureRows():
-                yield from self._clock(rows.times)
                 yield from self._features(rows)
             case LabelRows(labelling="live"):
                 yield from self._labels(rows)
@@ -156,14 +143,6 @@ class LiveTimeline:
                 yield from self._segments(rows.microphone, rows.spans)
             case GapRows():
                 yield _gaps(rows)
-
-    def _clock(self, times: Int64) -> Iterator[Lane]:
-        first = int(times[0]) if self._newest is None else self._newest
-        newest = int(times[-1])
-        if newest > first:
-            hours = clock(Grid(first, newest, 1), self._zone)
-            yield Lane(CLOCK, "", str(self._zone), Changes(hours.starts, list(hours.texts)))
-        self._newest = max(first, newest)
 
     def _features(self, rows: FeatureRows) -> Iterator[Plot]:
         microphone, names = rows.microphone, rows.names
@@ -187,18 +166,18 @@ class LiveTimeline:
         present = ~np.isnan(shares[:, 0])
         best = np.where(present, np.nan_to_num(shares).argmax(axis=1), len(names))
         states = np.array([*names, None], object)[best]
-        yield Lane(RECORDER, microphone, LIVE, Changes(starts, states.tolist()))
+        yield StateLane(RECORDER, microphone, Changes(starts, states.tolist()))
         seconds = np.append(self._open_seconds(microphone), starts[present])
         self._open[microphone] = seconds[-_MOST_OPEN:]
 
-    def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[Lane]:
+    def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[StateLane]:
         """Replace the labels of the seconds in closed segments by those of the segments."""
         seconds = self._open_seconds(microphone)
         times = np.unique(np.append(seconds, spans.starts))
         rows = rows_at(spans, times)
         closed = rows >= 0
         states = spans.texts[rows[closed]].tolist()
-        yield Lane(RECORDER, microphone, LIVE, Changes(times[closed], states))
+        yield StateLane(RECORDER, microphone, Changes(times[closed], states))
         self._open[microphone] = seconds[seconds >= spans.ends[-1]]
 
     def _open_seconds(self, microphone: str) -> Int64:
@@ -252,15 +231,15 @@ class _Scale:
         return np.clip(scaled + 0.5, 0.0, 1.0)
 
 
-def _gaps(rows: GapRows) -> Lane:
+def _gaps(rows: GapRows) -> StateLane:
     spans = rows.spans
     later = spans.ends > spans.starts  # where the clock was set back nothing is missing
     texts = np.full(later.sum(), NOT_HEARD, object)
     spans = LabelledSpans(spans.starts[later], spans.ends[later], texts)
-    return Lane(GAPS, rows.microphone, NOT_HEARD, changes(spans))
+    return StateLane(GAPS, rows.microphone, changes(spans))
 
 
-def _states(rows: StateRows) -> Iterator[Lane | Plot]:
+def _states(rows: StateRows) -> Iterator[StateLane | Plot]:
     by_microphone: dict[str, list[MicrophoneState]] = {}
     for state in rows.states:
         by_microphone.setdefault(state.microphone, []).append(state)
@@ -268,7 +247,7 @@ def _states(rows: StateRows) -> Iterator[Lane | Plot]:
         times = np.array([state.time for state in states])
         levels = (min(state.level, len(TROUBLES)) for state in states)
         texts = [TROUBLES[level - 1] if level else None for level in levels]
-        yield Lane(TROUBLE, name, "trouble", Changes(times, texts))
+        yield StateLane(TROUBLE, name, Changes(times, texts))
         floors = np.array([[state.floor_dbfs] for state in states])
         if not np.isnan(floors).all():
             yield Plot(FLOOR, name, "", ("floor",), times, floors)

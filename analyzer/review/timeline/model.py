@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.coverage import Coverage
+from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.review.timeline.grid import Grid
-from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.analyzer.review.timeline.home_clock import HomeClock, home_clock
+from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
 from hearthlog.schemas.times import NANOSECONDS
 
 
@@ -89,13 +91,12 @@ class SoundClip(NamedTuple):
         In nanoseconds of UTC.
     rate : int
         Samples a second.
-    samples : np.ndarray [shape=(n,)], float32
-        -1 to 1.
+    samples : np.ndarray [shape=(n,)], int16
     """
 
     start: int
     rate: int
-    samples: Float32
+    samples: Int16
 
     @property
     def end(self) -> int:
@@ -116,7 +117,7 @@ class LabellingTimeline:
         A column for each class.
     novelty : np.ndarray [shape=(count,)], float64, or None
     frames : list of FrameValues
-        The probabilities, frame by frame.
+        The probabilities, frame by frame; none of more than three hours, see `read_frames`.
     """
 
     name: str
@@ -139,11 +140,13 @@ class MicrophoneTimeline:
     level : np.ndarray [shape=(count,)], float64, or None
         Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
     level_frames : list of FrameValues
-        The level, frame by frame.
+        The level, frame by frame; none of more than three hours.
     floor : np.ndarray [shape=(count,)], float64, or None
         Level of the floor of the room, in the same unit; NaN where it is not known.
+    reviewed : LabelledSpans
+        What a person has looked at, with how it was chosen.
     gaps : LabelledSpans
-        Audio that was lost, with the reasons.
+        When nothing was heard, with the reasons.
     troubles : LabelledSpans
         Warnings and errors of the diagnostics.
     clips : list of SoundClip
@@ -155,6 +158,7 @@ class MicrophoneTimeline:
     level: Float64 | None
     level_frames: Sequence[FrameValues]
     floor: Float64 | None
+    reviewed: LabelledSpans
     gaps: LabelledSpans
     troubles: LabelledSpans
     clips: list[SoundClip]
@@ -196,6 +200,17 @@ class Timeline:
     coverage: Mapping[str, Coverage]
     every: int = 1
     losses: list[str] = field(default_factory=list)
+
+    @property
+    def clock(self) -> HomeClock:
+        """The clock of the home.
+
+        Raises
+        ------
+        DataError
+            If there is no such time zone.
+        """
+        return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)
 
 
 def no_spans() -> LabelledSpans:

@@ -1,5 +1,6 @@
 """The plots of a review and of a watch: which there are, how they look, and what they show."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -9,7 +10,9 @@ import numpy as np
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.review.timeline.model import MicrophoneTimeline, Timeline
+from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.times import NANOSECONDS
 
 _BRIGHT: Colour = (235, 215, 140)
 _GROUND: Colour = (200, 120, 90)
@@ -41,6 +44,11 @@ class PlotKind:
     scale: tuple[float, float] | None = None  # None fits the values
     live_scale: tuple[float, float] | None = None  # if another one, where values go on
 
+    @property
+    def view(self) -> str:
+        """Short name of the view."""
+        return re.split("[:,]", self.title)[0]
+
 
 SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
 _LEVELS = "Level, and floor of the room, in dBFS"
@@ -70,6 +78,8 @@ class Plot(NamedTuple):
         Middles of the spans, in nanoseconds of UTC.
     values : np.ndarray [shape=(n, k)], float64
         NaN where nothing was recorded.
+    length : int
+        Of a span, in nanoseconds.
     """
 
     kind: PlotKind
@@ -78,15 +88,30 @@ class Plot(NamedTuple):
     names: tuple[str, ...]
     times: Int64
     values: Float64
+    length: int = NANOSECONDS
+
+    @property
+    def title(self) -> str:
+        """Of a view of it."""
+        last = len(self.names) - 1
+        return self.kind.title.format(first=self.names[0], last=self.names[-1], end=last)
+
+    @property
+    def text(self) -> str:
+        """What stands beside it: what it shows, of bands each from below."""
+        if self.kind.style is not Style.BANDS:
+            return self.title
+        return f"From below: {', '.join(map(in_words, self.names))}"
 
 
 def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
     """Make the plots of a timeline, microphone by microphone in the order of `PLOTS`."""
-    times = timeline.grid.middles
+    grid = timeline.grid
+    times, length = grid.middles, grid.step
     for microphone in timeline.microphones.values():
         for kind, labelling, names, values in _values(microphone):
             rows = _shades(times, values) if kind is FEATURES else (times, values)
-            yield Plot(kind, microphone.name, labelling, names, *rows)
+            yield Plot(kind, microphone.name, labelling, names, *rows, length)
 
 
 def _values(

@@ -2,21 +2,31 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from time import time_ns
 
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import read_clips
-from hearthlog.analyzer.logs.coverage import coverage_of
+from hearthlog.analyzer.logs.coverage import Coverage, coverage_of
 from hearthlog.analyzer.logs.layers import TimedFile, find_timed_files, latest_records
 from hearthlog.analyzer.logs.local_time import home_zone
+from hearthlog.analyzer.logs.spans import joined, without
+from hearthlog.analyzer.logs.spans import one as one_span
 from hearthlog.analyzer.logs.typed_columns import decode_types
-from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
 from hearthlog.analyzer.review.timeline.collect import Collector
 from hearthlog.analyzer.review.timeline.decode import FIELDS, read_rows, shown_topic
 from hearthlog.analyzer.review.timeline.grid import Grid
-from hearthlog.analyzer.review.timeline.model import SoundClip, Timeline
+from hearthlog.analyzer.review.timeline.model import (
+    LabelledSpans,
+    MicrophoneTimeline,
+    SoundClip,
+    Timeline,
+)
+from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -30,6 +40,9 @@ from hearthlog.schemas.times import NANOSECONDS
 
 SHARES = 1_200  # of a timeline, at most: more than a screen has pixels
 MOST_CLIP_SECONDS = 3_600  # of kept sound that is shown: 115 MB
+MOST_FRAMES = 3 * 3600 * NANOSECONDS  # of which every frame is kept; a day's would be 90 MB
+_PART = 3600 * NANOSECONDS
+OFF = "the recorder was off"
 _SHORTEST = 2 * FRAME_NANOSECONDS  # of a share, so that each has a frame
 _WHOLE_BYTES = 2 << 30  # of logs that are read whole: about three days
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
@@ -103,8 +116,68 @@ def read_timeline(
         )
         for name in microphones
     }
+    for name, microphone in microphones.items():
+        microphone.gaps = _unheard(microphone, coverage[name], grid)
     home = str(home_zone(zone, latest_records(file.path for file in files)))
     return Timeline(grid, microphones, collector.lines(), home, coverage, reader.every, losses)
+
+
+def read_frames(
+    timeline: Timeline, start: int | None = None, end: int | None = None
+) -> Iterator[Timeline]:
+    """Read the frames of a timeline that is too long to keep them, an hour at a time.
+
+    Parameters
+    ----------
+    timeline : Timeline
+    start, end : int, optional
+        In nanoseconds of UTC; by default from its start to its end.
+
+    Yields
+    ------
+    Timeline
+        With frames: the timeline itself if it has them. What cannot be read is left out.
+    """
+    start = timeline.grid.start if start is None else max(start, timeline.grid.start)
+    end = timeline.grid.end if end is None else min(end, timeline.grid.end)
+    if timeline.grid.end - timeline.grid.start <= MOST_FRAMES:
+        yield timeline
+        return
+    logs = [
+        log
+        for one in timeline.coverage.values()
+        for log in zip(one.logs, one.starts, one.ends, strict=True)
+    ]
+    # The last labels before a log begins may be in it: a part ends before them.
+    begins = sorted({time - _LATE for _, begin, stop in logs for time in range(begin, stop, _PART)})
+    edges = [start]
+    for time in begins:
+        if edges[-1] + 2 * _LATE < time < end - 2 * _LATE:
+            edges.append(time)
+    for span in pairwise([*edges, end]):
+        near = {log for log, begin, stop in logs if begin < span[1] and stop > span[0]}
+        try:
+            part = read_timeline(near, *span, zone=timeline.zone)
+        except (LogError, DataError):
+            continue
+        yield part
+
+
+def _unheard(microphone: MicrophoneTimeline, coverage: Coverage, grid: Grid) -> LabelledSpans:
+    """Add to the gaps of a recorder when it was off, as far as that is past."""
+    gaps = microphone.gaps
+    spans = [gaps, *(one.spans for one in microphone.labellings)]
+    past = max(time_ns(), *coverage.ends, grid.start)
+    whole = one_span(grid.start, min(grid.end, past))
+    starts = np.concatenate([coverage.starts, *(each.starts for each in spans)]).astype(np.int64)
+    ends = np.concatenate([coverage.ends, *(each.ends for each in spans)]).astype(np.int64)
+    recorded = joined(starts, ends, NANOSECONDS)
+    off = without(whole, recorded)
+    starts = np.concatenate([gaps.starts, off.starts])
+    order = np.argsort(starts, kind="stable")
+    ends = np.concatenate([gaps.ends, off.ends])
+    texts = np.concatenate([gaps.texts, np.full(len(off.starts), OFF, object)])
+    return LabelledSpans(starts[order], ends[order], texts[order])
 
 
 def _nothing(losses: Sequence[str], *, limited: bool) -> DataError:
@@ -113,12 +186,18 @@ def _nothing(losses: Sequence[str], *, limited: bool) -> DataError:
     return DataError(f"no features, labels, segments or gaps {where}{first}")
 
 
+def _as_kept(samples: Float32) -> Int16:
+    """Return 16-bit samples: those of an hour are large."""
+    return np.clip(np.rint(samples * 32768.0), -32768, 32767).astype(np.int16)
+
+
 class _Reader:
     """Reads one log or layer after the other, in the order of time."""
 
     def __init__(self, grid: Grid, every: int) -> None:
         self.every = every
-        self.collector = Collector(grid, sampled=every > 1)
+        frames = every == 1 and grid.end - grid.start <= MOST_FRAMES
+        self.collector = Collector(grid, sampled=every > 1, frames=frames)
         self._grid = grid
         self._clip_seconds = 0.0
         self._layers: dict[tuple[Path, str], Path] = {}
@@ -136,6 +215,7 @@ class _Reader:
         self._read_messages(file, types)
         if not file.layer:  # last, for a damaged layer must not hide its log
             self.collector.add_marks(read_marks(file.path))
+            self.collector.add_reviewed(read_reviewed(file.path))
 
     def _read_messages(self, file: TimedFile, types: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
@@ -202,4 +282,4 @@ class _Reader:
                         f"{path}: more than {MOST_CLIP_SECONDS // 60} minutes of sound: what comes "
                         "later is not shown; name a shorter span with --start and --end"
                     )
-                self.collector.add_clip(name.microphone, SoundClip(start, rate, samples))
+                self.collector.add_clip(name.microphone, SoundClip(start, rate, _as_kept(samples)))

@@ -10,11 +10,14 @@ import soundfile
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import Colour
+from hearthlog.analyzer.logs.spans import Spans
+from hearthlog.analyzer.review.timeline.home_clock import HomeClock
 from hearthlog.analyzer.review.timeline.model import FrameValues, LogLines, SoundClip
+from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
-TIMELINE = "time"
-_LAYERS = 4  # of translucent bands, one on the other: opaque enough
+_STROKE_WIDTH = 2.0  # pixels
+_LEAST_SHARE = 0.004  # below, a band is less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
 _HEAT_SQUARE = 6.5  # half its side: from afar squares overlap, close up they lie apart
 _DARK_TO_BRIGHT = np.array(  # through purple and red, as matplotlib's magma
@@ -26,17 +29,65 @@ _LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "CRITICAL"}
 class Canvas:
     """Draws arrays into a recording. Times are nanoseconds of UTC, shape (n,).
 
+    Rerun has axes of UTC only; so it is told, as if it were UTC, what the clock of the home shows.
+
     Parameters
     ----------
     recording : rr.RecordingStream
         Goes to a file, or to a viewer.
+    clock : HomeClock
+        Names the axis of time.
     """
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
+    def __init__(self, recording: rr.RecordingStream, clock: HomeClock) -> None:
         self.recording = recording
+        self.clock = clock
 
-    def configure_lane(self, entity: str, colours: Mapping[str, Colour]) -> None:
-        """Give the states of a lane their colours.
+    def draw_strips(
+        self, entity: str, places: tuple[float, float], spans: Spans, name: str, colour: Colour
+    ) -> None:
+        """Draw spans as strips, which round ends keep visible from afar.
+
+        Parameters
+        ----------
+        entity : str
+            Path of the strips in the recording.
+        places : (float, float)
+            Where they lie, in the unit of the view, and how thick they are, in points of the screen
+            at any zoom.
+        spans : Spans
+            At least one, in the order of time.
+        name : str
+            Is shown at the mouse.
+        colour : Colour
+            Red, green and blue, 0 to 255.
+        """
+        height, thickness = places
+        style = rr.SeriesLines(
+            names=[name], colors=[colour], widths=[thickness], aggregation_policy="off"
+        )
+        self.recording.log(entity, style, static=True)
+        starts, ends = spans  # a hole before each, or the first one is cut off in the middle
+        times = np.stack([starts, starts, ends, ends], axis=1).ravel()
+        heights = np.tile([np.nan, height, height, np.nan], len(starts))
+        column = rr.Scalars.columns(scalars=heights)
+        self.recording.send_columns(entity, [self._time_column(times)], column)
+
+    def hide(self, entity: str) -> None:
+        """Show strips no more; a recording cannot forget what it was told."""
+        self.recording.log(entity, rr.SeriesLines(visible_series=[False]), static=True)
+
+    def begin(self, entity: str, time: int) -> None:
+        """Put an empty text at a time (ns of UTC): a viewer's cursor begins where data does."""
+        text = rr.TextDocument.columns(text=[""])
+        self.recording.send_columns(entity, [self._time_column(np.array([time]))], text)
+
+    def write(self, entity: str, text: str) -> None:
+        """Set the text of an entity that shows one."""
+        self.recording.log(entity, rr.TextDocument(text), static=True)
+
+    def configure_states(self, entity: str, colours: Mapping[str, Colour]) -> None:
+        """Give the states of a lane their colours, and names in words.
 
         Parameters
         ----------
@@ -46,7 +97,7 @@ class Canvas:
             By state: red, green and blue, 0 to 255.
         """
         style = rr.StateConfiguration(
-            values=list(colours), labels=list(colours), colors=list(colours.values())
+            values=list(colours), labels=[*map(in_words, colours)], colors=[*colours.values()]
         )
         self.recording.log(entity, style, static=True)
 
@@ -56,17 +107,17 @@ class Canvas:
         Parameters
         ----------
         entity : str
-            Configured by `configure_lane`.
+            Configured by `configure_states`.
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
         states : sequence of (str or None)
             n of them; None is no state.
         """
         column = rr.StateChange.columns(state=pa.array(states, pa.string()))
-        self.recording.send_columns(entity, [_time_column(times)], column)
+        self.recording.send_columns(entity, [self._time_column(times)], column)
 
     def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set names and colours of the bands of an entity, which gets a child for each layer.
+        """Set names and colours of the bands of an entity.
 
         Parameters
         ----------
@@ -77,32 +128,36 @@ class Canvas:
         colours : sequence of Colour
             Of each: red, green and blue, 0 to 255.
         """
-        for layer in range(_LAYERS):
-            style = rr.Measurements.from_fields(
-                colors=colours, widths=[0.0] * len(names), names=names if layer == 0 else None
-            )
-            self.recording.log(f"{entity}/{layer}", style, static=True)
+        widths = [_STROKE_WIDTH] * len(names)
+        style = rr.SeriesLines(
+            names=names, colors=colours, widths=widths, aggregation_policy="MinMax"
+        )
+        self.recording.log(entity, style, static=True)
 
-    def add_bands(self, entity: str, times: Int64, shares: Float64) -> None:
-        """Stack shares of one as bands.
+    def add_bands(
+        self, entity: str, times: Int64, shares: Float64, length: int, strokes: int = 1
+    ) -> None:
+        """Stack shares of one as bands: each is filled by a line that goes up and down in it.
 
         Parameters
         ----------
         entity : str
             Configured by `configure_bands`.
         times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
+            Middles of spans, in nanoseconds of UTC.
         shares : np.ndarray [shape=(n, k)], float64
             0 to 1; NaN where there is nothing.
+        length : int
+            Of a span, in nanoseconds.
+        strokes : int, optional
+            In each span: fewer than the pixels of a span leave holes between.
         """
-        half = shares / 2
-        middles = np.cumsum(shares, axis=1) - half
-        lengths = [shares.shape[1]] * len(times)
-        columns = rr.Measurements.columns(
-            values=middles.ravel(), variances=(half * half).ravel()
-        ).partition(lengths)
-        for layer in range(_LAYERS):
-            self.recording.send_columns(f"{entity}/{layer}", [_time_column(times)], columns)
+        upper = np.cumsum(shares, axis=1)
+        lower = np.where(shares < _LEAST_SHARE, np.nan, upper - shares)
+        ends = np.tile(np.stack([lower, upper], axis=1), (1, strokes, 1))
+        steps = (np.arange(2 * strokes) + 0.5) / (2 * strokes) - 0.5
+        places = times[:, np.newaxis] + (steps * length).astype(np.int64)
+        self.draw_lines(entity, places.ravel(), ends.reshape(-1, shares.shape[1]))
 
     def configure_lines(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
         """Set names and colours of the lines of an entity.
@@ -135,11 +190,15 @@ class Canvas:
         for first in range(0, len(times), _ROWS_AT_ONCE):
             part = values[first : first + _ROWS_AT_ONCE]
             column = rr.Scalars.columns(scalars=part.ravel()).partition([width] * len(part))
-            stamps = _time_column(times[first : first + _ROWS_AT_ONCE])
+            stamps = self._time_column(times[first : first + _ROWS_AT_ONCE])
             self.recording.send_columns(entity, [stamps], column)
 
-    def draw_frames(self, entity: str, names: Sequence[str], parts: Iterable[FrameValues]) -> None:
+    def draw_frames(
+        self, entity: str, names: Sequence[str], parts: Iterable[FrameValues], step: float
+    ) -> None:
         """Draw frames as lines, interrupted where frames are missing.
+
+        A frame whose values are those of both its neighbours is left out.
 
         Parameters
         ----------
@@ -149,9 +208,15 @@ class Canvas:
             Of its lines; every part has some of them.
         parts : iterable of FrameValues
             Each of at least one frame.
+        step : float
+            To whose multiples values are rounded.
         """
         for part in parts:
-            self.draw_lines(entity, *_with_holes(part, names))
+            times, values = _with_holes(part, names)
+            rounded = np.rint(values / step) * step
+            changes = np.append(True, (rounded[1:] != rounded[:-1]).any(axis=1))
+            kept = changes | np.append(changes[1:], True)
+            self.draw_lines(entity, times[kept], rounded[kept])
 
     def configure_heat_map(self, entity: str, names: Sequence[str]) -> None:
         """Set the names of the rows of a heat map.
@@ -191,7 +256,7 @@ class Canvas:
             *rr.SeriesPoints.columns(colors=colours.round().astype(np.uint8).reshape(-1, 3))
             .partition(lengths),
         ]  # fmt: skip
-        self.recording.send_columns(entity, [_time_column(times)], columns)
+        self.recording.send_columns(entity, [self._time_column(times)], columns)
 
     def write_lines(self, entity: str, lines: LogLines) -> None:
         """Add lines of text, each at its time and with its level.
@@ -205,28 +270,43 @@ class Canvas:
         if len(lines.times):
             levels = [_LEVELS.get(level, "INFO") for level in lines.levels.tolist()]
             column = rr.TextLog.columns(text=lines.texts.tolist(), level=levels)
-            self.recording.send_columns(entity, [_time_column(lines.times)], column)
+            self.recording.send_columns(entity, [self._time_column(lines.times)], column)
 
-    def show_clip(self, entity: str, clip: SoundClip) -> None:
-        """Add a clip of sound at its start.
+    def show_clips(self, entity: str, clips: Sequence[SoundClip], start: int) -> None:
+        """Add clips of sound, each at its start; between them is a moment of silence.
+
+        A viewer shows what came last, however long ago, and an error where nothing came yet.
 
         Parameters
         ----------
         entity : str
-            Path of the clip in the recording.
-        clip : SoundClip
+            Path of the clips in the recording.
+        clips : sequence of SoundClip
+            At least one, in the order of time.
+        start : int
+            From when on the viewer looks, in nanoseconds of UTC.
         """
+        rate = clips[0].rate
+        silence = np.zeros(rate // 10, np.int16)
+        quiet = {min(start, clips[0].start), *(clip.end for clip in clips)}
+        for time in sorted(quiet - {clip.start for clip in clips}):
+            self._show_clip(entity, SoundClip(time, rate, silence))
+        for clip in clips:
+            self._show_clip(entity, clip)
+
+    def _show_clip(self, entity: str, clip: SoundClip) -> None:
         stream = io.BytesIO()
         soundfile.write(stream, clip.samples, clip.rate, format="FLAC", subtype="PCM_16")
-        self.recording.set_time(TIMELINE, timestamp=np.datetime64(clip.start, "ns"))
+        start = np.datetime64(self.clock.shown(clip.start), "ns")
+        self.recording.set_time(self.clock.name, timestamp=start)
         self.recording.log(
             entity, rr.AssetAudio(contents=stream.getvalue(), media_type="audio/flac")
         )
         self.recording.reset_time()
 
-
-def _time_column(times: Int64) -> rr.TimeColumn:
-    return rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))
+    def _time_column(self, times: Int64) -> rr.TimeColumn:
+        shown = self.clock.shown(times).astype("datetime64[ns]")
+        return rr.TimeColumn(self.clock.name, timestamp=shown)
 
 
 def _with_holes(part: FrameValues, names: Sequence[str]) -> tuple[Int64, Float64]:

@@ -1,22 +1,120 @@
 """Draw a timeline: which entity of a Rerun recording shows what."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.colours import colour
-from hearthlog.analyzer.review.timeline.lanes import MARKS, Changes, Lane, timeline_lanes
+from hearthlog.analyzer.colours import Colour, colour
+from hearthlog.analyzer.logs.spans import Spans, rows_at
+from hearthlog.analyzer.review.timeline.lanes import REVIEWED, Lane, timeline_lanes
 from hearthlog.analyzer.review.timeline.model import FrameValues, Timeline
-from hearthlog.analyzer.review.timeline.plots import LEVEL, Plot, Style, timeline_plots
+from hearthlog.analyzer.review.timeline.plots import LEVEL, SHARES, Plot, Style, timeline_plots
 from hearthlog.analyzer.review.viewer.canvas import Canvas
-from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.schemas.times import NANOSECONDS
 
-OVERVIEW, DETAIL = "lanes", "exact"  # entities of all lanes
-LINES, CLIP = "events", "clip"
+LINES, CLIP, WORDS = "events", "clip", "words"
+NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # behind the name of a microphone
+ASKED = "asked"
+_CLOSE_KINDS = SHARES, LEVEL  # of plots
+_SHARE_STEP, _LEVEL_STEP = 0.01, 0.1  # less is not seen
+_CLOSE_STROKES = 1_200  # of a band
+_AROUND_ASKED: Colour = (38, 44, 54)
+_ASKED: Colour = (245, 240, 225)
+
+_THICK, _THIN = 12.0, 8.0  # in points of the screen
+_Strip = tuple[int, int, str]
 
 
-def draw(timeline: Timeline, canvas: Canvas) -> None:
+class DrawnLane:
+    """A lane as it is drawn; what is drawn can be hidden, but not changed.
+
+    Parameters
+    ----------
+    root : str
+        Entity of all of it.
+    height : float
+        Where it lies, in the unit of the view.
+    long : int
+        Nanoseconds: what is shorter is drawn thinner, or many short sounds look like a long one.
+    """
+
+    def __init__(self, root: str, height: float, long: int) -> None:
+        self._root, self._height, self._long = root, height, long
+        self._parts: dict[str, set[_Strip]] = {}
+        self._count = 0
+
+    def show(self, lane: Lane, canvas: Canvas) -> None:
+        """Draw what is new, and hide what is gone; long sounds lie under short ones.
+
+        Parameters
+        ----------
+        lane : Lane
+            All that it has now.
+        canvas : Canvas
+            Is drawn on.
+        """
+        starts, ends, texts = lane.spans
+        wanted = set(zip(starts.tolist(), ends.tolist(), texts, strict=True))
+        for entity, part in list(self._parts.items()):
+            if not part <= wanted:
+                canvas.hide(entity)
+                del self._parts[entity]
+        fresh = wanted.difference(*self._parts.values())
+        parts = self._divide(fresh).items()
+        for (is_long, text), strips in sorted(parts, key=lambda part: -_length(part[1])):
+            layer = 0 if text == REVIEWED else 1  # the viewer draws in the order of names
+            places = self._height, _THICK if is_long else _THIN
+            entity = f"{self._root}/{layer}/{self._count:06}"
+            times = np.array(sorted(strip[:2] for strip in strips))
+            spans = Spans(times[:, 0], times[:, 1])
+            canvas.draw_strips(entity, places, spans, text, lane.colours[text])
+            self._parts[entity] = strips
+            self._count += 1
+
+    def _divide(self, strips: Iterable[_Strip]) -> dict[tuple[bool, str], set[_Strip]]:
+        found: dict[tuple[bool, str], set[_Strip]] = {}
+        for start, end, text in strips:
+            found.setdefault((end - start >= self._long, text), set()).add((start, end, text))
+        return found
+
+
+class LanePlace(NamedTuple):
+    """Where a lane is: its entity, that of its name, and its height in the view, a unit each."""
+
+    entity: str
+    name: str
+    height: float
+
+
+def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
+    """Find a place for each lane: those of the labellings of a microphone are in the same ones.
+
+    Parameters
+    ----------
+    lanes : sequence of Lane
+        As `timeline_lanes` yields them.
+    """
+    names: dict[str, dict[str, None]] = {}
+    for lane in lanes:
+        names.setdefault(lane.microphone, {})[lane.name] = None
+    places = []
+    for lane in lanes:
+        own = list(names[lane.microphone])
+        number = own.index(lane.name)
+        root = lanes_entity(lane.microphone, lane.labelling)
+        name = f"{lane.microphone}/{WORDS}/{number:02}"
+        places.append(LanePlace(f"{root}/{number:02}", name, len(own) - number - 0.5))
+    return places
+
+
+def lanes_entity(microphone: str, labelling: str) -> str:
+    """Name the entity of the lanes of a labelling, or, without one, of those beside all."""
+    return f"{microphone}/lanes/{_word(labelling) or 'all'}"
+
+
+def draw(timeline: Timeline, canvas: Canvas) -> dict[str, DrawnLane]:
     """Draw all of a timeline but the single frames.
 
     Parameters
@@ -25,38 +123,86 @@ def draw(timeline: Timeline, canvas: Canvas) -> None:
     canvas : Canvas
         Is drawn on.
 
+    Returns
+    -------
+    dict of str to DrawnLane
+        By microphone: what is reviewed, to show it again when there is more of it.
+
     Raises
     ------
     DataError
         If there is no such time zone as the timeline's.
     """
-    for root in (OVERVIEW, DETAIL):
-        for lane in timeline_lanes(timeline, detail=root == DETAIL):
-            _draw_lane(lane, root, canvas)
+    reviewed = {}
+    lanes = list(timeline_lanes(timeline))
+    canvas.begin(NOTHING, timeline.grid.start)
+    for lane, place in zip(lanes, lane_places(lanes), strict=True):
+        canvas.write(place.name, lane.name)
+        drawn = DrawnLane(place.entity, place.height, timeline.grid.step)
+        drawn.show(lane, canvas)
+        if lane.name == REVIEWED and not lane.labelling:
+            reviewed[lane.microphone] = drawn
     _draw_plots(timeline, canvas)
+    for plot in timeline_plots(timeline):
+        canvas.write(text_entity(plot), plot.text)
     for microphone in timeline.microphones.values():
-        for clip in microphone.clips:
-            canvas.show_clip(f"{microphone.name}/{CLIP}", clip)
+        if microphone.clips:
+            canvas.show_clips(f"{microphone.name}/{CLIP}", microphone.clips, timeline.grid.start)
     canvas.write_lines(LINES, timeline.lines)
+    return reviewed
 
 
-def draw_close_up(timeline: Timeline, canvas: Canvas) -> None:
-    """Draw the plots of a short timeline beside those of the longer timeline around it.
+def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
+    """Draw what close-ups show of a short timeline beside the longer timeline around it.
 
     Parameters
     ----------
     timeline : Timeline
         The short one.
+    before : Spans
+        What is drawn close up already, and is not drawn again.
     canvas : Canvas
         Is drawn on.
     """
-    _draw_plots(timeline, canvas, CLOSE_UP)
+    strokes = -(-_CLOSE_STROKES // timeline.grid.count)
+    for plot in timeline_plots(timeline):
+        if plot.kind in _CLOSE_KINDS:
+            entity = plot_entity(plot, CLOSE_UP)
+            if not len(before.starts):
+                configure_plot(plot, entity, canvas)
+            new = rows_at(before, plot.times) < 0
+            part = plot._replace(times=plot.times[new], values=plot.values[new])
+            add_to_plot(part, entity, canvas, strokes)
+
+
+def draw_asked(changes: Sequence[int], start: int, end: int, text: str, canvas: Canvas) -> None:
+    """Draw which span is asked, and beside it on which side it is.
+
+    Parameters
+    ----------
+    changes : sequence of int
+        Start of all that is shown, then start and end of this span and of those that were asked
+        before it, in nanoseconds of UTC, ascending.
+    start, end : int
+        Of the span.
+    text : str
+        What is asked.
+    canvas : Canvas
+        Is drawn on.
+    """
+    earlier, later = f"{text} >", f"< {text}"
+    times = np.array(changes)
+    inside = (times >= start) & (times < end)
+    states = np.where(inside, text, np.where(times < start, earlier, later))
+    colours = {earlier: _AROUND_ASKED, text: _ASKED, later: _AROUND_ASKED}
+    canvas.configure_states(ASKED, colours)
+    canvas.change_states(ASKED, times, states.tolist())
 
 
 def draw_frames(
     timeline: Timeline, canvas: Canvas, start: int | None = None, end: int | None = None
 ) -> None:
-    """Draw every frame of a span of a timeline.
+    """Draw the frames of a span: all probabilities, and the level five times a second.
 
     Parameters
     ----------
@@ -72,26 +218,13 @@ def draw_frames(
                 entity = frames_entity(microphone.name, labelling.name)
                 names = labelling.probabilities.names
                 canvas.configure_lines(entity, names, [colour(name) for name in names])
-                canvas.draw_frames(entity, names, _between(labelling.frames, start, end))
+                parts = _between(labelling.frames, start, end)
+                canvas.draw_frames(entity, names, parts, _SHARE_STEP)
         if microphone.level_frames:
             entity = frames_entity(microphone.name, LEVEL.name)
             canvas.configure_lines(entity, ["level"], [LEVEL.colour])
-            canvas.draw_frames(entity, ["level"], _between(microphone.level_frames, start, end))
-
-
-def redraw_marks(microphone: str, changes: Changes, canvas: Canvas) -> None:
-    """Draw the marks of a microphone again, in both lanes that show them.
-
-    Parameters
-    ----------
-    microphone : str
-    changes : Changes
-        The label at each time, None for no mark.
-    canvas : Canvas
-        Is drawn on.
-    """
-    for root in (OVERVIEW, DETAIL):
-        _draw_lane(Lane(MARKS, microphone, REVIEW, changes), root, canvas)
+            parts = map(_level_means, _between(microphone.level_frames, start, end))
+            canvas.draw_frames(entity, ["level"], parts, _LEVEL_STEP)
 
 
 def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
@@ -114,7 +247,7 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
         canvas.configure_lines(entity, plot.names, [plot.kind.colour])
 
 
-def add_to_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
+def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> None:
     """Draw values into a plot that is configured.
 
     Parameters
@@ -125,31 +258,15 @@ def add_to_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
         Configured by `configure_plot`.
     canvas : Canvas
         Is drawn on.
+    strokes : int, optional
+        As of `Canvas.add_bands`.
     """
     if plot.kind.style is Style.BANDS:
-        canvas.add_bands(entity, plot.times, plot.values)
+        canvas.add_bands(entity, plot.times, plot.values, plot.length, strokes)
     elif plot.kind.style is Style.HEAT_MAP:
         canvas.add_shades(entity, plot.times, plot.values)
     else:
         canvas.draw_lines(entity, plot.times, plot.values)
-
-
-def lane_entity(root: str, lane: Lane) -> str:
-    """Name the entity of a lane; the viewer shows lanes in the order of their names.
-
-    Parameters
-    ----------
-    root : str
-        `OVERVIEW` or `DETAIL`.
-    lane : Lane
-
-    Returns
-    -------
-    str
-        As `lanes/<microphone>/1_live`; the clock is in no microphone.
-    """
-    folder = f"{root}/{lane.microphone}" if lane.microphone else root
-    return f"{folder}/{lane.kind.place}_{_word(lane.name)}"
 
 
 def plot_entity(plot: Plot, close_up: str = "") -> str:
@@ -170,6 +287,12 @@ def plot_entity(plot: Plot, close_up: str = "") -> str:
     return f"{plot.microphone}{close_up}{labelling}/{plot.kind.name}"
 
 
+def text_entity(plot: Plot) -> str:
+    """Name the entity of the words beside a plot, and beside others in the same view."""
+    labelling = f"/{_word(plot.labelling)}" if plot.kind.style is Style.BANDS else ""
+    return f"{plot.microphone}/{WORDS}/{_word(plot.kind.view)}{labelling}"
+
+
 def frames_entity(microphone: str, name: str) -> str:
     """Name the entity of the frames of a labelling, or of the level.
 
@@ -182,16 +305,14 @@ def frames_entity(microphone: str, name: str) -> str:
     return f"{microphone}/frames/{_word(name)}"
 
 
-def _draw_lane(lane: Lane, root: str, canvas: Canvas) -> None:
-    entity = lane_entity(root, lane)
-    canvas.configure_lane(entity, lane.colours)
-    canvas.change_states(entity, *lane.changes)
+def _length(strips: Iterable[_Strip]) -> int:
+    return sum(end - start for start, end, _ in strips)
 
 
-def _draw_plots(timeline: Timeline, canvas: Canvas, close_up: str = "") -> None:
+def _draw_plots(timeline: Timeline, canvas: Canvas) -> None:
     for plot in timeline_plots(timeline):
         if len(plot.times):
-            entity = plot_entity(plot, close_up)
+            entity = plot_entity(plot)
             configure_plot(plot, entity, canvas)
             add_to_plot(plot, entity, canvas)
 
@@ -205,6 +326,15 @@ def _between(
         last = len(times) if end is None else int(np.searchsorted(times, end))
         if first < last:
             yield FrameValues(names, times[first:last], values[first:last])
+
+
+def _level_means(part: FrameValues) -> FrameValues:
+    """Average the level over each fifth of a second: a room's noise has no use for more."""
+    fifths = part.times // (NANOSECONDS // 5)
+    first = np.flatnonzero(np.diff(fifths, prepend=-1))
+    sizes = np.diff(first, append=len(part.times))
+    means = np.add.reduceat(part.values, first, axis=0) / sizes[:, np.newaxis]
+    return FrameValues(part.names, part.times[first], means.astype(np.float32))
 
 
 def _word(name: str) -> str:

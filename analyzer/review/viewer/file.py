@@ -1,11 +1,16 @@
 """A timeline in a file that Rerun's viewer opens."""
 
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import rerun as rr
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.review.timeline.model import Timeline
+from hearthlog.analyzer.review.timeline.read_timeline import read_frames
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import draw, draw_frames
 from hearthlog.analyzer.review.viewer.layout import APPLICATION, review_layout
@@ -51,18 +56,42 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     """
     check_output(output)
     try:
-        with new_file(output) as temporary, temporary.open("wb") as file:
-            rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
-            recording = rr.RecordingStream(APPLICATION)
-            stream = rr.binary_stream(recording)  # for `save` waits for ever where the disk is full
-            recording.send_blueprint(review_layout(timeline))
-            canvas = Canvas(recording)
-            name_recording(recording, timeline)
-            draw(timeline, canvas)
-            draw_frames(timeline, canvas)
-            file.write(stream.read() or b"")
+        with new_file(output) as temporary:
+            _write(timeline, temporary)
     except LogError as error:
         raise DataError(str(error)) from error
+
+
+def _write(timeline: Timeline, output: Path) -> None:
+    """Write a recording through a pipe: to a file, Rerun waits for ever where the disk is full."""
+    rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
+    recording = rr.RecordingStream(APPLICATION)
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as thread:
+        pipe = Path(folder, "recording")
+        os.mkfifo(pipe)
+        written = thread.submit(_copy, pipe, output)
+        recording.save(pipe)
+        try:
+            recording.send_blueprint(review_layout(timeline))
+            canvas = Canvas(recording, timeline.clock)
+            name_recording(recording, timeline)
+            draw(timeline, canvas)
+            for part in read_frames(timeline):
+                draw_frames(part, canvas)
+        finally:
+            recording.disconnect()
+        written.result()
+
+
+def _copy(pipe: Path, output: Path) -> None:
+    with pipe.open("rb") as source:
+        try:
+            with output.open("wb") as file:
+                shutil.copyfileobj(source, file)
+        except OSError:
+            while source.read(1 << 20):  # to its end, or nobody could close it
+                pass
+            raise
 
 
 def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
@@ -75,6 +104,6 @@ def name_recording(recording: rr.RecordingStream, timeline: Timeline) -> None:
     timeline : Timeline
         What it shows.
     """
-    start, end = timeline.grid.start, timeline.grid.end
+    start, end = (timeline.clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
     recording.send_recording_start_time_nanos(start)
     recording.send_recording_name(f"{time_text(start):.16} to {time_text(end):.16}")

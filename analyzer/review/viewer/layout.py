@@ -5,32 +5,39 @@ from collections.abc import Iterable, Sequence
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hearthlog.analyzer.review.timeline.lanes import timeline_lanes
+from hearthlog.analyzer.review.timeline.lanes import (
+    labelling_in_words,
+    labellings_of,
+    timeline_lanes,
+)
 from hearthlog.analyzer.review.timeline.model import MicrophoneTimeline, Timeline
 from hearthlog.analyzer.review.timeline.plots import (
     LEVEL,
-    PLOTS,
     SHARES,
     Plot,
-    PlotKind,
     Style,
     timeline_plots,
 )
-from hearthlog.analyzer.review.viewer.canvas import TIMELINE
 from hearthlog.analyzer.review.viewer.drawing import (
+    ASKED,
     CLIP,
     CLOSE_UP,
-    DETAIL,
     LINES,
-    OVERVIEW,
+    NOTHING,
     frames_entity,
+    lane_places,
+    lanes_entity,
     plot_entity,
+    text_entity,
 )
 
 APPLICATION = "hearthlog"
 # The viewer keeps the range that linked time axes share under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
-_HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
+# In points of a screen of 1366 x 768; on others they are in relation to each other.
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 190, 90
+_BELOW = 0.65  # of a lane: the axis of time
+_COLUMNS = (1, 9)  # of words, and of what they stand beside
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its height in relation to others
 
@@ -84,24 +91,12 @@ def tabs(views: Iterable[rrb.View | rrb.Container]) -> rrb.View | rrb.Container:
     return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
 
-def lanes_height(count: int) -> int:
-    """Return the height of a view of some lanes, in relation to that of other views.
-
-    Parameters
-    ----------
-    count : int
-        Number of lanes.
-    """
-    return _HEAD_HEIGHT + _LANE_HEIGHT * count
-
-
-def lanes_view(root: str, name: str) -> rrb.View:
-    """Make a view of all lanes below an entity.
+def states_view(root: str, name: str) -> rrb.View:
+    """Make a view of all lanes of states below an entity.
 
     Parameters
     ----------
     root : str
-        `OVERVIEW` or `DETAIL`.
     name : str
         Its title.
     """
@@ -113,51 +108,44 @@ def lines_view() -> rrb.View:
     return rrb.TextLogView(origin=LINES, name="Events")
 
 
-def plot_view(
-    kind: PlotKind,
-    entities: Sequence[str],
-    names: Sequence[str],
-    note: str = "",
-    *,
-    live: bool = False,
-) -> rrb.View:
+def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = False) -> rrb.View:
     """Show plots of one kind, or of kinds with the same title, in one view.
 
     Parameters
     ----------
-    kind : PlotKind
+    plots : sequence of Plot
+        At least one; the names of the last with the most of them count.
     entities : sequence of str
         Of the plots, at least one.
-    names : sequence of str
-        Of the columns, at least one.
-    note : str, optional
-        Behind the title.
     live : bool, optional
-        Whether new values come from the right.
+        Whether new values come from the right, and the view has a title and a legend.
     """
-    last = len(names) - 1
-    title = kind.title.format(first=names[0], last=names[-1], end=last) + note
+    plot = max(reversed(plots), key=lambda one: len(one.names))
+    kind = plots[0].kind
     scale = kind.live_scale or kind.scale if live else kind.scale
     if kind.style is Style.HEAT_MAP:
-        scale = (-0.5, last + 0.5)
-    legend = rrb.PlotLegend(
-        corner="LeftTop" if live else "RightTop",
-        visible=kind.style is Style.BANDS or len(entities) > 1,
-    )
-    return _time_series(title, entities, scale, legend)
+        scale = (-0.5, len(plot.names) - 0.5)
+    legend = live and (kind.style is Style.BANDS or len(entities) > 1)
+    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend)
 
 
 def _time_series(
-    name: str, entities: Sequence[str], scale: tuple[float, float] | None, legend: rrb.PlotLegend
+    name: str,
+    entities: Sequence[str],
+    scale: tuple[float, float] | None,
+    *,
+    titlebar: bool = False,
+    legend: bool = False,
 ) -> rrb.View:
     is_one = len(entities) == 1
     return rrb.TimeSeriesView(
         origin=entities[0] if is_one else "/",
         contents="$origin/**" if is_one else [f"{entity}/**" for entity in entities],
         name=name,
+        titlebar=titlebar,
         axis_x=_axis(),
         axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
-        plot_legend=legend,
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )
 
 
@@ -177,102 +165,120 @@ def review_layout(
     marking : bool, optional
         Whether the time panel is open, on whose ruler spans are marked with the mouse.
     close_up : bool, optional
-        Whether short spans are looked at: there is room for what is drawn of them.
+        Whether short spans are looked at: what is drawn of them comes first.
 
     Raises
     ------
     DataError
         If there is no such time zone as the timeline's.
     """
-    sampled = "" if timeline.every == 1 else f" (a sample: one part in {timeline.every})"
-    lanes = rrb.Tabs(
-        lanes_view(OVERVIEW, f"What was heard, from afar{sampled}: clock of the home, axes in UTC"),
-        lanes_view(DETAIL, "What was heard, exactly"),
-        active_tab=1 if close_up else 0,
-    )
-    height = lanes_height(sum(1 for _ in timeline_lanes(timeline, detail=False)))
+    clock = timeline.clock
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}
     for plot in timeline_plots(timeline):
         plots[plot.microphone].append(plot)
-    stacks = [_stack_plots(name, each, sampled, close_up=close_up) for name, each in plots.items()]
-    rows: list[Row] = [
-        (height, lanes),
-        (320 if close_up else 540, tabs(stacks)),
-        (120 if close_up else 160, _details(timeline, plots, close_up=close_up)),
-    ]
+    lanes = list(timeline_lanes(timeline))
+    places = list(zip(lanes, lane_places(lanes), strict=True))
+    stacks: dict[str, list[Row]] = {}
+    for name, microphone in timeline.microphones.items():
+        own = {place.name: place for lane, place in places if lane.microphone == name}
+        views = _lane_views(microphone, list(own), _note(timeline))
+        rows: list[Row] = [(_LANE * len(own) + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
+        more = _plot_views(microphone, plots[name], timeline.every, close_up=close_up)
+        level = [_beside(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
+        if close_up:
+            rows += [(_LEVEL_HEIGHT, view) for view in _sounds(microphone)]
+        elif marking or not more:
+            more[1:1] = level
+        else:
+            rows += [(_LEVEL_HEIGHT, view) for view in level]
+        stacks[name] = [*rows, (_PLOT_HEIGHT, tabs(more))] if more else rows
     panel = rrb.TimePanel(
-        state="expanded" if marking else "collapsed", timeline=TIMELINE, play_state="paused"
+        state="expanded" if marking else "collapsed", timeline=clock.name, play_state="paused"
     )
-    ends = (Boundary.absolute(nanos=time) for time in (timeline.grid.start, timeline.grid.end))
-    return TimelineBlueprint(rows, panel, *ends)
+    ends = (clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
+    boundaries = (Boundary.absolute(nanos=time) for time in ends)
+    height = max(sum(height for height, _ in rows) for rows in stacks.values())
+    asked: list[Row] = [(_ASKED_HEIGHT, states_view(ASKED, "Which span is asked"))]
+    whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
+    return TimelineBlueprint([*(asked if close_up else []), whole], panel, *boundaries)
 
 
-def _stack_plots(
-    microphone: str, plots: Sequence[Plot], sampled: str, *, close_up: bool
-) -> rrb.Vertical:
-    """Show the plots of a microphone; for close-ups its shares, and those of a short span."""
-    shares = [plot for plot in plots if plot.kind is SHARES]
-    rows: list[Row] = []
-    if shares:
-        rows.append((SHARES.height, tabs(_view(plot, sampled) for plot in shares)))
-    if shares and close_up:
-        rows.append((240, tabs(_view(plot, ", close up", CLOSE_UP) for plot in shares)))
-    if not close_up:
-        rows += _other_rows(plots)
-    return stack(rows or [(1, lines_view())], microphone)
+def _note(timeline: Timeline) -> str:
+    sampled = "" if timeline.every == 1 else f"; a sample: one part in {timeline.every}"
+    return f"{timeline.clock.name}{sampled}"
 
 
-def _view(plot: Plot, note: str = "", close_up: str = "") -> rrb.View:
-    name = f": {plot.labelling}" if plot.labelling else ""
-    return plot_view(plot.kind, [plot_entity(plot, close_up)], plot.names, name + note)
+def _lane_views(
+    microphone: MicrophoneTimeline, names: Sequence[str], note: str
+) -> list[rrb.Horizontal]:
+    """Show the lanes of each labelling, beside their names."""
+    labellings = [(one.name, labelling_in_words(one.name)) for one in labellings_of(microphone)]
+    count = len(names)
+    views = []
+    for labelling, words in labellings or [("", "")]:
+        entities = [lanes_entity(microphone.name, each) for each in dict.fromkeys((labelling, ""))]
+        lanes = _time_series(words, entities, (0.0, float(count)))
+        beside = rrb.Vertical(
+            *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, _BELOW]
+        )
+        by = f" by {words}" if words else ""
+        title = f"What was heard{by}: {note}"
+        views.append(rrb.Horizontal(beside, lanes, column_shares=_COLUMNS, name=title))
+    return views
 
 
-def _other_rows(plots: Sequence[Plot]) -> list[Row]:
-    """Show all but the shares; plots whose kinds have one title share a view."""
-    rows: list[Row] = []
-    for title in dict.fromkeys(kind.title for kind in PLOTS if kind is not SHARES):
-        same = [plot for plot in plots if plot.kind.title == title]
-        if same:
-            kind = same[0].kind
-            view = plot_view(kind, [plot_entity(plot) for plot in same], same[0].names)
-            rows.append((kind.height, view))
-    return rows
+def _text(entity: str) -> rrb.View:
+    return rrb.TextDocumentView(origin=entity, titlebar=False)
 
 
-def _details(
-    timeline: Timeline, plots: dict[str, list[Plot]], *, close_up: bool
-) -> rrb.View | rrb.Container:
-    microphones = timeline.microphones.values()
-    lines: rrb.View | rrb.Container = lines_view()
-    clips = [
-        rrb.AudioView(origin=f"{one.name}/{CLIP}", name=f"Sound that was kept: {one.name}")
-        for one in microphones
-        if one.clips
-    ]
-    if clips:
-        lines = rrb.Horizontal(*clips, lines, name="Sound and events")
-    views = [
-        view
-        for one in microphones
-        for view in (_close_views(plots[one.name]) if close_up else _frame_views(one))
-    ]
-    # Where spans are marked one after the other their sound comes first, else their level.
-    return rrb.Tabs(lines, *views) if clips or not close_up else rrb.Tabs(*views, lines)
-
-
-def _close_views(plots: Sequence[Plot]) -> list[rrb.View | rrb.Container]:
-    levels = [_view(plot, ", close up", CLOSE_UP) for plot in plots if plot.kind is LEVEL]
-    return [*levels, *(view for _, view in _other_rows(plots))]
-
-
-def _frame_views(microphone: MicrophoneTimeline) -> list[rrb.View]:
-    """Show every frame."""
-    scales = {one.name: SHARES.scale for one in microphone.labellings if one.frames}
-    if microphone.level_frames:
-        scales[LEVEL.name] = LEVEL.scale
-    rows = [(name, frames_entity(microphone.name, name), scales[name]) for name in scales]
-    no_legend = rrb.PlotLegend(visible=False)
+def _plot_views(
+    microphone: MicrophoneTimeline, plots: Sequence[Plot], every: int, *, close_up: bool
+) -> list[rrb.View | rrb.Container]:
+    """Show the plots of a microphone but the level; of close-ups what is drawn of them."""
+    first = [plot for plot in plots if plot.kind is SHARES]
+    if close_up:
+        first += [plot for plot in plots if plot.kind is LEVEL]
+    others = [same for same in _by_title(plots) if same[0].kind not in {LEVEL, SHARES}]
     return [
-        _time_series(f"{name}, 20 a second: zoom in", [entity], scale, no_legend)
+        *(_beside([plot], CLOSE_UP if close_up else "") for plot in first),
+        *map(_beside, reversed(others)),
+        *([] if close_up else [*_sounds(microphone), *_frame_views(microphone, every)]),
+    ]
+
+
+def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
+    titles = dict.fromkeys(plot.kind.title for plot in plots)
+    return [[plot for plot in plots if plot.kind.title == title] for title in titles]
+
+
+def _beside(plots: Sequence[Plot], close_up: str = "") -> rrb.Container:
+    """Show plots of one title, beside words on what they show."""
+    labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
+    note = ", close up" if close_up else ""
+    entities = [plot_entity(plot, close_up) for plot in plots]
+    return rrb.Horizontal(
+        _text(text_entity(plots[0])),
+        plot_view(plots, entities),
+        column_shares=_COLUMNS,
+        name=f"{plots[0].kind.view}{labelling}{note}",
+    )
+
+
+def _sounds(microphone: MicrophoneTimeline) -> list[rrb.View | rrb.Container]:
+    view = rrb.AudioView(origin=f"{microphone.name}/{CLIP}", name="Sound that was kept")
+    return [view] if microphone.clips else []
+
+
+def _frame_views(microphone: MicrophoneTimeline, every: int) -> list[rrb.View | rrb.Container]:
+    """Show frames, unless only a sample is read."""
+    known = [one for one in microphone.labellings if one.probabilities is not None]
+    scales = {one.name: SHARES.scale for one in known}
+    if microphone.level is not None:
+        scales[LEVEL.name] = LEVEL.scale
+    if every > 1:
+        return []
+    rows = [(name, frames_entity(microphone.name, name), scales[name]) for name in scales]
+    return [
+        _time_series(f"{labelling_in_words(name)}, frame by frame: zoom in", [entity], scale)
         for name, entity, scale in rows
     ]

@@ -1,34 +1,33 @@
 """A timeline that goes on: a server that viewers connect to, and leave, as they like."""
 
 from collections.abc import Iterable
+from datetime import UTC, tzinfo
 from typing import Self
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour
-from hearthlog.analyzer.review.timeline.lanes import Lane
+from hearthlog.analyzer.review.timeline.home_clock import home_clock
 from hearthlog.analyzer.review.timeline.live import Update
 from hearthlog.analyzer.review.timeline.model import LogLines
 from hearthlog.analyzer.review.timeline.plots import PLOTS, Plot
-from hearthlog.analyzer.review.viewer.canvas import TIMELINE, Canvas
+from hearthlog.analyzer.review.timeline.state_lanes import StateLane
+from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     LINES,
-    OVERVIEW,
     add_to_plot,
     configure_plot,
-    lane_entity,
     plot_entity,
 )
 from hearthlog.analyzer.review.viewer.layout import (
     Boundary,
     Row,
     TimelineBlueprint,
-    lanes_height,
-    lanes_view,
     lines_view,
     plot_view,
     stack,
+    states_view,
     tabs,
 )
 from hearthlog.analyzer.review.viewer.process import free_port
@@ -36,6 +35,9 @@ from hearthlog.analyzer.review.viewer.process import free_port
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
 _APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each
 _MEMORY = "200MB"
+_MOST_STROKES = 1_200  # of a band on the screen
+_STATES = "lanes"  # entity of all lanes
+_HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
 _MOST_STATES = 2_000  # of a lane that get the colours of their own
 
 Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names that it shows
@@ -74,8 +76,9 @@ class LiveServer:
         self.url = sink.uri
         self._recording.set_sinks(sink)
         self._recording.send_recording_name("live")
-        self._canvas = Canvas(self._recording)
+        self._canvas: Canvas | None = None  # until it is known what the clock of the home shows
         self._minutes = minutes
+        self._strokes = max(1, round(_MOST_STROKES / (60 * minutes)))
         self._plots: Plots = {}
         self._lanes: dict[str, dict[str, Colour]] = {}
         self._is_laid_out = True  # there is nothing to lay out
@@ -86,38 +89,54 @@ class LiveServer:
     def __exit__(self, *_: object) -> None:
         self._recording.disconnect()
 
-    def show(self, updates: Iterable[Update]) -> None:
+    def show(self, updates: Iterable[Update], zone: tzinfo = UTC) -> None:
         """Draw updates, and lay out the views anew where there is a new plot.
+
+        Where the clock of the home is changed, an axis of the new time begins.
 
         Parameters
         ----------
-        updates : iterable of (Plot, Lane or LogLines)
+        updates : iterable of (Plot, StateLane or LogLines)
             From `LiveTimeline.take`, in the order of time.
+        zone : tzinfo, optional
+            Of the home.
         """
         for update in updates:
-            if isinstance(update, LogLines):
-                self._canvas.write_lines(LINES, update)
-            elif isinstance(update, Lane):
-                self._show_lane(update)
-            elif len(update.times):
-                self._show_plot(update)
-        if not self._is_laid_out:
-            layout = _layout(self._plots, self._minutes)
+            times = update.changes.times if isinstance(update, StateLane) else update.times
+            if len(times):
+                self._show(update, self._canvas_at(int(times[-1]), zone))
+        if self._canvas is not None and self._plots and not self._is_laid_out:
+            layout = _layout(self._plots, self._minutes, self._canvas.clock.name)
             self._recording.send_blueprint(layout, make_active=True, make_default=True)
             self._is_laid_out = True
 
-    def _show_lane(self, lane: Lane) -> None:
-        entity = lane_entity(OVERVIEW, lane)
+    def _canvas_at(self, time: int, zone: tzinfo) -> Canvas:
+        clock = home_clock(zone, time, time + 1)
+        if self._canvas is None or self._canvas.clock != clock:
+            self._canvas = Canvas(self._recording, clock)
+            self._is_laid_out = False
+        return self._canvas
+
+    def _show(self, update: Update, canvas: Canvas) -> None:
+        if isinstance(update, LogLines):
+            canvas.write_lines(LINES, update)
+        elif isinstance(update, StateLane):
+            self._show_lane(update, canvas)
+        else:
+            self._show_plot(update, canvas)
+
+    def _show_lane(self, lane: StateLane, canvas: Canvas) -> None:
+        entity = f"{_STATES}/{lane.microphone}/{lane.kind.name}"
         states = {state for state in lane.changes.states if state is not None}
         if entity not in self._lanes and not states:
             return  # a lane is there once it has something to show
         colours = self._lanes.get(entity) or lane.kind.colours(lane.kind.states)
         if entity not in self._lanes or (states - colours.keys() and len(colours) < _MOST_STATES):
             self._lanes[entity] = lane.kind.colours(sorted(states)) | colours
-            self._canvas.configure_lane(entity, self._lanes[entity])
-        self._canvas.change_states(entity, *lane.changes)
+            canvas.configure_states(entity, self._lanes[entity])
+        canvas.change_states(entity, *lane.changes)
 
-    def _show_plot(self, plot: Plot) -> None:
+    def _show_plot(self, plot: Plot, canvas: Canvas) -> None:
         """Draw into the entity of the names; another model or feature set gets one of its own."""
         root = plot_entity(plot)
         same = self._plots.setdefault(root, [])
@@ -126,20 +145,20 @@ class LiveServer:
         entity = f"{root}/{len(names) if is_new else names.index(plot.names)}"
         if is_new:
             same.append(plot._replace(times=plot.times[:0], values=plot.values[:0]))
-            configure_plot(plot, entity, self._canvas)
+            configure_plot(plot, entity, canvas)
             self._is_laid_out = False
-        add_to_plot(plot, entity, self._canvas)
+        add_to_plot(plot, entity, canvas, self._strokes)
 
 
-def _layout(plots: Plots, minutes: float) -> TimelineBlueprint:
+def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
     """Lay out the views, whose time axes end with the newest data."""
     microphones = sorted({same[0].microphone for same in plots.values()})
     rows: list[Row] = [
-        (lanes_height(1 + len(microphones)), lanes_view(OVERVIEW, "What is heard")),
+        (_HEAD_HEIGHT + _LANE_HEIGHT * len(microphones), states_view(_STATES, "What is heard")),
         (580, tabs(_stack_plots(name, plots) for name in microphones)),
         (160, lines_view()),
     ]
-    panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
+    panel = rrb.TimePanel(state="collapsed", timeline=clock, play_state="following")
     ends = (Boundary.cursor_relative(seconds=seconds) for seconds in (-60 * minutes, 0.0))
     return TimelineBlueprint(rows, panel, *ends)
 
@@ -154,7 +173,7 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
             if same[0].kind.title == title and same[0].microphone == microphone
         }
         if shown:
-            kind = next(iter(shown.values()))[0].kind
-            names = max((plot.names for same in shown.values() for plot in same[::-1]), key=len)
-            rows.append((kind.height, plot_view(kind, list(shown), names, live=True)))
+            first = [plot for same in shown.values() for plot in same]
+            view = plot_view(first, list(shown), live=True)
+            rows.append((first[0].kind.height, view))
     return stack(rows, microphone)

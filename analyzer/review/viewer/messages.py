@@ -6,8 +6,6 @@ value.
 
 from collections.abc import Iterator
 
-from hearthlog.analyzer.review.viewer.canvas import TIMELINE
-
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _SIZES = {_FIXED64: 8, _FIXED32: 4}
 _STATE, _SET_TIME, _BLUEPRINT, _SET_BLUEPRINT = 3, 6, 12, 14  # operations
@@ -38,17 +36,18 @@ def set_blueprint(blueprint: str) -> bytes:
     return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
 
 
-def set_time(nanoseconds: int, *, play: bool) -> bytes:
+def set_time(axis: str, nanoseconds: int, *, play: bool) -> bytes:
     """Make the request to put the cursor on a time.
 
     Parameters
     ----------
+    axis : str
+        Name of the axis of time.
     nanoseconds : int
-        Of UTC.
     play : bool
         Whether the cursor runs from there on.
     """
-    timeline = _field(2, _field(1, TIMELINE.encode()))
+    timeline = _field(2, _field(1, axis.encode()))
     time = _field(3, _field(1, nanoseconds))
     return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
 
@@ -89,7 +88,7 @@ def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
     reports : list of list of str
         The errors of each view.
     cursor : int or None
-        In nanoseconds of UTC; None if there is no cursor.
+        In nanoseconds of the axis of time; None if there is no cursor.
 
     Raises
     ------

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import secrets
 import socket
 import subprocess
 import sys
@@ -70,6 +71,27 @@ def free_port(port: int | None = None, bind: str = HOST) -> int:
         return int(probe.getsockname()[1])
 
 
+def hidden_address() -> str:
+    """Return an address of this machine that no web page can guess.
+
+    Rerun's servers answer whoever reaches them. A page in a browser reaches all of this machine, by
+    a name that it lets point there, but it would have to try 16 million addresses times some ten
+    thousand ports. Programs of this machine can look the address up.
+
+    Returns
+    -------
+    str
+        In 127.0.0.0/8; 127.0.0.1 on a system that has no other one, such as macOS.
+    """
+    address = ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
+    with socket.socket() as probe:
+        try:
+            probe.bind((address, 0))
+        except OSError:
+            return HOST
+    return address
+
+
 def check_display(instead: str) -> None:
     """Raise DataError where no window can be opened.
 
@@ -95,8 +117,8 @@ class ViewerProcess:
     ----------
     arguments : sequence of str
         Of its command line, beside the address and the port.
-    port : int
-        Where it listens, for this machine only.
+    port : int, optional
+        Where it listens, at a `hidden_address`; by default any.
 
     Raises
     ------
@@ -104,11 +126,12 @@ class ViewerProcess:
         If the viewer is not installed.
     """
 
-    def __init__(self, arguments: Sequence[str], port: int) -> None:
-        self.port = port
+    def __init__(self, arguments: Sequence[str], port: int | None = None) -> None:
+        self.address = hidden_address()
+        self.port = free_port(port, self.address)
         self._folder = tempfile.TemporaryDirectory(prefix="hearthlog-rerun-")
         self._log = Path(self._folder.name, "log.txt")
-        command = [str(program()), "--bind", HOST, "--port", str(port), *arguments]
+        command = [str(program()), "--bind", self.address, "--port", str(self.port), *arguments]
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - the program is the package's own
                 command,
@@ -128,7 +151,7 @@ class ViewerProcess:
     @property
     def url(self) -> str:
         """Where the viewer takes data: `rerun+http://…/proxy`."""
-        return f"rerun+http://{HOST}:{self.port}/proxy"
+        return f"rerun+http://{self.address}:{self.port}/proxy"
 
     def is_running(self) -> bool:
         """Tell whether the viewer runs; its user may have closed the window."""
@@ -145,7 +168,7 @@ class ViewerProcess:
         deadline = time.monotonic() + _WAIT_SECONDS
         while time.monotonic() < deadline:
             with socket.socket() as probe:
-                if probe.connect_ex((HOST, self.port)) == 0:
+                if probe.connect_ex((self.address, self.port)) == 0:
                     return
             if not self.is_running():
                 raise self.failed()

@@ -8,14 +8,17 @@ import numpy as np
 import rerun as rr
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.timeline.lanes import Changes, changes
+from hearthlog.analyzer.logs.spans import NONE, joined
+from hearthlog.analyzer.review.timeline.home_clock import HomeClock
+from hearthlog.analyzer.review.timeline.lanes import reviewed_lane
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
+    DrawnLane,
     draw,
+    draw_asked,
     draw_close_up,
     draw_frames,
-    redraw_marks,
 )
 from hearthlog.analyzer.review.viewer.file import name_recording
 from hearthlog.analyzer.review.viewer.layout import APPLICATION, SHARED_AXIS, review_layout
@@ -39,7 +42,7 @@ class ViewerState(NamedTuple):
     errors : list of str
         Those that views report.
     cursor : int or None
-        The time cursor, in nanoseconds of UTC.
+        The time cursor, in nanoseconds of the clock of the home.
     """
 
     version: str
@@ -68,13 +71,15 @@ class ViewerControl(Protocol):
             As `blueprint` returns it, for JSON.
         """
 
-    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
         """Put the cursor of the viewer on a time.
 
         Parameters
         ----------
+        axis : str
+            Name of the clock of the home.
         nanoseconds : int
-            Of UTC.
+            Of that clock.
         play : bool
             Whether the cursor runs from there on.
         """
@@ -116,8 +121,10 @@ class Viewer:
         self.address = address
         self._control = control
         self._recording = rr.RecordingStream(APPLICATION)
-        self._canvas = Canvas(self._recording)
-        self._times: dict[str, set[int]] = {}  # of changes in review lanes
+        self._canvas = Canvas(self._recording, HomeClock("", 0))
+        self._reviewed: dict[str, DrawnLane] = {}
+        self._asked: set[int] = set()  # times of changes in the lane of what is asked
+        self._close = NONE  # what was drawn close up
         self._sent = False
 
     def __enter__(self) -> Self:
@@ -161,10 +168,12 @@ class Viewer:
         process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
+        self._asked = {timeline.grid.start}
         layout = review_layout(timeline, marking=True, close_up=close_up)
         self._recording.connect_grpc(process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
-        draw(timeline, self._canvas)
+        self._canvas = Canvas(self._recording, timeline.clock)
+        self._reviewed = draw(timeline, self._canvas)
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
@@ -180,29 +189,41 @@ class Viewer:
         self._flush()
 
     def draw_close_up(self, timeline: Timeline) -> None:
-        """Draw a short timeline beside the longer one that it is a part of."""
-        draw_close_up(timeline, self._canvas)
+        """Draw a short timeline beside the longer one that it is a part of.
+
+        What was drawn close up before is left out: a viewer forgets nothing, and would draw both.
+        """
+        draw_close_up(timeline, self._close, self._canvas)
+        starts, ends = self._close
+        grid = timeline.grid
+        self._close = joined(np.append(starts, grid.start), np.append(ends, grid.end))
         self._flush()
 
-    def redraw_marks(self, microphone: str, marks: LabelledSpans) -> None:
-        """Draw the marks of a microphone again.
+    def ask(self, start: int, end: int, text: str) -> None:
+        """Draw which span is asked, in place of the one before.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC.
+        text : str
+            What is asked.
+        """
+        self._asked |= {start, end}
+        draw_asked(sorted(self._asked), start, end, text, self._canvas)
+        self._flush()
+
+    def redraw_marks(self, microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> None:
+        """Draw what is reviewed of a microphone again.
 
         Parameters
         ----------
         microphone : str
-        marks : LabelledSpans
-            All that it has now; a mark that was drawn before and is not among them goes away.
+        marks, reviewed : LabelledSpans
+            All that it has now; what was drawn before and is not among them goes away.
         """
-        times, states = changes(marks)
-        drawn = self._times.setdefault(microphone, set())
-        drawn |= set(times.tolist())
-        if not drawn:
-            return
-        # A later row wins over an earlier one of the same time, and none can be taken away.
-        every = np.array(sorted(drawn))
-        rows = np.searchsorted(times, every, side="right") - 1
-        now = [states[row] if row >= 0 else None for row in rows.tolist()]
-        redraw_marks(microphone, Changes(every, now), self._canvas)
+        lane = reviewed_lane(microphone, marks, reviewed)
+        self._reviewed[microphone].show(lane, self._canvas)
         self._flush()
 
     def wait_until_drawn(self) -> ViewerState:
@@ -253,7 +274,8 @@ class Viewer:
             If the viewer does not answer.
         """
         panel = self._control.blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
-        return _span(panel.get("time_selection"))
+        span = _span(panel.get("time_selection"))
+        return span and (self._clock.utc(span[0]), self._clock.utc(span[1]))
 
     def cursor(self) -> int | None:
         """Return the time of the cursor, in nanoseconds of UTC; None if there is no cursor.
@@ -263,7 +285,8 @@ class Viewer:
         ConnectionError, TimeoutError
             If the viewer does not answer.
         """
-        return self.state().cursor
+        cursor = self.state().cursor
+        return None if cursor is None else self._clock.utc(cursor)
 
     def show(self, start: int, end: int, margin: int) -> None:
         """Select a span, show it with a margin, and put the cursor on its start.
@@ -280,6 +303,7 @@ class Viewer:
         ConnectionError, TimeoutError
             If the viewer does not answer.
         """
+        start, end = self._clock.shown(start), self._clock.shown(end)
         blueprint = self._control.blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
         panel["time_selection"] = {"min": start, "max": end}
@@ -287,7 +311,7 @@ class Viewer:
         bounds = {"start": {"Absolute": start - margin}, "end": {"Absolute": end + margin}}
         blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
         self._control.set_blueprint(blueprint)
-        self._control.set_time(start, play=False)
+        self._control.set_time(self._clock.name, start, play=False)
 
     def play(self, start: int) -> None:
         """Let the cursor run from a time on.
@@ -302,7 +326,7 @@ class Viewer:
         ConnectionError, TimeoutError
             If the viewer does not answer.
         """
-        self._control.set_time(start, play=True)
+        self._control.set_time(self._clock.name, self._clock.shown(start), play=True)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
         """Offer buttons in the page of the viewer, if it has one.
@@ -324,6 +348,10 @@ class Viewer:
         text : str
         """
         self._control.say(text)
+
+    @property
+    def _clock(self) -> HomeClock:
+        return self._canvas.clock
 
     def _flush(self) -> None:
         if self.is_open():  # or it would wait for ever

@@ -251,8 +251,8 @@ class _WebControl:
     def set_blueprint(self, blueprint: Blueprint) -> None:
         self._relay.ask(messages.set_blueprint(json.dumps(blueprint)))
 
-    def set_time(self, nanoseconds: int, *, play: bool) -> None:
-        self._relay.ask(messages.set_time(nanoseconds, play=play))
+    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
+        self._relay.ask(messages.set_time(axis, nanoseconds, play=play))
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
         self._relay.keys, self._relay.press = keys, press
@@ -282,6 +282,7 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
         If the viewer is not installed, or the port is in use.
     """
     page, viewer_files = free_port(port), free_port()
-    process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)], free_port())
-    server = _Server(page, Relay(), f"http://{HOST}:{viewer_files}", data or process.url)
+    process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)])
+    files_url = f"http://{process.address}:{viewer_files}"
+    server = _Server(page, Relay(), files_url, data or process.url)
     return Viewer(_WebControl(process, server), server.url)

@@ -5,11 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from hearthlog.analyzer.review.viewer.canvas import TIMELINE
-from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display, free_port
+from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
-_MEMORY = "1GB"  # of a viewer that data comes to for days; then it drops the oldest
+_MEMORY = "800MB"  # of a viewer that data comes to for days; then it drops the oldest
 
 
 class _WindowControl:
@@ -44,9 +43,9 @@ class _WindowControl:
     def set_blueprint(self, blueprint: Blueprint) -> None:
         self.client.set_blueprint(blueprint, of="recording")
 
-    def set_time(self, nanoseconds: int, *, play: bool) -> None:
+    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
         self.client.set_time(
-            TIMELINE,
+            axis,
             timestamp=np.datetime64(nanoseconds, "ns"),
             play_state="playing" if play else "paused",
         )
@@ -129,4 +128,4 @@ def open_hidden(port: int | None = None) -> WindowViewer:
 
 def _opened(port: int | None, *more: str) -> WindowViewer:
     limit = ["--server-memory-limit", "32MB"]  # no other viewer connects later
-    return WindowViewer(ViewerProcess(["--hide-welcome-screen", *limit, *more], free_port(port)))
+    return WindowViewer(ViewerProcess(["--hide-welcome-screen", *limit, *more], port))

@@ -1,0 +1,151 @@
+"""A queue in the real viewer: what is asked, close up, and the sound of it."""
+
+import subprocess
+
+import numpy as np
+import psutil
+import pytest
+from conftest import HEARTHLOG
+from viewers import patiently, pixels
+
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.timeline.model import SoundClip
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.analyzer.review.viewer.window import open_hidden
+
+SECOND = 1_000_000_000
+MARGIN = 20 * SECOND
+_NEAR = 14  # of 255: how far a colour may be off
+
+
+@pytest.fixture(scope="module")
+def logs(day, model_file, tmp_path_factory):
+    """Three minutes of a home."""
+    folder = tmp_path_factory.mktemp("queue") / "logs"
+    subprocess.run([*HEARTHLOG, "record", day, "--model", model_file, "-o", folder], check=True)
+    return folder
+
+
+@pytest.fixture
+def timeline(logs):
+    """Three minutes, of which the sound from 60 to 65 s was kept."""
+    timeline = read_timeline([logs])
+    hiss = np.random.default_rng(1).integers(-16_000, 16_000, 5 * 16_000).astype(np.int16)
+    clip = SoundClip(timeline.grid.start + 60 * SECOND, 16_000, hiss)
+    timeline.microphones["mic"].clips.append(clip)
+    return timeline
+
+
+@pytest.fixture
+def view(timeline):
+    """A viewer that shows them, for spans that are looked at close up."""
+    try:
+        with open_hidden() as viewer:
+            viewer.draw(timeline, close_up=True)
+            viewer.wait_until_drawn()
+            yield viewer
+    except DataError as error:
+        if "does not run here" not in str(error):
+            raise
+        pytest.skip(str(error))
+
+
+def ask(view, logs, start, end):
+    """Go to a span, as a queue does."""
+    view.draw_close_up(read_timeline([logs], start - MARGIN, end + MARGIN))
+    view.ask(start, end, "music? 3.0 s")
+    view.show(start, end, MARGIN)
+
+
+def columns_of(picture, start, end):
+    """The colours of the columns in which some time is seen: that lane is as wide as all."""
+    whole = end - start + 2 * MARGIN
+    edges = MARGIN, MARGIN + end - start
+    first, last = (int(edge / whole * picture.shape[1]) for edge in edges)
+    return picture[:, first:last]
+
+
+def is_asked(picture, start, end):
+    """Whether a light band lies from the start of a span to its end, and ends there."""
+    whole = columns_of(picture, start, end)
+    light = (whole.min(axis=2) > 150).mean(axis=1) > 0.6
+    width = whole.shape[1]
+    at = int(MARGIN / (end - start + 2 * MARGIN) * picture.shape[1])
+    beside = picture[:, [at - 40, at + width + 40]].min(axis=2) < 100
+    return (light & beside.all(axis=1)).sum() >= 10
+
+
+def share_of_right_columns(picture, timeline, start, end):
+    """In how many columns most of the bands has the colour of the most probable class."""
+    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    first, last = start - MARGIN, end + MARGIN
+    words = picture.shape[1] // 10 + 2
+    left = words + int(np.argmax((pixels_of_bands(picture, names) > 40).any(axis=1)[words:][:80]))
+    width = picture.shape[1] - left
+    right = []
+    for share in np.linspace(0.05, 0.8, 60):  # the legend is on the right
+        time = first + int(share * (last - first))
+        place = int(timeline.grid.find(np.array([time]))[0])
+        column = picture[:, left + int(share * width)]
+        seen = [(np.abs(column - np.array(colour(n))).max(axis=1) <= _NEAR).sum() for n in names]
+        expected = values[place]
+        if expected.max() > 0.7:
+            right.append(int(np.argmax(seen)) == int(np.argmax(expected)))
+    assert len(right) > 20
+    return np.mean(right)
+
+
+def pixels_of_bands(picture, names):
+    """For each column how many pixels have the colour of each class."""
+    return np.stack(
+        [(np.abs(picture - np.array(colour(n))).max(axis=2) <= _NEAR).sum(axis=0) for n in names],
+        axis=1,
+    )
+
+
+def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_back(
+    view, logs, timeline
+):
+    for second in (150, 30, 61, 45):
+        start = timeline.grid.start + second * SECOND
+        end = start + 3 * SECOND
+        ask(view, logs, start, end)
+
+        def is_right(png, start=start, end=end):
+            picture = pixels(png)
+            right = share_of_right_columns(picture, timeline, start, end)
+            return right > 0.85 and is_asked(picture, start, end)
+
+        patiently(view.picture, is_right)
+    assert view.state().errors == []
+
+
+def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timeline):
+    ours = psutil.Process().children(recursive=True)
+    (viewer,) = [each for each in ours if each.name() == "rerun"]
+    memory = []
+    for number in range(12):
+        start = timeline.grid.start + (30 + 37 * number % 120) * SECOND
+        ask(view, logs, start, start + 3 * SECOND)
+        patiently(view.picture)
+        memory.append(viewer.memory_info().rss)
+    assert memory[-1] - memory[3] < 8 * 20_000_000
+
+
+def test_a_sound_is_shown_as_long_as_it_lasts_and_none_without_an_error(view, timeline):
+    def rows_of_hiss():
+        """The rows that are light from left to right, as far as the view of the sound goes."""
+        picture = pixels(patiently(view.picture))
+        left = picture[:, picture.shape[1] // 50 : picture.shape[1] * 2 // 5]
+        return ((left.min(axis=2) > 110).mean(axis=1) > 0.9).sum()
+
+    found = {}
+    for second in (0, 62, 70):
+        start = timeline.grid.start + second * SECOND
+        view.show(start, start + SECOND, MARGIN)
+        patiently(view.cursor, lambda cursor, start=start: cursor == start)
+        patiently(view.picture)
+        found[second] = rows_of_hiss()
+        assert view.state().errors == []
+    assert found[62] > max(found[0], found[70]) + 5
