@@ -5,13 +5,13 @@ import shutil
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
-from datetime import UTC, date
+from datetime import UTC
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from homelife import GENERAL, at, write_day
 from realday import START
+from shortsounds import DAY, SOUGHT, short_sounds
 from viewers import (
     Window,
     browsing,
@@ -34,7 +34,7 @@ from hearthlog.analyzer.review.viewer.web import open_page
 from hearthlog.analyzer.review.viewer.window import WindowViewer
 from hearthlog.schemas.logs.files import find_logs
 
-__all__ = ["display", "viewer"]  # fixtures
+__all__ = ["display", "short_sounds", "viewer"]  # fixtures
 
 HOUR = 3600 * 1_000_000_000
 MARKED = (START + 2 * HOUR, START + 3 * HOUR)
@@ -207,26 +207,7 @@ def test_the_page_shows_a_day_as_it_was_heard(timeline, tmp_path):
 
 # What one looks for: short sounds in a long day
 
-DAY = date(2026, 3, 1)
-SOUGHT = {
-    "coughing": [(at("02:06") + 137 * number, 0.5) for number in range(14)],
-    "flushing_water": [(at("03:48"), 6)],
-    "crying": [(at("16:54"), 20)],
-    "yelling": [(at("17:21"), 2), (at("17:41"), 2)],
-}
 SIZES = [(1366, 768), (1920, 1080)]
-
-
-@pytest.fixture(scope="module")
-def short_sounds(tmp_path_factory):
-    """Logs of a day in which little is heard but an evening of talk and music."""
-    folder = tmp_path_factory.mktemp("short") / "logs"
-    evening = [(at("19:30") + 60 * i, 60, ("speech", "music")[i % 2], 0.9) for i in range(150)]
-    sought = [(*span, name, 0.9) for name, spans in SOUGHT.items() for span in spans]
-    classes = [*GENERAL, "flushing_water"]
-    hours = [hour for hour in range(24) if hour != 13]
-    write_day(folder, DAY, sought + evening, classes=classes, hours=hours)
-    return folder
 
 
 @contextmanager

@@ -290,6 +290,11 @@ class Page:
         call = asyncio.wait_for(self._call(method, parameters), _WAIT_SECONDS)
         return self._loop.run_until_complete(call)
 
+    def open(self, address):
+        """Go to another page, and wait until it is there with its pictures."""
+        self.call("Page.navigate", url=address)
+        patiently(lambda: self.evaluate("document.readyState"), lambda state: state == "complete")
+
     def evaluate(self, expression):
         """Let the page compute something."""
         found = self.call("Runtime.evaluate", expression=expression, returnByValue=True)

@@ -19,7 +19,7 @@ from hearthlog.analyzer.report.values import Minutes
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64
 
-_DAY_BINS, _WEEK_BINS = 20, 6  # an hour
+_DAY_BINS, _WEEK_BINS = 30, 6  # an hour
 _LEAST = 0.35  # of a lane's height, for what is short: a cough has to be seen
 _INK, _PALE, _NIGHT = "#1d2733", "#8a94a0", "#e9ecf1"
 _DOTS = 150  # an inch
