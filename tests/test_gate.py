@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from spliced import run
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.difference import compare_labellings
 from hearthlog.analyzer.gate.changes import Changes, changes_of_frames, changes_of_labellings
-from hearthlog.analyzer.gate.evidence import Evidence, Right
+from hearthlog.analyzer.gate.evidence import Evidence, Right, gather_evidence
 from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import (
     Part,
@@ -28,9 +29,11 @@ from hearthlog.analyzer.gate.recent_time import (
 )
 from hearthlog.analyzer.gate.rules import clearly_better, damages
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.labellings import NamedLabelling
+from hearthlog.analyzer.logs.labellings import NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.review.queue.review_list import ReviewSpan, read_list
+from hearthlog.analyzer.review.session.queue_items import queue_spans, review_items
 from hearthlog.models.modelfile.judgement import (
     Judgement,
     insist,
@@ -490,3 +493,114 @@ def test_what_the_champion_is_sure_of_stays():
     )
     assert damages(evidence(table, sure=[[900, 0, 0], [0, 9, 3], [0, 0, 0]]), "one") == []
     assert damages(evidence(table, sure=[[900, 0, 0], [0, 1, 4], [0, 0, 0]]), "one") == []
+
+
+# What would change, as spans to look at
+
+
+def asked_of(model, count=10, limits=(None, None)):
+    """Return the spans that are asked of what a model would change."""
+    return queue_spans(model, find_labellings(Path("logs")), ("mic", "live"), limits, count)
+
+
+def most_of(labelling, span):
+    """Return the label of most of a span."""
+    named = find_labellings(Path("logs")).read("mic", labelling, span.start, span.end).labelling
+    seconds = {}
+    for start, end, label in zip(named.starts, named.ends, named.labels, strict=True):
+        seconds[label] = seconds.get(label, 0) + end - start
+    return max(seconds, key=seconds.get)
+
+
+@pytest.mark.usefixtures("place")
+def test_what_a_model_would_change_is_asked_where_it_says_something_else_than_the_recorder(capfd):
+    keep_swapped("speech", "music")
+    asked = asked_of("swapped")
+    assert len(asked) == 10
+    assert run(capfd, "relabel", "logs", "--model", "models/swapped.safetensors").returncode == 0
+    for span in asked:
+        assert SECOND // 2 <= span.end - span.start <= 10 * SECOND
+        assert most_of("live", span) == span.label_a
+        assert most_of("relabel/swapped", span) == span.label_b != span.label_a
+    assert sorted(asked_of("models/swapped")) == sorted(asked)
+
+
+@pytest.mark.usefixtures("place")
+def test_the_largest_changes_are_asked_first_and_others_too():
+    one = load_model(Path("models/one.safetensors"))
+    sounds = [name for name in one.classes if name != "silence"]
+    after = dict(zip(sounds, [*sounds[1:], sounds[0]], strict=True)) | {"silence": "silence"}
+    new = keep("turned", classes=[after[name] for name in one.classes])
+    changes = gather_evidence(one, new, recent_logs([Path("logs")])).changes.pairs()
+    spans = asked_of("turned")
+    asked = [(span.label_a, span.label_b) for span in spans]
+    for each in set(asked):
+        same = [b.end - b.start for b, pair in zip(spans, asked, strict=True) if pair == each]
+        assert same == sorted(same, reverse=True)
+    assert asked[0] == changes[0][:2]
+    assert set(asked) >= {change[:2] for change in changes[:3]}
+    assert all(after[before] == other for before, other in asked)
+
+
+@pytest.mark.usefixtures("place")
+def test_what_was_looked_at_or_lies_elsewhere_is_not_asked_though_a_model_would_change_it(lived):
+    keep_swapped("speech", "music")
+    review(lived, RANDOM, count=6)
+    asked = asked_of("swapped", count=100)
+    assert asked
+    assert all(span.start >= START + 6 * MINUTE for span in asked)
+    later = START + 9 * MINUTE
+    assert all(span.start >= later for span in asked_of("swapped", limits=(later, None)))
+
+
+@pytest.mark.usefixtures("place")
+def test_when_all_that_a_model_would_change_was_looked_at_that_is_said(lived):
+    keep_swapped("speech", "music")
+    review(lived, RANDOM, count=MINUTES)
+    with pytest.raises(DataError, match="swapped: no span is left in which it says something else"):
+        asked_of("swapped")
+
+
+@pytest.mark.usefixtures("place")
+def test_where_the_recorder_says_something_else_than_the_champion_by_now_nothing_is_asked():
+    keep_swapped("speech", "music")
+    Path("models/champion.safetensors").unlink()
+    Path("models/champion.safetensors").symlink_to("swapped.safetensors")
+    with pytest.raises(DataError, match="one: no span is left in which it says something else"):
+        asked_of("one")
+
+
+@pytest.mark.usefixtures("place")
+def test_who_reads_what_would_change_is_told_how_to_hear_it(capfd, tmp_path):
+    keep_swapped("speech", "music")
+    lines = run(capfd, "models", "promote", "swapped", "--logs", "logs").stdout.splitlines()
+    assert "hear what changes: `hearthlog review logs --queue swapped`" in lines
+    saved = run(capfd, "review", "logs", "--queue", "swapped", "--save", tmp_path / "ten.csv")
+    assert saved.returncode == 0, saved.stderr
+    listed = read_list(tmp_path / "ten.queue.csv")
+    assert sorted(listed) == sorted(asked_of("swapped"))
+    (again,) = review_items(listed[:1])
+    assert re.fullmatch("swapped says (talking|music), the recorder (talking|music)", again.text)
+    keep_alike()
+    assert "hear what changes" not in run(capfd, "models", "promote", "alike").stdout
+
+
+def test_a_change_is_said_in_words_and_in_minutes_of_a_day():
+    span = ReviewSpan("mic", START, START + SECOND, "live", "music", "relabel/new", "speech", 41.2,
+                      "change")  # fmt: skip
+    (item,) = review_items([span])
+    assert item.text == "new says talking, the recorder music: 41 min a day"
+    assert item.label == "music"
+
+
+@pytest.mark.usefixtures("place")
+def test_a_model_whose_changes_cannot_be_told_is_said_in_a_line():
+    with pytest.raises(
+        DataError, match=r"or a model \(models/none.safetensors: no such model file"
+    ):
+        asked_of("none")
+    with pytest.raises(DataError, match="one labels here already"):
+        asked_of("champion")
+    shutil.copy(OLD_MODEL, "models/old.safetensors")
+    with pytest.raises(DataError, match="old: it is for feature set auros21, and one"):
+        asked_of("old")

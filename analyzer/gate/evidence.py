@@ -1,36 +1,32 @@
 """What another model would change in a home, measured on time that it has not learned from."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.changes import A_DAY, Changes, changes_of_frames
+from hearthlog.analyzer.gate.changes import Changes
+from hearthlog.analyzer.gate.home_sample import (
+    KnownSounds,
+    changes_of_sample,
+    known_sounds,
+    label_parts,
+    learned_by,
+    unlearned_sample,
+)
 from hearthlog.analyzer.gate.recent_time import (
     Part,
     RecentLog,
     WeightedPart,
-    choose,
-    learned_time,
-    minutes_a_day,
     recorded_minutes,
-    sounding_time,
-    unlearned_time,
 )
-from hearthlog.analyzer.gate.reference import Sound, reference, spans_of
-from hearthlog.analyzer.gate.two_models import (
-    NO_FRAMES,
-    LabelledFrames,
-    TwoModels,
-    joined_frames,
-)
-from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.analyzer.gate.reference import Sound, spans_of
+from hearthlog.analyzer.gate.two_models import LabelledFrames, TwoModels, joined_frames
+from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.models.classes import translation
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
@@ -112,29 +108,25 @@ def gather_evidence(
         If the feature set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
-    known = _known_sounds(logs, losses)
-    learned = _learned(before, after, known)
-    chosen = choose(unlearned_time(logs, learned), sounding_time(logs))
+    known = known_sounds(logs, losses)
+    learned = learned_by(before, after, known)
+    chosen = unlearned_sample(logs, learned)
     places = _places(
         [(log, [s for s in own if s.random or not _is_in(learned, s)]) for log, own in known]
     )
     models = TwoModels(before, after)
     parts = [*chosen, *(WeightedPart(part, 1.0) for part, _ in places)]
-    labelled = list(_label(models, parts, losses, progress))
+    labelled = list(label_parts(models, parts, losses, progress))
     frames = joined_frames(labelled[: len(chosen)])
     right = [
         _right(sounds, own, models.classes)
         for (_, sounds), own in zip(places, labelled[len(chosen) :], strict=True)
     ]
-    share = frames.weight / max(frames.weight.sum(), 1.0)
-    recorded, day = recorded_minutes(logs), minutes_a_day(logs)
-    minutes, each = (share * recorded, "") if day is None else (share * day, A_DAY)
-    labels, sure = (models.classes, frames.before, frames.after), frames.confidence >= SURE
     return Evidence(
         minutes=len(frames.stamps) * FRAME_SECONDS / 60,
-        recorded=recorded,
-        changes=changes_of_frames(*labels, minutes, each),
-        sure=changes_of_frames(*labels, minutes * sure).minutes,
+        recorded=recorded_minutes(logs),
+        changes=changes_of_sample(models.classes, frames, logs),
+        sure=changes_of_sample(models.classes, frames, logs, SURE).minutes,
         random=_sum(one for one, _ in right),
         marks=_sum(one for _, one in right),
         losses=losses,
@@ -156,57 +148,22 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> R
         As `gather_evidence`.
     """
     losses: list[str] = []
-    known = _known_sounds(logs, losses)
+    known = known_sounds(logs, losses)
     places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
     models = TwoModels(before, after)
     parts = [WeightedPart(part, 1.0) for part, _ in places]
-    labelled = _label(models, parts, losses, ignore_progress)
+    labelled = label_parts(models, parts, losses, ignore_progress)
     return _sum(
         _right(sounds, own, models.classes)[0]
         for (_, sounds), own in zip(places, labelled, strict=True)
     )
 
 
-def _label(
-    models: TwoModels, parts: Sequence[WeightedPart], losses: list[str], progress: Progress
-) -> Iterator[LabelledFrames]:
-    """Label one part after the other; of one that cannot be read there are no frames."""
-    for i, (part, weight) in enumerate(parts):
-        try:
-            frames = models.label(part, weight)
-        except LogError as error:
-            losses.append(str(error))
-            frames = NO_FRAMES
-        progress((i + 1) / len(parts))
-        yield frames
-
-
-def _known_sounds(
-    logs: Sequence[RecentLog], losses: list[str]
-) -> list[tuple[RecentLog, list[Sound]]]:
-    known, paths = [], [log.path for log in logs]
-    for place, log in enumerate(logs, 1):
-        try:
-            known.append((log, reference(log.path, paths[place:])))
-        except (DataError, LogError) as error:
-            losses.append(str(error))
-    return known
-
-
-def _learned(before: Model, after: Model, known: list[tuple[RecentLog, list[Sound]]]) -> Spans:
-    """Return the time that one of the models has learned from."""
-    chosen = [(s.start, s.end) for _, sounds in known for s in sounds if not s.random]
-    marked = spans_of(chosen)
-    both = [learned_time(model, marked) for model in (before, after)]
-    starts, ends = (np.concatenate(edges) for edges in zip(*both, strict=True))
-    return joined(starts, ends)
-
-
 def _is_in(spans: Spans, sound: Sound) -> bool:
     return bool(rows_at(spans, np.array([(sound.start + sound.end) // 2]))[0] >= 0)
 
 
-def _places(known: list[tuple[RecentLog, list[Sound]]]) -> list[tuple[Part, list[Sound]]]:
+def _places(known: KnownSounds) -> list[tuple[Part, list[Sound]]]:
     """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
     places: list[tuple[Part, list[Sound]]] = []
     for log, sounds in known:

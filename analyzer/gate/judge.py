@@ -65,10 +65,8 @@ def judge(
     evidence, reasons = None, list[str]()
     if champion is None:
         reasons = [f"there are no labels in {_names(home)} to compare its own with"]
-    elif champion.description.feature_set != model.description.feature_set:
-        mine, theirs = (one.description.feature_set for one in (model, champion))
-        text = f"it is for feature set {mine}, and {champion.name}, which labels now, for {theirs}"
-        reasons = [f"{text}: they cannot be compared on the same logs"]
+    elif other := other_features(champion, model):
+        reasons = [other]
     elif champion.sha256 != model.sha256:
         logs = recent_logs(home)
         evidence = gather_evidence(champion, model, logs, progress)
@@ -83,6 +81,20 @@ def judge(
     )
     write_judgement(folder, judgement)
     return Verdict(judgement, model.name, "" if champion is None else champion.name, evidence)
+
+
+def other_features(champion: Model, model: Model) -> str:
+    """Say that two models cannot be compared, if they are of different feature sets.
+
+    Parameters
+    ----------
+    champion, model : Model
+    """
+    mine, theirs = (one.description.feature_set for one in (model, champion))
+    if mine == theirs:
+        return ""
+    text = f"it is for feature set {mine}, and {champion.name}, which labels now, for {theirs}"
+    return f"{text}: they cannot be compared on the same logs"
 
 
 def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | None:

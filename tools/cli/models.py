@@ -201,7 +201,8 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     if judgement is None:
         with share_done(f"judging {model.name}", announce=True) as report:
             verdict = judge(folder, model, home, report)
-        print_verdict(verdict)
+        own = folder == models_folder()
+        print_verdict(verdict, home, model.name if own else str(folder / model.name))
         judgement = verdict.judgement
     if not judgement.may_label:
         raise ModelError(refusal(judgement, model.name))

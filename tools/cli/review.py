@@ -61,8 +61,8 @@ def review(
         str | None,
         typer.Option(
             help="Go through spans that are useful to learn from and minutes drawn at random (as "
-            "without a value), or uncertain, novel, disagreeing or random ones, or a list of "
-            "`hearthlog diff --list`."
+            "without a value), or uncertain, novel, disagreeing or random ones, a list of "
+            "`hearthlog diff --list`, or what a model, as home-1, would change."
         ),
     ] = None,
     spans: Annotated[

@@ -117,7 +117,8 @@ def train(
         _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
         if verdict is not None:
-            print_verdict(verdict)
+            own = output.parent == models_folder()
+            print_verdict(verdict, home or [], output.stem if own else str(output))
             _print_next(verdict, output)
 
 

@@ -1,7 +1,11 @@
 """What a model would change in a home, and whether it may label there, in lines."""
 
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.changes_table import print_changes
 from hearthlog.tools.cli.text import tell
 
@@ -11,8 +15,17 @@ if TYPE_CHECKING:
     from hearthlog.models.modelfile.judgement import Judgement
 
 
-def print_verdict(verdict: "Verdict") -> None:
-    """Print what would change, and on what that is seen."""
+def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
+    """Print what would change, how to hear that, and on what it is seen.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    home : sequence of Path
+        Logs that it is by.
+    model : str
+        As `hearthlog review --queue` takes it.
+    """
     evidence = verdict.evidence
     if evidence is None:
         return
@@ -22,6 +35,9 @@ def print_verdict(verdict: "Verdict") -> None:
     if not evidence.minutes:
         return
     _print_changes(evidence, verdict.model, verdict.champion)
+    if evidence.changes.pairs():
+        command = shlex.join(["hearthlog", "review", *map(str, home), "--queue", model])
+        print(printable(f"hear what changes: `{command}`"))
     _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
     _print_right("other sounds that were marked and not learned from", evidence.marks, verdict)
     if not evidence.random.sounds:

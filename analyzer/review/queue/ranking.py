@@ -240,7 +240,7 @@ def _ranked(
     rows = _best_of_each(scores, spans.sources)
     if ranking is not None:
         rows = rows[scores[rows] > 0.0]
-    return rows[_spread(scores[rows], spans.take(rows), count)]
+    return rows[spread(scores[rows], spans.take(rows), count)]
 
 
 def _add_frames(
@@ -268,11 +268,24 @@ def _best_of_each(scores: Float64, sources: Int64) -> Int64:
     return order[np.flatnonzero(np.diff(sources[order], prepend=-1))]
 
 
-def _spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
+def spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
     """Choose the best spans, of many days and classes rather than of one.
 
     Each time it is the one with the highest score / sqrt((1 + c) (1 + d)), where c and d are how
-    many of its class and of its day are chosen already.
+    many of its class and of its day are chosen already; of equal ones the first.
+
+    Parameters
+    ----------
+    scores : np.ndarray [shape=(n,)], float64
+    spans : JudgeableSpans
+        In any order, at least one.
+    count : int
+        How many, at most.
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], int64
+        Rows, in the order in which they were chosen.
     """
     _, day = np.unique(spans.starts // DAY, return_inverse=True)
     label = spans.labels

@@ -22,10 +22,11 @@ from hearthlog.schemas.times import read_time, time_text
 
 MOST_SPANS = 100_000
 _PARTS = ("uncertainty", "disagreement", "novelty")
-REASONS = (*_PARTS, USEFUL, RANDOM)
+CHANGE = "change"  # which another model would make
+REASONS = (*_PARTS, USEFUL, RANDOM, CHANGE)
 _SIZE_LIMIT = 64 << 20
 _LATEST = 1 << 62  # nanoseconds
-_NUMBER = re.compile(r"[0-9]{1,3}(\.[0-9]{1,20})?")
+_NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,20})?")
 
 
 class ReviewSpan(NamedTuple):
@@ -41,7 +42,7 @@ class ReviewSpan(NamedTuple):
     b, label_b : str
         Another one; both are empty if there is none, the label where it has none.
     score : float or None
-        None where spans are not ranked by one.
+        None where spans are not ranked by one; of a change the minutes a day that change so.
     reason : str
         One of `REASONS`; `random` is a whole minute that was drawn at random.
     """

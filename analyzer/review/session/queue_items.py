@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.gate.changes import A_DAY, class_words, time_words
 from hearthlog.analyzer.logs.labellings import Labellings
 from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.queue.asked import chosen_as
+from hearthlog.analyzer.review.queue.changed_spans import changed_by
 from hearthlog.analyzer.review.queue.random_minutes import MINUTE, draw_minutes, whole_minutes
 from hearthlog.analyzer.review.queue.ranking import DISAGREEING, RANKINGS, USEFUL, make_queue
 from hearthlog.analyzer.review.queue.review_list import (
+    CHANGE,
     ReviewSpan,
     queued,
     random_minutes,
@@ -20,7 +23,10 @@ from hearthlog.analyzer.review.queue.review_list import (
 )
 from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
 from hearthlog.analyzer.review.session.session import ReviewItem
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.analyzer.review.timeline.lanes import labelling_in_words
+from hearthlog.models.classifiers.model import Model
+from hearthlog.models.errors import ModelError
+from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
 from hearthlog.schemas.messages.topics import REVIEW
 from hearthlog.schemas.progress import Progress, ignore_progress
 
@@ -58,17 +64,19 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     Parameters
     ----------
     queue : str
-        One of `QUEUES`, or the name of a list (`*.csv`) that `hearthlog diff` made. Every fifth
-        item of a `useful` queue is a minute drawn at random, and every one of a `random` one.
+        One of `QUEUES`, or the name of a list (`*.csv`) that `hearthlog diff` made, or a model
+        whose changes are asked for: its name in the folder of models, or its file. Every fifth item
+        of a `useful` queue is a minute drawn at random, and every one of a `random` one.
     sources : Labellings
     labelled : (str, str)
         The microphone, and the labelling: `live`, or `relabel/` and a model.
     limits : (int or None, int or None)
         Start and end in nanoseconds of UTC; None for all that there is.
     count : int or None
-        How many, at most; None for ten of a ranking, all of a list.
+        How many, at most; None for ten, all of a list.
     models : Path, optional
-        Folder of models, in which the one of the labels is looked for.
+        Folder of models, in which the one of the labels is looked for, and whose champion others
+        are compared with.
     progress : callable, optional
         Told the share of the logs that is read, 0 to 1.
 
@@ -80,18 +88,19 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     Raises
     ------
     DataError
-        If there is nothing to review, or no such list.
+        If there is nothing to review, or no such list or model.
+    ModelError
+        If the model that labels now cannot be found or used.
     LogError
         If the labelling has no segment in these limits, or its segments overlap or cannot be.
     """
     microphone, labelling = labelled
-    if queue not in QUEUES:
-        if not queue.endswith(".csv"):
-            raise DataError(
-                f"--queue {queue[:64]}: use {', '.join(QUEUES)}, or a list *.csv of `diff --list`"
-            )
+    if queue.endswith(".csv"):
         return _listed(Path(queue), microphone, limits)[:count]
+    model = None if queue in QUEUES else _model(queue, models)
     side = sources.read(microphone, labelling, *limits)
+    if model is not None:
+        return changed_by(model, side, sources, microphone, count or _TEN, progress)
     others = [name for name in sources.names(microphone) if name not in {labelling, REVIEW}]
     if queue == DISAGREEING and not others:
         raise DataError("no other labelling to disagree with: `hearthlog relabel` makes one")
@@ -128,6 +137,19 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     return _mixed(spans, drawn_at_random)
 
 
+def _model(queue: str, models: Path) -> tuple[Path, Model]:
+    """Load the model that the changes of are asked for; return its folder, too."""
+    place = Path(queue)
+    folder = models if place.name == queue else place.parent
+    try:
+        return folder, load(folder, place.name)
+    except ModelError as error:
+        raise DataError(
+            f"--queue {queue[:64]}: use {', '.join(QUEUES)}, a list *.csv of `diff --list`, or a "
+            f"model ({error})"
+        ) from error
+
+
 def _listed(path: Path, microphone: str, limits: Limits) -> list[ReviewSpan]:
     start, end = limits
     spans = [
@@ -155,5 +177,10 @@ def _mixed(spans: Sequence[ReviewSpan], minutes: Sequence[ReviewSpan]) -> list[R
 def _text(span: ReviewSpan) -> str:
     if span.reason == RANDOM:
         return f"{span.a}: mostly {span.label_a} (a minute at random: mark what is wrong in it)"
+    if span.reason == CHANGE:
+        much = "" if span.score is None else f": {time_words(span.score)}{A_DAY}"
+        new, old = (labelling_in_words(name) for name in (span.b, span.a))
+        says = f"{new} says {class_words(span.label_b)}, {old} {class_words(span.label_a)}"
+        return says + much
     other = f", {span.b}: {span.label_b or 'nothing'}" if span.b else ""
     return f"{span.a}: {span.label_a}{other} ({span.reason})"
