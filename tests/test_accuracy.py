@@ -23,6 +23,9 @@ from hearthlog.analyzer.report.daily_metrics import day_of
 from hearthlog.analyzer.report.home_metrics import whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
+from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.cli.accuracy_text import Accuracy
 
@@ -88,6 +91,33 @@ def test_a_damaged_layer_is_a_loss_and_the_other_minutes_count(tmp_path):
     minutes = read_checked_minutes(find_home_logs([tmp_path]), "live", *EVER, losses)
     assert (len(minutes), len(losses)) == (1, 1)
     assert "T120000Z.review.mcap" in losses[0]
+
+
+def test_a_review_counts_what_was_right_in_the_four_weeks_before_and_after(tmp_path):
+    for day in (DAY, DAY + timedelta(days=20), DAY + timedelta(days=70)):
+        write_day(tmp_path, day, [(at("10:00:05"), 2, "coughing", 0.9)], hours=[10])
+    first, _, far = find_logs(tmp_path)
+    ten = START + at("10:00") * NANOSECONDS
+    for log, days in ((first, 0), (far, 70)):
+        begin = ten + days * 1440 * MINUTE
+        write_marks(log, [], reviewed=[ReviewedSpan("mic", begin, begin + MINUTE, chosen=RANDOM)])
+
+    (other,) = write_day(
+        tmp_path, DAY, [(at("10:00:05"), 2, "coughing", 0.9)], hours=[10], node="b", microphone="b"
+    )
+    seen = ReviewedSpan("b", ten, ten + MINUTE, chosen=RANDOM)
+    write_marks(other, [Mark("b", ten, ten + MINUTE, "speech")], reviewed=[seen])
+
+    def counted(days):
+        home, day = find_home_logs([tmp_path]), DAY + timedelta(days=days)
+        return checked_classes(read_timeline([tmp_path], *day_span(day, UTC)), home)
+
+    wrong = {("b", "Coughing"): (1, 0, 0, 0, 0)}
+    assert counted(20) == {("mic", "Coughing"): (1, 1, 1, 0, 0)}
+    assert counted(0) == counted(20) | wrong
+    write_marks(first, [Mark("mic", ten, ten + MINUTE, "speech")])
+    assert counted(20) == {("mic", "Coughing"): (1, 0, 0, 0, 0)}
+    assert counted(70) == {("mic", "Coughing"): (1, 1, 1, 0, 0)}
 
 
 def test_fewer_than_five_minutes_promise_nothing():

@@ -80,7 +80,7 @@ def share_of_right_columns(picture, timeline, start, end):
     """In how many columns most of the bands has the colour of the most probable class."""
     names, values = timeline.microphones["mic"].labellings[0].probabilities
     first, last = start - MARGIN, end + MARGIN
-    words = picture.shape[1] // 10 + 2
+    words = picture.shape[1] // 6 + 2
     left = words + int(np.argmax((pixels_of_bands(picture, names) > 40).any(axis=1)[words:][:80]))
     width = picture.shape[1] - left
     right = []

@@ -24,9 +24,11 @@ from viewers import rerun_home, shown, viewer
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.timeline import read_timeline as reading
+from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
 from hearthlog.analyzer.review.timeline.disagreements import disagreements
 from hearthlog.analyzer.review.timeline.grid import Grid, GridMeans
 from hearthlog.analyzer.review.timeline.home_clock import home_clock
@@ -712,8 +714,12 @@ def fixed(path, entity, name):
 def test_everything_is_in_the_recording_and_nothing_else(recording, timeline):
     expected = {"/mic/live/shares", "/mic/live/novelty", "/mic/level", "/mic/floor"}
     expected |= {"/mic/features", "/events", "/mic/frames/live", "/mic/frames/level"}
-    names = {lane.name for lane in timeline_lanes(timeline)}
-    expected |= {"/words/nothing", *(f"/mic/words/{number:02}" for number in range(len(names)))}
+    lanes = list(timeline_lanes(timeline))
+    expected |= {"/words/nothing"}
+    expected |= {
+        f"/mic/words/names/{lane.labelling or 'all'}/{number:02}"
+        for number, lane in enumerate(lanes)
+    }
     views = ("How_probable_each_class_is/live", "Level", "Novelty", "Features")
     expected |= {f"/mic/words/{view}" for view in views}
     found = {name for name in entities(recording) if "/lanes/" not in name}
@@ -741,6 +747,30 @@ def test_every_sound_is_a_strip_in_the_lane_of_its_class_and_in_its_colour(recor
     }
     assert drawn == expected
     assert {text for _, _, _, _, text, _ in drawn} >= {"Shouting", "My own", "Not heard"}
+
+
+def test_beside_a_class_of_the_recorder_stands_how_many_of_its_sounds_were_right(
+    tmp_path, folder, model_file, capfd
+):
+    home, output = tmp_path / "home", tmp_path / "day.rrd"
+    shutil.copytree(folder, home)
+    assert run(capfd, "relabel", home, "--model", model_file).returncode == 0
+    (log, *_) = find_logs(home)
+    whole = ReviewedSpan("mic", START, START + 600 * SECOND, chosen="random")
+    write_marks(log, [], reviewed=[whole])
+    assert run(capfd, "review", home, "--save", output).returncode == 0
+    names = {}
+    for chunk in RrdReader(output).stream():
+        if (entity := str(chunk.entity_path)).startswith("/mic/words/names/"):
+            names[entity] = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1][0]
+    live = {entity: text for entity, text in names.items() if "/names/live/" in entity}
+    told = {text for text in live.values() if " · " in text}
+    checked = checked_classes(read_timeline([home]), find_home_logs([home]))
+    assert told == {f"{name} · {n.right}/{n.labelled} right" for (_, name), n in checked.items()}
+    assert len(told) < len(live)
+    others = {text for entity, text in names.items() if entity not in live}
+    assert others >= {"Talking", "Reviewed"}
+    assert not any(" · " in text for text in others)
 
 
 def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_path):
@@ -883,6 +913,7 @@ _SAVE = """
 import pathlib, resource, sys
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.local_time import day_span
+from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
 from hearthlog.analyzer.review.viewer.file import save_timeline
 timeline = read_timeline([pathlib.Path(sys.argv[1])])

@@ -78,7 +78,7 @@ class Picture:
 
     def begin_at_cursor(self, rows):
         """Take the column of the cursor, which is at the start, in these rows."""
-        words = self.image.shape[1] // 10 + 2
+        words = self.image.shape[1] // 6 + 2
         white = (self.image[rows, words : 2 * words] > _WHITE).all(axis=2)
         self._left = words + int(white.sum(axis=0).argmax())
 

@@ -180,7 +180,7 @@ def read_checked_minutes(
     losses : list of str
         What cannot be read is appended.
     """
-    reviewed = read_reviewed_labels(logs, labelling, start, end, losses)
+    reviewed = read_reviewed_labels(logs, labelling, start, end, losses, {RANDOM})
     return checked_minutes(one for one in reviewed if start <= one.span.start < end)
 
 

@@ -88,6 +88,8 @@ def review(
         wrong_use("--save makes a file: --web and --port go without it")
     if day is not None and (start or end):
         wrong_use("--day is a span of its own: leave out --start and --end")
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import check_output, save_timeline
 
@@ -104,7 +106,7 @@ def review(
     if save is not None:
         check_output(save)
         timeline = read()
-        save_timeline(timeline, save)
+        save_timeline(timeline, save, checked_classes(timeline, find_home_logs(logs)))
         print_recording(save)
     else:
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -178,9 +180,11 @@ class _Choice(NamedTuple):
 
 def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
     """Show a timeline until the reviewer is done."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.session.session import Session
     from hearthlog.analyzer.review.session.sound import listen
+    from hearthlog.analyzer.review.timeline.checked_classes import checked_classes
     from hearthlog.analyzer.review.timeline.read_timeline import (
         MOST_FRAMES,
         read_frames,
@@ -223,6 +227,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     grid = timeline.grid
     if not items and grid.end - grid.start <= MOST_FRAMES:
         look_closely(grid.start, grid.end)
+    viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
     print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
         session.run(keys)

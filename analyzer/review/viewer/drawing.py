@@ -7,10 +7,12 @@ import numpy as np
 
 from hearthlog.analyzer.colours import Colour, colour
 from hearthlog.analyzer.logs.spans import Spans, rows_at
+from hearthlog.analyzer.review.timeline.checked_classes import Checked
 from hearthlog.analyzer.review.timeline.lanes import REVIEWED, Lane, timeline_lanes
 from hearthlog.analyzer.review.timeline.model import FrameValues, Timeline
 from hearthlog.analyzer.review.timeline.plots import LEVEL, SHARES, Plot, Style, timeline_plots
 from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 
 LINES, CLIP, WORDS = "events", "clip", "words"
@@ -104,7 +106,7 @@ def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
         own = list(names[lane.microphone])
         number = own.index(lane.name)
         root = lanes_entity(lane.microphone, lane.labelling)
-        name = f"{lane.microphone}/{WORDS}/{number:02}"
+        name = f"{lane.microphone}/{WORDS}/names/{_word(lane.labelling) or 'all'}/{number:02}"
         places.append(LanePlace(f"{root}/{number:02}", name, len(own) - number - 0.5))
     return places
 
@@ -150,6 +152,25 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[str, DrawnLane]:
             canvas.show_clips(f"{microphone.name}/{CLIP}", microphone.clips, timeline.grid.start)
     canvas.write_lines(LINES, timeline.lines)
     return reviewed
+
+
+def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
+    """Write beside the classes of the recorder how many of its sounds were right in this home.
+
+    Parameters
+    ----------
+    timeline : Timeline
+        That is drawn.
+    checked : mapping
+        As `checked_classes` returns it.
+    canvas : Canvas
+        Is drawn on.
+    """
+    lanes = list(timeline_lanes(timeline))
+    for lane, place in zip(lanes, lane_places(lanes), strict=True):
+        known = checked.get((lane.microphone, lane.name))
+        if lane.labelling == LIVE and known is not None:
+            canvas.write(place.name, f"{lane.name} · {known.right}/{known.labelled} right")
 
 
 def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:

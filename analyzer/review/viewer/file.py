@@ -9,10 +9,11 @@ from tempfile import TemporaryDirectory
 import rerun as rr
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.timeline.checked_classes import Checked
 from hearthlog.analyzer.review.timeline.model import Timeline
 from hearthlog.analyzer.review.timeline.read_timeline import read_frames
 from hearthlog.analyzer.review.viewer.canvas import Canvas
-from hearthlog.analyzer.review.viewer.drawing import draw, draw_frames
+from hearthlog.analyzer.review.viewer.drawing import draw, draw_frames, write_checked
 from hearthlog.analyzer.review.viewer.layout import APPLICATION, review_layout
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.storage.new_files import check_new, new_file
@@ -38,7 +39,7 @@ def check_output(output: Path) -> None:
         raise DataError(str(error)) from error
 
 
-def save_timeline(timeline: Timeline, output: Path) -> None:
+def save_timeline(timeline: Timeline, output: Path, checked: Checked | None = None) -> None:
     """Write a timeline into a Rerun recording (`.rrd`).
 
     Only Rerun's viewer sends usage statistics and opens a port; this does neither.
@@ -48,6 +49,8 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     timeline : Timeline
     output : Path
         Must not exist, and must end in `.rrd`.
+    checked : mapping, optional
+        As `checked_classes` returns it.
 
     Raises
     ------
@@ -57,12 +60,12 @@ def save_timeline(timeline: Timeline, output: Path) -> None:
     check_output(output)
     try:
         with new_file(output) as temporary:
-            _write(timeline, temporary)
+            _write(timeline, temporary, checked or {})
     except LogError as error:
         raise DataError(str(error)) from error
 
 
-def _write(timeline: Timeline, output: Path) -> None:
+def _write(timeline: Timeline, output: Path, checked: Checked) -> None:
     """Write a recording through a pipe: to a file, Rerun waits for ever where the disk is full."""
     rr.set_strict_mode(True)  # or its mistakes become warnings, and its file wrong
     recording = rr.RecordingStream(APPLICATION)
@@ -76,6 +79,7 @@ def _write(timeline: Timeline, output: Path) -> None:
             canvas = Canvas(recording, timeline.clock)
             name_recording(recording, timeline)
             draw(timeline, canvas)
+            write_checked(timeline, checked, canvas)
             for part in read_frames(timeline):
                 draw_frames(part, canvas)
         finally:

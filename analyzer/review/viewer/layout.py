@@ -24,6 +24,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     CLOSE_UP,
     LINES,
     NOTHING,
+    LanePlace,
     frames_entity,
     lane_places,
     lanes_entity,
@@ -37,7 +38,7 @@ SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on others they are in relation to each other.
 _LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 190, 90
 _BELOW = 0.65  # of a lane: the axis of time
-_COLUMNS = (1, 9)  # of words, and of what they stand beside
+_COLUMNS = (2, 10)  # of words, and of what they stand beside
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its height in relation to others
 
@@ -180,9 +181,10 @@ def review_layout(
     places = list(zip(lanes, lane_places(lanes), strict=True))
     stacks: dict[str, list[Row]] = {}
     for name, microphone in timeline.microphones.items():
-        own = {place.name: place for lane, place in places if lane.microphone == name}
-        views = _lane_views(microphone, list(own), _note(timeline))
-        rows: list[Row] = [(_LANE * len(own) + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
+        own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
+        count = len({place.height for _, place in own})
+        views = _lane_views(microphone, own, count, _note(timeline))
+        rows: list[Row] = [(_LANE * count + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
         more = _plot_views(microphone, plots[name], timeline.every, close_up=close_up)
         level = [_beside(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
@@ -209,14 +211,14 @@ def _note(timeline: Timeline) -> str:
 
 
 def _lane_views(
-    microphone: MicrophoneTimeline, names: Sequence[str], note: str
+    microphone: MicrophoneTimeline, places: Sequence[tuple[str, LanePlace]], count: int, note: str
 ) -> list[rrb.Horizontal]:
     """Show the lanes of each labelling, beside their names."""
     labellings = [(one.name, labelling_in_words(one.name)) for one in labellings_of(microphone)]
-    count = len(names)
     views = []
     for labelling, words in labellings or [("", "")]:
         entities = [lanes_entity(microphone.name, each) for each in dict.fromkeys((labelling, ""))]
+        names = [place.name for own, place in places if own in {labelling, ""}]
         lanes = _time_series(words, entities, (0.0, float(count)))
         beside = rrb.Vertical(
             *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, _BELOW]

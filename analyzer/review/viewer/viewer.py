@@ -9,6 +9,7 @@ import rerun as rr
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.spans import NONE, joined
+from hearthlog.analyzer.review.timeline.checked_classes import Checked
 from hearthlog.analyzer.review.timeline.home_clock import HomeClock
 from hearthlog.analyzer.review.timeline.lanes import reviewed_lane
 from hearthlog.analyzer.review.timeline.model import LabelledSpans, Timeline
@@ -19,6 +20,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     draw_asked,
     draw_close_up,
     draw_frames,
+    write_checked,
 )
 from hearthlog.analyzer.review.viewer.file import name_recording
 from hearthlog.analyzer.review.viewer.layout import APPLICATION, SHARED_AXIS, review_layout
@@ -174,6 +176,18 @@ class Viewer:
         name_recording(self._recording, timeline)
         self._canvas = Canvas(self._recording, timeline.clock)
         self._reviewed = draw(timeline, self._canvas)
+        self._flush()
+
+    def write_checked(self, timeline: Timeline, checked: Checked) -> None:
+        """Write beside the classes of a timeline that is drawn how many of its sounds were right.
+
+        Parameters
+        ----------
+        timeline : Timeline
+        checked : mapping
+            As `checked_classes` returns it.
+        """
+        write_checked(timeline, checked, self._canvas)
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
