@@ -12,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
-from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -835,25 +834,6 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
             assert review.process.wait(60) == 0
-
-
-def test_a_page_that_lets_its_name_point_to_this_machine_reads_nothing(home, tmp_path):
-    rebound = ["--host-resolver-rules=MAP stranger.test 127.0.0.1"]
-    with reviewing(home, "--web", BROWSER="true") as review:
-        line = review.wait_for("http://127.0.0.1:")
-        ours = line[line.index("http:") :].split()[0]
-        with browsing(ours, tmp_path / "reviewer"):
-            review.wait_for("drag a span")
-            ports = {port for _, port in listening(programs_of(review))}
-            assert len(ports) == 3  # data, files of the viewer, page
-            with browsing("about:blank", tmp_path / "stranger", flags=rebound) as page:
-                answering = []
-                for port in ports:
-                    found = page.call("Page.navigate", url=f"http://stranger.test:{port}/")
-                    answering += [] if "errorText" in found else [port]
-                assert answering == [urlsplit(ours).port]
-                page.call("Page.navigate", url=ours.replace("127.0.0.1", "stranger.test"))
-                assert "404" in patiently(lambda: page.evaluate("document.body.textContent"), bool)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

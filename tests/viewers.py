@@ -277,12 +277,18 @@ class Page:
         url = found[0]["webSocketDebuggerUrl"]
         self._socket = await self._session.ws_connect(url, max_msg_size=0)
 
-    async def _call(self, method, parameters):
+    async def _send(self, method, parameters):
         self._number += 1
         await self._socket.send_json({"id": self._number, "method": method, "params": parameters})
+        return self._number
+
+    async def _call(self, method, parameters):
+        return await self._answer(await self._send(method, parameters))
+
+    async def _answer(self, number):
         while True:
             answer = await self._socket.receive_json()
-            if answer.get("id") == self._number:
+            if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer["result"]
 
@@ -293,7 +299,39 @@ class Page:
     def open(self, address):
         """Go to another page, and wait until it is there with its pictures."""
         self.call("Page.navigate", url=address)
+        self._wait_until_loaded()
+
+    def open_as(self, address, content):
+        """Open a page that does not come from where its address points to."""
+        opened = asyncio.wait_for(self._open_as(address, content), _WAIT_SECONDS)
+        self._loop.run_until_complete(opened)
+        self._wait_until_loaded()
+
+    async def _open_as(self, address, content):
+        await self._call("Fetch.enable", {"patterns": [{"urlPattern": address}]})
+        opened = await self._send("Page.navigate", {"url": address})
+        while (said := await self._socket.receive_json()).get("method") != "Fetch.requestPaused":
+            pass
+        answer = {
+            "requestId": said["params"]["requestId"],
+            "responseCode": 200,
+            "responseHeaders": [{"name": "Content-Type", "value": "text/html"}],
+            "body": base64.b64encode(content.encode()).decode(),
+        }
+        await self._send("Fetch.fulfillRequest", answer)
+        await self._answer(opened)
+        await self._call("Fetch.disable", {})
+
+    def _wait_until_loaded(self):
         patiently(lambda: self.evaluate("document.readyState"), lambda state: state == "complete")
+
+    def wait_for(self, promise):
+        """Let the page compute something that takes its time."""
+        found = self.call(
+            "Runtime.evaluate", expression=promise, returnByValue=True, awaitPromise=True
+        )
+        assert "exceptionDetails" not in found, found
+        return found["result"]["value"]
 
     def evaluate(self, expression):
         """Let the page compute something."""

@@ -9,9 +9,10 @@ from hearthlog.tools.cli.text import tell
 
 def print_recording(path: Path) -> None:
     """Print the name of a Rerun recording, and how to look at it."""
+    from hearthlog.analyzer.review.viewer.process import hidden_options
+
     print(path)
-    # Otherwise the viewer listens to the whole network.
-    print(f"open it with: rerun --bind 127.0.0.1 {shlex.quote(str(path))}")
+    print(f"open it with: rerun {hidden_options()} {shlex.quote(str(path))}")
 
 
 def show_page(address: str) -> None:

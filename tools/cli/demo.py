@@ -26,6 +26,7 @@ def demo(
     """Compose a day of a home, record it with the starter model, and draw the result."""
     from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
     from hearthlog.analyzer.review.viewer.file import save_timeline
+    from hearthlog.analyzer.review.viewer.process import hidden_options
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL
     from hearthlog.recorder.config import load_settings
@@ -62,7 +63,7 @@ def demo(
     _say(f"4. hearthlog review {logs} --save {timeline}")
     save_timeline(read_timeline([logs]), timeline)
 
-    _say(f"Look at it:           {_command('rerun')} --bind 127.0.0.1 {timeline}")
+    _say(f"Look at it:           {_command('rerun')} {hidden_options()} {timeline}")
     print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
     print(f"Record a microphone:  {_command('hearthlog')} record")
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.viewer.live import LiveServer
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
-_LOOPBACK = "127.0.0.1"
 _POLL_SECONDS = 0.2
 _MOST_TROUBLES = 100  # that are remembered, so that none is said again and again
 
@@ -102,8 +101,10 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
 def _say_where(url: str, bind: str | None) -> None:
     from urllib.parse import urlsplit
 
+    from hearthlog.analyzer.review.viewer.process import hidden_options
+
     place = urlsplit(url).netloc
-    tell(f"look with: rerun --bind {_LOOPBACK} --connect {url}")
+    tell(f"look with: rerun {hidden_options()} --connect {url}")
     if bind is None:
         tell(f"from another machine, first: ssh -L {place}:{place} and the name of this one")
     else:

@@ -92,6 +92,20 @@ def hidden_address() -> str:
     return address
 
 
+def hidden_options() -> str:
+    """Return options of `rerun` with which no web page finds the viewer that a user starts.
+
+    By itself it listens to the whole network, and tells every web page that finds it what it shows.
+
+    Returns
+    -------
+    str
+        Of a command line: a `hidden_address`, and a port.
+    """
+    address = hidden_address()
+    return f"--bind {address} --port {free_port(bind=address)}"
+
+
 def check_display(instead: str) -> None:
     """Raise DataError where no window can be opened.
 
