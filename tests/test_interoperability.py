@@ -303,8 +303,8 @@ def test_a_file_cut_anywhere_is_read_up_to_its_last_whole_chunk(recorded, tmp_pa
     _, unfinished = recorded
     whole = unfinished.read_bytes()
     layout = chunks(whole)
-    assert len(layout) > 4
-    middle = layout[3][0]
+    assert len(layout) > 2
+    middle = layout[len(layout) // 2][0]
     cut = tmp_path / "cut.mcap.active"
     rng = np.random.default_rng(5)
     for length in [*rng.integers(1000, len(whole), 50).tolist(), middle - 1, middle, len(whole)]:

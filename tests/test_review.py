@@ -794,7 +794,7 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         window = Window(display, port)
         x, y = ruler(patiently(window.picture, shows_ruler))
         window.drag(y, x + 300, x + 500)
-        selected = patiently(window.selection, bool)
+        selected = window.dragged()
         review.press("2")
         mark = one_mark(home)
         assert (mark.start, mark.end) == selected

@@ -224,6 +224,15 @@ class Window:
         found = panel.get("TimePanelBlueprint", {}).get("time_selection")
         return (found["min"], found["max"]) if found else None
 
+    def dragged(self):
+        """The span that is marked once the viewer has drawn all of a drag."""
+        selected = patiently(self.selection, bool)
+        before = None
+        while selected != before:
+            time.sleep(_DRAW_SECONDS)
+            before, selected = selected, self.selection()
+        return selected
+
     def mouse(self, *steps):
         """Do what `xdotool` calls steps, each when the one before was seen and drawn."""
         for step in steps:

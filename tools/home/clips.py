@@ -1,5 +1,6 @@
 """The clips that a simulated home is composed of: recordings of a manifest, and made-up sounds."""
 
+import os
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -229,7 +230,7 @@ class _AnyLabel(Collection[str]):
 def _recorded(manifest: Path) -> list[Clip]:
     clips = []
     for row in read_manifest(manifest, _AnyLabel()):
-        name = row.path.relative_to(manifest.parent).as_posix()
+        name = Path(os.path.relpath(row.path, manifest.parent)).as_posix()
         name += f"@{row.start:g}" if row.start else ""
         try:
             seconds = min(audio_seconds(row.path), row.end) - row.start
