@@ -37,6 +37,7 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on others they are in relation to each other.
 _LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 190, 90
+_NEAR = -60.0, 300.0  # seconds from the cursor, which stands at the start of what is asked
 _BELOW = 0.65  # of a lane: the axis of time
 _COLUMNS = (2, 10)  # of words, and of what they stand beside
 Boundary = rr.encodings.TimeRangeBoundary
@@ -109,7 +110,13 @@ def lines_view() -> rrb.View:
     return rrb.TextLogView(origin=LINES, name="Events")
 
 
-def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = False) -> rrb.View:
+def plot_view(
+    plots: Sequence[Plot],
+    entities: Sequence[str],
+    *,
+    live: bool = False,
+    near: Sequence[rr.VisibleTimeRange] = (),
+) -> rrb.View:
     """Show plots of one kind, or of kinds with the same title, in one view.
 
     Parameters
@@ -120,6 +127,8 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
         Of the plots, at least one.
     live : bool, optional
         Whether new values come from the right, and the view has a title and a legend.
+    near : sequence of rr.VisibleTimeRange, optional
+        What is drawn; by default all.
     """
     plot = max(reversed(plots), key=lambda one: len(one.names))
     kind = plots[0].kind
@@ -127,7 +136,7 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, len(plot.names) - 0.5)
     legend = live and (kind.style is Style.BANDS or len(entities) > 1)
-    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend)
+    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend, near=near)
 
 
 def _time_series(
@@ -137,6 +146,7 @@ def _time_series(
     *,
     titlebar: bool = False,
     legend: bool = False,
+    near: Sequence[rr.VisibleTimeRange] = (),
 ) -> rrb.View:
     is_one = len(entities) == 1
     return rrb.TimeSeriesView(
@@ -147,6 +157,7 @@ def _time_series(
         axis_x=_axis(),
         axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
+        time_ranges=near or None,
     )
 
 
@@ -185,7 +196,8 @@ def review_layout(
         count = len({place.height for _, place in own})
         views = _lane_views(microphone, own, count, _note(timeline))
         rows: list[Row] = [(_LANE * count + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
-        more = _plot_views(microphone, plots[name], timeline.every, close_up=close_up)
+        near = _near_cursor(clock.name) if close_up else []
+        more = _plot_views(microphone, plots[name], timeline.every, near)
         level = [_beside(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
             rows += [(_LEVEL_HEIGHT, view) for view in _sounds(microphone)]
@@ -234,17 +246,20 @@ def _text(entity: str) -> rrb.View:
 
 
 def _plot_views(
-    microphone: MicrophoneTimeline, plots: Sequence[Plot], every: int, *, close_up: bool
+    microphone: MicrophoneTimeline,
+    plots: Sequence[Plot],
+    every: int,
+    near: Sequence[rr.VisibleTimeRange],
 ) -> list[rrb.View | rrb.Container]:
     """Show the plots of a microphone but the level; of close-ups what is drawn of them."""
     first = [plot for plot in plots if plot.kind is SHARES]
-    if close_up:
+    if near:
         first += [plot for plot in plots if plot.kind is LEVEL]
     others = [same for same in _by_title(plots) if same[0].kind not in {LEVEL, SHARES}]
     return [
-        *(_beside([plot], CLOSE_UP if close_up else "") for plot in first),
+        *(_beside([plot], near) for plot in first),
         *map(_beside, reversed(others)),
-        *([] if close_up else [*_sounds(microphone), *_frame_views(microphone, every)]),
+        *([] if near else [*_sounds(microphone), *_frame_views(microphone, every)]),
     ]
 
 
@@ -253,14 +268,20 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
     return [[plot for plot in plots if plot.kind.title == title] for title in titles]
 
 
-def _beside(plots: Sequence[Plot], close_up: str = "") -> rrb.Container:
-    """Show plots of one title, beside words on what they show."""
+def _near_cursor(clock: str) -> list[rr.VisibleTimeRange]:
+    """Draw close-ups near the cursor only: of all the viewer's memory grows without end."""
+    before, after = (Boundary.cursor_relative(seconds=seconds) for seconds in _NEAR)
+    return [rr.VisibleTimeRange(clock, start=before, end=after)]
+
+
+def _beside(plots: Sequence[Plot], near: Sequence[rr.VisibleTimeRange] = ()) -> rrb.Container:
+    """Show plots of one title, close up or all of them, beside words on what they show."""
     labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
-    note = ", close up" if close_up else ""
-    entities = [plot_entity(plot, close_up) for plot in plots]
+    note, place = (", close up", CLOSE_UP) if near else ("", "")
+    entities = [plot_entity(plot, place) for plot in plots]
     return rrb.Horizontal(
         _text(text_entity(plots[0])),
-        plot_view(plots, entities),
+        plot_view(plots, entities, near=near),
         column_shares=_COLUMNS,
         name=f"{plots[0].kind.view}{labelling}{note}",
     )
