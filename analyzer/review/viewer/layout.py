@@ -110,13 +110,7 @@ def lines_view() -> rrb.View:
     return rrb.TextLogView(origin=LINES, name="Events")
 
 
-def plot_view(
-    plots: Sequence[Plot],
-    entities: Sequence[str],
-    *,
-    live: bool = False,
-    near: Sequence[rr.VisibleTimeRange] = (),
-) -> rrb.View:
+def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = False) -> rrb.View:
     """Show plots of one kind, or of kinds with the same title, in one view.
 
     Parameters
@@ -127,8 +121,6 @@ def plot_view(
         Of the plots, at least one.
     live : bool, optional
         Whether new values come from the right, and the view has a title and a legend.
-    near : sequence of rr.VisibleTimeRange, optional
-        What is drawn; by default all.
     """
     plot = max(reversed(plots), key=lambda one: len(one.names))
     kind = plots[0].kind
@@ -136,7 +128,7 @@ def plot_view(
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, len(plot.names) - 0.5)
     legend = live and (kind.style is Style.BANDS or len(entities) > 1)
-    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend, near=near)
+    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend)
 
 
 def _time_series(
@@ -146,7 +138,6 @@ def _time_series(
     *,
     titlebar: bool = False,
     legend: bool = False,
-    near: Sequence[rr.VisibleTimeRange] = (),
 ) -> rrb.View:
     is_one = len(entities) == 1
     return rrb.TimeSeriesView(
@@ -157,7 +148,6 @@ def _time_series(
         axis_x=_axis(),
         axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
-        time_ranges=near or None,
     )
 
 
@@ -196,9 +186,8 @@ def review_layout(
         count = len({place.height for _, place in own})
         views = _lane_views(microphone, own, count, _note(timeline))
         rows: list[Row] = [(_LANE * count + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
-        near = _near_cursor(clock.name) if close_up else []
-        more = _plot_views(microphone, plots[name], timeline.every, near)
-        level = [_beside(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
+        more = _plot_views(microphone, plots[name], timeline, close_up=close_up)
+        level = [_all(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
             rows += [(_LEVEL_HEIGHT, view) for view in _sounds(microphone)]
         elif marking or not more:
@@ -246,20 +235,17 @@ def _text(entity: str) -> rrb.View:
 
 
 def _plot_views(
-    microphone: MicrophoneTimeline,
-    plots: Sequence[Plot],
-    every: int,
-    near: Sequence[rr.VisibleTimeRange],
+    microphone: MicrophoneTimeline, plots: Sequence[Plot], timeline: Timeline, *, close_up: bool
 ) -> list[rrb.View | rrb.Container]:
     """Show the plots of a microphone but the level; of close-ups what is drawn of them."""
     first = [plot for plot in plots if plot.kind is SHARES]
-    if near:
+    if close_up:
         first += [plot for plot in plots if plot.kind is LEVEL]
     others = [same for same in _by_title(plots) if same[0].kind not in {LEVEL, SHARES}]
     return [
-        *(_beside([plot], near) for plot in first),
-        *map(_beside, reversed(others)),
-        *([] if near else [*_sounds(microphone), *_frame_views(microphone, every)]),
+        *(_close_up(plot, timeline.clock.name) if close_up else _all([plot]) for plot in first),
+        *map(_all, reversed(others)),
+        *([] if close_up else [*_sounds(microphone), *_frame_views(microphone, timeline.every)]),
     ]
 
 
@@ -268,20 +254,25 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
     return [[plot for plot in plots if plot.kind.title == title] for title in titles]
 
 
-def _near_cursor(clock: str) -> list[rr.VisibleTimeRange]:
-    """Draw close-ups near the cursor only: of all the viewer's memory grows without end."""
+def _close_up(plot: Plot, clock: str) -> rrb.Container:
+    """Show what is drawn close up near the cursor only: all of it makes the viewer grow."""
+    view = plot_view([plot], [plot_entity(plot, CLOSE_UP)])
     before, after = (Boundary.cursor_relative(seconds=seconds) for seconds in _NEAR)
-    return [rr.VisibleTimeRange(clock, start=before, end=after)]
+    near = rr.VisibleTimeRange(clock, start=before, end=after)
+    view.properties["VisibleTimeRanges"] = rrb.VisibleTimeRanges(near)
+    return _beside([plot], view, ", close up")
 
 
-def _beside(plots: Sequence[Plot], near: Sequence[rr.VisibleTimeRange] = ()) -> rrb.Container:
-    """Show plots of one title, close up or all of them, beside words on what they show."""
+def _all(plots: Sequence[Plot]) -> rrb.Container:
+    return _beside(plots, plot_view(plots, [plot_entity(plot) for plot in plots]))
+
+
+def _beside(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Container:
+    """Put a view of plots of one title beside words on what they show."""
     labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
-    note, place = (", close up", CLOSE_UP) if near else ("", "")
-    entities = [plot_entity(plot, place) for plot in plots]
     return rrb.Horizontal(
         _text(text_entity(plots[0])),
-        plot_view(plots, entities, near=near),
+        view,
         column_shares=_COLUMNS,
         name=f"{plots[0].kind.view}{labelling}{note}",
     )
