@@ -152,8 +152,9 @@ class Canvas:
         strokes : int, optional
             In each span: fewer than the pixels of a span leave holes between.
         """
-        upper = np.cumsum(shares, axis=1)
-        lower = np.where(shares < _LEAST_SHARE, np.nan, upper - shares)
+        # Half a stroke is a line of its own for the viewer, which keeps something of each.
+        upper = np.where(shares < _LEAST_SHARE, np.nan, np.cumsum(shares, axis=1))
+        lower = upper - shares
         ends = np.tile(np.stack([lower, upper], axis=1), (1, strokes, 1))
         steps = (np.arange(2 * strokes) + 0.5) / (2 * strokes) - 0.5
         places = times[:, np.newaxis] + (steps * length).astype(np.int64)
