@@ -55,6 +55,7 @@ NAMED = [
     "evaluate log LOGS --reference NAMED.csv",
 ]
 _TOOK = re.compile(r" in [0-9.]+ s \([0-9]+ times real time\)")
+_HIDDEN = re.compile(r"--bind \S+ --port \d+")  # each time another address
 
 
 def put(kind, path):
@@ -113,8 +114,8 @@ def command(capfd, tmp_path, day, model_file):
 
 
 def told(result, log):
-    """What a command says, but for where the logs are, and how fast it was."""
-    texts = (text.replace(str(log.parents[4]), "") for text in result[1:])
+    """What a command says, but for where the logs are, how fast it was, and what is drawn."""
+    texts = (_HIDDEN.sub("", text.replace(str(log.parents[4]), "")) for text in result[1:])
     return result.returncode, *(_TOOK.sub("", text) for text in texts)
 
 
