@@ -18,11 +18,10 @@ from hearthlog.schemas.times import NANOSECONDS
 LINES, CLIP, WORDS = "events", "clip", "words"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # behind the name of a microphone
-ASKED = "asked"
+ASKED, ASKED_WORDS = "asked", "words/asked"
 _CLOSE_KINDS = SHARES, LEVEL  # of plots
 _SHARE_STEP, _LEVEL_STEP = 0.01, 0.1  # less is not seen
-_CLOSE_STROKES = 1_200  # of a band
-_AROUND_ASKED: Colour = (38, 44, 54)
+_CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # of a band
 _ASKED: Colour = (245, 240, 225)
 
 _THICK, _THIN = 12.0, 8.0  # in points of the screen
@@ -196,28 +195,26 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
             add_to_plot(part, entity, canvas, strokes)
 
 
-def draw_asked(changes: Sequence[int], start: int, end: int, text: str, canvas: Canvas) -> None:
-    """Draw which span is asked, and beside it on which side it is.
+def draw_asked(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
+    """Draw which span is asked, in place of the one before.
 
     Parameters
     ----------
-    changes : sequence of int
-        Start of all that is shown, then start and end of this span and of those that were asked
-        before it, in nanoseconds of UTC, ascending.
+    number : int
+        How many were asked before.
     start, end : int
-        Of the span.
+        Of the span, in nanoseconds of UTC.
     text : str
         What is asked.
     canvas : Canvas
         Is drawn on.
     """
-    earlier, later = f"{text} >", f"< {text}"
-    times = np.array(changes)
-    inside = (times >= start) & (times < end)
-    states = np.where(inside, text, np.where(times < start, earlier, later))
-    colours = {earlier: _AROUND_ASKED, text: _ASKED, later: _AROUND_ASKED}
-    canvas.configure_states(ASKED, colours)
-    canvas.change_states(ASKED, times, states.tolist())
+    if number:
+        canvas.hide(f"{ASKED}/{number - 1}")
+    entity, middle = f"{ASKED}/{number}", np.array([(start + end) // 2])
+    canvas.configure_bands(entity, [text], [_ASKED])
+    canvas.add_bands(entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
+    canvas.write(ASKED_WORDS, text)
 
 
 def draw_frames(

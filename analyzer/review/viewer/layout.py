@@ -20,6 +20,7 @@ from hearthlog.analyzer.review.timeline.plots import (
 )
 from hearthlog.analyzer.review.viewer.drawing import (
     ASKED,
+    ASKED_WORDS,
     CLIP,
     CLOSE_UP,
     LINES,
@@ -201,7 +202,7 @@ def review_layout(
     ends = (clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
     boundaries = (Boundary.absolute(nanos=time) for time in ends)
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    asked: list[Row] = [(_ASKED_HEIGHT, states_view(ASKED, "Which span is asked"))]
+    asked: list[Row] = [(_ASKED_HEIGHT, _asked_view())]
     whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     return TimelineBlueprint([*(asked if close_up else []), whole], panel, *boundaries)
 
@@ -252,6 +253,11 @@ def _plot_views(
 def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
     titles = dict.fromkeys(plot.kind.title for plot in plots)
     return [[plot for plot in plots if plot.kind.title == title] for title in titles]
+
+
+def _asked_view() -> rrb.Container:
+    lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
+    return rrb.Horizontal(_text(ASKED_WORDS), lane, column_shares=_COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:

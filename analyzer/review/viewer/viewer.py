@@ -125,7 +125,7 @@ class Viewer:
         self._recording = rr.RecordingStream(APPLICATION)
         self._canvas = Canvas(self._recording, HomeClock("", 0))
         self._reviewed: dict[str, DrawnLane] = {}
-        self._asked: set[int] = set()  # times of changes in the lane of what is asked
+        self._asked = 0
         self._close = NONE  # what was drawn close up
         self._sent = False
 
@@ -170,7 +170,6 @@ class Viewer:
         process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
-        self._asked = {timeline.grid.start}
         layout = review_layout(timeline, marking=True, close_up=close_up)
         self._recording.connect_grpc(process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
@@ -223,8 +222,8 @@ class Viewer:
         text : str
             What is asked.
         """
-        self._asked |= {start, end}
-        draw_asked(sorted(self._asked), start, end, text, self._canvas)
+        draw_asked(self._asked, start, end, text, self._canvas)
+        self._asked += 1
         self._flush()
 
     def redraw_marks(self, microphone: str, marks: LabelledSpans, reviewed: LabelledSpans) -> None:
