@@ -49,6 +49,7 @@ from hearthlog.schemas.messages.message_types import nanoseconds
 
 SECOND = 1_000_000_000
 HOUR, DAY = 3600 * SECOND, 86_400 * SECOND
+INFO, WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 BEHIND = 12  # frames; with the window before them a second
 START = 1_772_348_400 * SECOND  # 2026-03-01T07:00:00Z
 CLASSES = ("silence", "speech", "music")
@@ -415,6 +416,7 @@ def test_only_so_many_minutes_are_kept_a_day_also_when_the_recorder_starts_again
     assert 160 < kept <= 200  # what frames a message takes place, too
     assert keep([noise(50)], about, START + 2 * HOUR) == []
     assert said(tmp_path) == ["no clips: 1 minutes of this day are kept already"] * 2
+    assert {item.level for item in read(tmp_path, "rosout") if "no clips" in item.msg} == {INFO}
     (layer,) = keep([noise(50)], about, START + DAY)
     assert len(frames_of([layer])) == 1000
 
@@ -507,6 +509,7 @@ def test_where_space_runs_out_clips_stop_and_the_log_goes_on(noise, tmp_path):
         assert 300 < len(frames_of([layer])) < 2000
         assert len(read(_log(layer), "features")) == 3800
         assert said(_log(layer)) == ["no clips: less than 4 MB are free on the disk"]
+        assert [i.level for i in read(_log(layer), "rosout") if "no clips" in i.msg] == [WARN]
 
 
 def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(tmp_path):

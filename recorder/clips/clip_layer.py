@@ -32,6 +32,7 @@ _LONGEST_HELD = 60 * NANOSECONDS  # a pre-roll, a second, a block of frames
 
 
 CLIPS_AGAIN = Notice(OK, "clips are kept again")
+_ALL_KEPT = "minutes of this day are kept already"
 
 
 class ClipWriter:
@@ -143,7 +144,10 @@ class ClipWriter:
         if reason == self._stopped:
             return []
         self._stopped = reason
-        return [Notice(WARNING, f"no clips: {reason}") if reason else CLIPS_AGAIN]
+        if not reason:
+            return [CLIPS_AGAIN]
+        # What the configuration asks for is no trouble.
+        return [Notice(OK if reason.endswith(_ALL_KEPT) else WARNING, f"no clips: {reason}")]
 
     def _append(self, log: Path, sound: KeptSound) -> str:
         """Write one message; return why that failed, or an empty text."""
@@ -188,7 +192,7 @@ class ClipWriter:
         minutes = self._settings.clip_minutes_a_day
         if self._used + frames > minutes * _MINUTE_FRAMES:
             self._used = minutes * _MINUTE_FRAMES  # so that no shorter sound is written either
-            return f"{minutes} minutes of this day are kept already"
+            return f"{minutes} {_ALL_KEPT}"
         least = self._settings.clip_min_free_space
         try:
             free = shutil.disk_usage(self._settings.output).free
