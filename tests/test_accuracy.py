@@ -300,6 +300,16 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     assert "not checked here" not in done.stdout, "no model labelled this log"
 
 
+@pytest.mark.parametrize(
+    ("checked_here", "left"), [(3, "2 more minutes, and"), (4, "1 more minute, and")]
+)
+def test_too_few_checked_minutes_say_how_many_more_are_needed(tmp_path, checked_here, left):
+    logs = write_day(tmp_path, DAY, [(at("08:00:05"), 2, "coughing", 0.9)])
+    for hour in range(8, 8 + checked_here):
+        check(logs, at(f"{hour:02}:00"))
+    assert any(line.startswith(left) for line in Accuracy(find_home_logs([tmp_path])).lines())
+
+
 def test_an_interval_of_few_checks_is_wide_and_of_many_narrow():
     few, many = ClassCheck(4, 3, 4, 1), ClassCheck(400, 300, 400, 100)
     assert few.precision[1] - few.precision[0] > 0.5

@@ -2,11 +2,15 @@
 
 import os
 import shutil
+import socket
+import struct
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager, suppress
 from datetime import UTC
 from itertools import pairwise
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -203,6 +207,19 @@ def test_the_page_shows_a_day_as_it_was_heard(timeline, tmp_path):
         assert viewer.wait_until_drawn().errors == []
         picture_of(page.picture, timeline, tmp_path / "page.png")
         assert viewer.state().errors == []
+
+
+def test_a_page_that_is_closed_leaves_no_error_in_the_terminal(capfd):
+    with open_page() as viewer:
+        address = urlsplit(viewer.address)
+        before = threading.active_count()
+        with socket.create_connection((address.hostname, address.port)) as page:
+            page.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            page.sendall(f"GET {address.path}text HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode())
+            patiently(threading.active_count, lambda count: count > before)
+        viewer.say("nobody reads this")
+        patiently(threading.active_count, lambda count: count <= before)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 # What one looks for: short sounds in a long day

@@ -48,8 +48,8 @@ class Accuracy:
             )
         if 0 < len(self.minutes) < FEWEST:
             yield (
-                f"{FEWEST - len(self.minutes)} more minutes, and the report says in which range "
-                "the right numbers lie"
+                f"{number(FEWEST - len(self.minutes), 'more minute')}, and the report says in "
+                "which range the right numbers lie"
             )
         if self.looked_at:
             yield (

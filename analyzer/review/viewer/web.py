@@ -3,6 +3,7 @@
 import json
 import queue
 import secrets
+import sys
 import threading
 import urllib.request
 from collections.abc import Callable, Sequence
@@ -124,6 +125,11 @@ class _Server(ThreadingHTTPServer):
         self.secret = secrets.token_urlsafe(16)
         self.viewer_files = viewer_files
         self.data = data
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Pass over what a page that was closed took no more; print other errors."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:
