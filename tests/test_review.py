@@ -319,7 +319,7 @@ def test_a_key_names_the_span_that_is_marked_with_the_mouse(home):
     assert sitting.run("2") == 1
     assert [(m.start, m.end, m.label) for m in layers(home)] == [(*span, "speech")]
     assert sitting.screen.lane == [(*span, "speech")]
-    assert "speech" in sitting.said[1]
+    assert sitting.said[1].endswith("talking")
     assert sitting.said[-1].startswith("1 span reviewed in")
 
 
@@ -555,6 +555,18 @@ def test_every_key_is_offered_once_with_what_it_does(home):
     assert len(set(keys)) == len(keys)
 
 
+def test_a_reviewer_reads_the_names_that_the_lanes_have_and_one_key_means_not_sure(home):
+    item = ReviewItem(START, START + 5 * SECOND, "yelling", "an item")
+    sitting = Sitting(home, [item])
+    sitting.session.classes = ["silence", "yelling", "unknown", "phone_ring"]
+    classes = [text for key, text in sitting.session.keys if key in "1234u"]
+    assert classes == ["quiet", "shouting", "telephone ringing", "not sure"]
+    sitting.run("3")
+    assert sitting.screen.asked == [(*item[:2], "shouting? 5.0 s")]
+    assert sitting.said[2].endswith("  telephone ringing")
+    assert [mark.label for mark in layers(home)] == ["phone_ring"]
+
+
 # Sound
 
 
@@ -585,7 +597,7 @@ def test_a_queue_has_spans_of_the_labelling_that_do_not_overlap(recorded_home, t
     ordered = sorted(found)
     assert all(a.end <= b.start for a, b in pairwise(ordered))
     assert all(timeline.grid.start <= item.start < item.end <= timeline.grid.end for item in found)
-    assert all(item.text.startswith("live: ") for item in found)
+    assert all(item.text.startswith("the recorder: ") for item in found)
     if ranking == "disagreeing":
         spans = [one.spans for one in timeline.microphones["mic"].labellings[:2]]
         for item in found:
@@ -824,12 +836,12 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             x, y = ruler(patiently(page.picture, shows_ruler))
             page.drag(y, x + 200, x + 350)  # a part of the second log
             buttons = "[...document.querySelectorAll('button')]"
-            page.evaluate(f"{buttons}.find(each => each.textContent == '2speech').click()")
+            page.evaluate(f"{buttons}.find(each => each.textContent == '2talking').click()")
             mark = one_mark(home)
             assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
             seconds = (mark.end - mark.start) / SECOND
             assert 25 < seconds < 45  # of 200 in about 870 pixels
-            patiently(page.text, lambda text: text.endswith("speech"))
+            patiently(page.text, lambda text: text.endswith("talking"))
             page.evaluate(f"{buttons}.find(each => each.textContent == 'zundo').click()")
             patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")

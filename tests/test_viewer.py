@@ -215,7 +215,8 @@ def test_a_page_that_is_closed_leaves_no_error_in_the_terminal(capfd):
         before = threading.active_count()
         with socket.create_connection((address.hostname, address.port)) as page:
             page.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            page.sendall(f"GET {address.path}text HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode())
+            wanted = f"GET {address.path}text HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n"
+            page.sendall(wanted.encode())
             patiently(threading.active_count, lambda count: count > before)
         viewer.say("nobody reads this")
         patiently(threading.active_count, lambda count: count <= before)

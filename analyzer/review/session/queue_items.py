@@ -24,6 +24,7 @@ from hearthlog.analyzer.review.queue.review_list import (
 from hearthlog.analyzer.review.queue.reviewed_time import reviewed_time
 from hearthlog.analyzer.review.session.session import ReviewItem
 from hearthlog.analyzer.review.timeline.lanes import labelling_in_words
+from hearthlog.models.classes import in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
@@ -175,12 +176,12 @@ def _mixed(spans: Sequence[ReviewSpan], minutes: Sequence[ReviewSpan]) -> list[R
 
 
 def _text(span: ReviewSpan) -> str:
-    if span.reason == RANDOM:
-        return f"{span.a}: mostly {span.label_a} (a minute at random: mark what is wrong in it)"
+    new, old = (labelling_in_words(name) for name in (span.b, span.a))
     if span.reason == CHANGE:
         much = "" if span.score is None else f": {time_words(span.score)}{A_DAY}"
-        new, old = (labelling_in_words(name) for name in (span.b, span.a))
-        says = f"{new} says {class_words(span.label_b)}, {old} {class_words(span.label_a)}"
-        return says + much
-    other = f", {span.b}: {span.label_b or 'nothing'}" if span.b else ""
-    return f"{span.a}: {span.label_a}{other} ({span.reason})"
+        return f"{new} says {class_words(span.label_b)}, {old} {class_words(span.label_a)}{much}"
+    label, other = (in_words(name).lower() for name in (span.label_a, span.label_b))
+    if span.reason == RANDOM:
+        return f"{old}: mostly {label} (a minute at random: mark what is wrong in it)"
+    said = f", {new}: {other or 'nothing'}" if span.b else ""
+    return f"{old}: {label}{said} ({span.reason})"

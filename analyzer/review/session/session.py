@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark
 from hearthlog.analyzer.review.session.marking import Marking
 from hearthlog.analyzer.review.timeline.model import LabelledSpans
-from hearthlog.models.classes import UNKNOWN
+from hearthlog.models.classes import UNKNOWN, in_words
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -143,7 +143,7 @@ class Session:
         queued = bool(self.items)
         keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
         keys += [(_RIGHT, "or Enter: all else in the span is right")]
-        keys += [*zip(_CLASS_KEYS, self.classes, strict=False), ("u", UNKNOWN)]
+        keys += [(key, _words(label)) for key, label in self._labels.items()]
         keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
         keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
         return [*keys, ("q", "quit")]
@@ -199,7 +199,6 @@ class Session:
             self.say("the viewer did not answer, and nothing was done; press the key again")
 
     def _press(self, key: str) -> None:
-        labels = dict(zip(_CLASS_KEYS, self.classes, strict=False)) | {"u": UNKNOWN}
         actions: dict[str, Callable[[], None]] = {
             "d": lambda: self._mark(self.marking.delete),
             "z": self._undo,
@@ -218,12 +217,18 @@ class Session:
             }
         else:
             actions |= {"c": lambda: self._mark(self.marking.confirm), "f": self._look_around}
-        if key in labels:
-            self._mark_as(labels[key])
+        if key in self._labels:
+            self._mark_as(self._labels[key])
         elif key in actions:
             actions[key]()
         elif key.strip():
             self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
+
+    @property
+    def _labels(self) -> dict[str, str]:
+        """What each key of a class marks."""
+        classes = [name for name in self.classes if name != UNKNOWN]
+        return dict(zip(_CLASS_KEYS, classes, strict=False)) | {"u": UNKNOWN}
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
@@ -253,8 +258,8 @@ class Session:
     def _mark(self, change: Callable[[int, int], list[Mark]]) -> None:
         start, end = self._chosen()
         made = change(start, end)
-        labels = ", ".join(dict.fromkeys(mark.label for mark in made)) or "no mark"
-        self._done(start, end, labels)
+        labels = dict.fromkeys(_words(mark.label) for mark in made)
+        self._done(start, end, ", ".join(labels) or "no mark")
         if self.items and not self._in_minute:
             self._go(1)
 
@@ -351,8 +356,13 @@ class Session:
 
 
 def _question(item: ReviewItem) -> str:
-    length = (item.end - item.start) / NANOSECONDS
-    return "all of this minute?" if item.chosen == RANDOM else f"{item.label}? {length:.1f} s"
+    if item.chosen == RANDOM:
+        return "all of this minute?"
+    return f"{_words(item.label)}? {(item.end - item.start) / NANOSECONDS:.1f} s"
+
+
+def _words(label: str) -> str:
+    return in_words(label).lower()
 
 
 def _margin(start: int, end: int) -> int:
