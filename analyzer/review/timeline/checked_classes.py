@@ -32,9 +32,9 @@ def checked_classes(timeline: Timeline, logs: HomeLogs) -> Checked:
     start, end = timeline.grid.start - _AROUND, timeline.grid.end + _AROUND
     near = read_reviewed_labels(logs, LIVE, start, end, [], {RANDOM})
     reviewed = [one for one in near if start <= one.span.start < end]
-    found: dict[tuple[str, str], ClassCheck] = {}
+    checked: dict[tuple[str, str], ClassCheck] = {}
     for microphone in timeline.microphones:
         minutes = checked_minutes(one for one in reviewed if one.span.microphone == microphone)
         checks = ((name, minutes.check(name)) for name in minutes.labelled)
-        found |= {(microphone, in_words(name)): one for name, one in checks if one.labelled}
-    return found
+        checked |= {(microphone, in_words(name)): one for name, one in checks if one.labelled}
+    return checked
