@@ -10,7 +10,7 @@ from typing import Any
 
 from hearthlog.recorder.stream_messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import active_path, log_path
+from hearthlog.schemas.logs.files import free_log_path, log_path
 from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import header
@@ -47,6 +47,8 @@ class RollingLog:
         A killed process loses at most this much sound.
     sync_seconds : float
         A power cut loses at most this much sound.
+    live : bool, optional
+        Whether a file whose name is taken gets another one, as where the clock was set back.
 
     Attributes
     ----------
@@ -60,12 +62,15 @@ class RollingLog:
         file_seconds: int,
         flush_seconds: float,
         sync_seconds: float,
+        *,
+        live: bool = False,
     ) -> None:
         self.finished: list[Path] = []
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
         self._sync_seconds = sync_seconds - _DELAY_SECONDS
+        self._name = free_log_path if live else log_path
         self._writer: LogWriter | None = None
         self._last = self._until = 0  # no time lies between: the first message opens a file
         self._flush_at: int | None = None
@@ -86,7 +91,7 @@ class RollingLog:
         ------
         LogError
             If the disk refuses: what was written stays, for the next start to complete. Also if
-            there is a file already with the name of one that begins.
+            there is a file already with the name of one that begins, unless live.
         """
         with self._keeping_what_was_written():
             for message in messages:
@@ -150,8 +155,9 @@ class RollingLog:
         stamp : int
             In nanoseconds of UTC.
         """
-        path = log_path(self._description.root, self._description.node, stamp)
-        return not (path.exists() or active_path(path).exists())
+        description = self._description
+        path = log_path(description.root, description.node, stamp)
+        return free_log_path(description.root, description.node, stamp) == path
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
         """Find the file that contains a time; the later one where the clock was set back.
@@ -223,7 +229,7 @@ class RollingLog:
     def _roll(self, stamp: int) -> None:
         self._finish_file()
         description = self._description
-        path = log_path(description.root, description.node, stamp)
+        path = self._name(description.root, description.node, stamp)
         self._writer = LogWriter(
             path, description.topics, description.metadata, description.attachments, stamp
         )

@@ -174,7 +174,7 @@ def record(
                 watch.first.classifier.feature_set,
             )
             stack.enter_context(closing(candidates))
-        recording = RecordingSession(settings, microphone.name, source.device, watch, candidates)
+        recording = RecordingSession(settings, microphone.name, source, watch, candidates)
         try:
             for event in source.events(stop):
                 recording.add(event)
@@ -191,8 +191,8 @@ class RecordingSession:
     settings : Settings
     microphone : str
         Its name.
-    device : str
-        Name of the source.
+    source : SoundSource
+        What is recorded; of audio files no log may be there already.
     watch : ModelWatch or None
         Gives the models, one after the other; None for no labels.
     candidates : CandidateWatch or None
@@ -215,12 +215,12 @@ class RecordingSession:
         self,
         settings: Settings,
         microphone: str,
-        device: str,
+        source: SoundSource,
         watch: ModelWatch | None,
         candidates: CandidateWatch | None = None,
     ) -> None:
         self._settings = settings
-        self._device = device
+        self._device = source.device
         self._watch = watch
         self._candidates = candidates
         self._model: Model | None
@@ -236,6 +236,7 @@ class RecordingSession:
             settings.max_bag_duration,
             settings.flush_seconds,
             settings.sync_seconds,
+            live=not isinstance(source, FileSource),
         )
         self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
         self._now = 0  # time of the last event

@@ -6,6 +6,7 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
 
+MICROPHONE = SimpleNamespace(device="test")
 OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
 OF_CANDIDATE = ["/mic/candidate/label", "/mic/candidate/segment"]
 
@@ -153,7 +155,7 @@ def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CountingWatch(folder, DEFAULT)
-    session = RecordingSession(Settings(output=tmp_path), "mic", "test", watch, candidates)
+    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, watch, candidates)
     frames = iter(range(0, 100_000, 30))
 
     def told():
@@ -386,7 +388,7 @@ def test_a_candidate_that_has_just_begun_cannot_be_compared_yet(folder, tmp_path
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CandidateWatch(folder, DEFAULT)
-    session = RecordingSession(Settings(output=tmp_path), "mic", "test", watch, candidates)
+    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, watch, candidates)
     session.add(block(0, 30))
     done = run(capfd, "models", "compare", "--live", "--logs", tmp_path)
     assert done.returncode == 1

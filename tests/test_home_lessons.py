@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, review_path
 
+MICROPHONE = SimpleNamespace(device="test")
 SECOND = 10**9
 
 
@@ -157,7 +159,7 @@ def test_a_class_that_a_review_left_alone_often_is_not_taken_from_other_time(hom
 def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path):
     """The blocks of the floor are counted from the first frame of the recorder."""
     begin, frame = 1_772_348_400 * SECOND, 50_000_000
-    session = RecordingSession(Settings(output=tmp_path), "mic", "test", None)
+    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, None)
     rng = np.random.default_rng(1)
     floors = []
     for first, loudness in ((7, 0.001), (900, 0.1)):

@@ -1,16 +1,21 @@
 """The log rolls with the clock, and what was written is on the disk soon enough."""
 
+from threading import Event as Flag
+
 import numpy as np
 import pytest
 from logreader import LogReader
 from logs import features
 
+from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.recording import Settings, describe_log
+from hearthlog.recorder.recording import Settings, describe_log, record
 from hearthlog.recorder.stream_messages import stream_info
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.times import NANOSECONDS
@@ -24,6 +29,25 @@ VALUES = np.random.default_rng(0).random((2000, DEFAULT.width)).astype(np.float3
 
 class Nowhere:
     device = "test"
+
+
+class ClockSetBack:
+    """Thirty seconds over a full hour; then the clock is set back, and sound goes on."""
+
+    device = "test"
+
+    def __init__(self, begin, seconds):
+        self._begin, self._seconds = begin, seconds
+
+    def events(self, _):
+        stamps = self._begin + np.arange(1201) * FRAME_NANOSECONDS
+        silence = np.zeros((600, FRAME_SAMPLES), np.float32)
+        yield Frames(0, silence, stamps[:600])
+        back = stamps[601:] - self._seconds * NANOSECONDS
+        yield Gap(int(stamps[600]), int(back[0]), "the clock was set", 1)
+        again = np.arange(1200) * FRAME_NANOSECONDS + back[0]
+        for half in (slice(0, 600), slice(600, 1200)):
+            yield Frames(601 + half.start, silence, again[half])
 
 
 @pytest.fixture
@@ -54,6 +78,24 @@ def test_where_time_runs_backwards_another_file_begins(description):
     late, early = log.finished
     assert features(late)[0].tolist() == list(range(40))
     assert features(early)[0].tolist() == list(range(40, 80))
+
+
+@pytest.mark.parametrize(
+    ("back", "names"),
+    [
+        (30, ["165940Z", "165940Z_2", "170000Z", "170000Z_2"]),
+        (3600, ["160010Z", "165940Z", "170000Z"]),
+    ],
+)
+def test_a_clock_that_is_set_back_over_a_full_hour_ends_nothing(tmp_path, back, names):
+    source = ClockSetBack(START + HOUR - 20 * NANOSECONDS, back)
+    settings = Settings(output=tmp_path)
+    logs = record(settings, settings.microphone[0], source, Flag()).logs
+    assert sorted(path.stem.partition("T")[2] for path in logs) == names
+    numbers = np.concatenate([features(log)[0] for log in logs])
+    np.testing.assert_array_equal(numbers, np.delete(np.arange(1801), 600))
+    assert {level for each in examine(tmp_path) for level, _ in each.counts} <= {"warning"}
+    assert {log.node for log in find_home_logs([tmp_path]).entries} == {settings.node}
 
 
 @pytest.mark.parametrize("block", [12, 200])

@@ -7,6 +7,7 @@ import time
 from contextlib import chdir, contextmanager, suppress
 from itertools import pairwise
 from queue import SimpleQueue
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 
+MICROPHONE = SimpleNamespace(device="test")
 SECOND = 1_000_000_000
 START = 1_772_348_400 * SECOND
 
@@ -261,7 +263,7 @@ def ready(watch):
 def record_and_promote(folder, logs, events):
     """Record events; before the second block of frames another model is ready."""
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
-    recording = RecordingSession(Settings(output=logs), "mic", "test", watch)
+    recording = RecordingSession(Settings(output=logs), "mic", MICROPHONE, watch)
     recording.add(events[0])
     promote(folder, "two")
     ready(watch)

@@ -9,7 +9,7 @@ from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX
-from hearthlog.schemas.times import millisecond_text
+from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
 _LEFT = {
@@ -66,20 +66,27 @@ def _start(file: ExaminedFile) -> int:
 
 def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
     """Two logs of one node speak of the same time only where its clock was set back."""
+    twice = [again for file in files if (again := _lived_twice(file)) is not None]
     latest = files[0]
     for file in files[1:]:
         assert file.span is not None
         assert latest.span is not None
-        if file.span[0] < latest.span[1] and not (_set_back(file) or _set_back(latest)):
+        start, end = file.span[0], min(file.span[1], latest.span[1])
+        if start < latest.span[1] and not any(a <= start and end <= b for a, b in twice):
             what = f"begins before {latest.findings.path.name} of the same node ends"
             advice = "move the one away that does not belong here"
-            file.findings.error("overlap", what, advice, time=file.span[0])
+            file.findings.error("overlap", what, advice, time=start)
         if file.span[1] > latest.span[1]:
             latest = file
 
 
-def _set_back(file: ExaminedFile) -> bool:
-    return any(_begins_back(frames) for frames in file.frames.values())
+def _lived_twice(file: ExaminedFile) -> tuple[int, int] | None:
+    """Return the time that came again because the clock was set back before a file, or None."""
+    back = [frames.gap_before for frames in file.frames.values() if _begins_back(frames)]
+    gaps = [gap for gap in back if gap is not None]
+    if not gaps:
+        return None
+    return min(new for _, new in gaps) - NANOSECONDS, max(old for old, _ in gaps) + NANOSECONDS
 
 
 def _begins_back(frames: FrameSequence) -> bool:
@@ -89,23 +96,23 @@ def _begins_back(frames: FrameSequence) -> bool:
 
 def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
     """Frame numbers go on from file to file, or begin at 0 again."""
-    by_end = {}
-    for file in files:
-        if (last := file.frames[microphone].last) is not None:
-            by_end[last[1] + FRAME_NANOSECONDS] = file
     for earlier, file in pairwise(files):
-        frames = file.frames[microphone]
-        if frames.first is None or frames.first[0] == 0:
-            continue
-        previous = earlier
-        if _begins_back(frames) and frames.gap_before is not None:
-            previous = by_end.get(frames.gap_before[0], earlier)
-        last = previous.frames[microphone].last
-        if last is None:
+        frames, last = file.frames[microphone], earlier.frames[microphone].last
+        if frames.first is None or frames.first[0] == 0 or last is None:
             continue
         missing = frames.first[0] - last[0] - 1 - frames.lost_before
-        if missing:
-            _say_missing(microphone, previous, file, missing)
+        if missing and not _goes_on(frames, [each.frames[microphone] for each in files]):
+            _say_missing(microphone, earlier, file, missing)
+
+
+def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
+    """Tell whether frames go on with where others end: the clock may have been set back between."""
+    assert frames.first is not None
+    number, time = frames.first[0] - frames.lost_before, frames.first[1]
+    if _begins_back(frames) and frames.gap_before is not None:
+        time = frames.gap_before[0]
+    ends = (other.last for other in others if other.last is not None)
+    return any(last[0] + 1 == number and abs(last[1] - time) < NANOSECONDS for last in ends)
 
 
 def _say_missing(microphone: str, previous: ExaminedFile, file: ExaminedFile, missing: int) -> None:

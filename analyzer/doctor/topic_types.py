@@ -18,7 +18,7 @@ TYPES = {
     CANDIDATE_SEGMENT: message_types.SEGMENT,
 }
 ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # what is a channel in every log of a recorder
-LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)\.mcap(\.active)?")
+LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)(_\d+)?\.mcap(\.active)?")
 SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 
 

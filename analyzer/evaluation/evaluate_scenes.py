@@ -305,7 +305,7 @@ class _Recorder:
             settings = load_settings(None, asked, {})
             source = FileSource([sound], _START, progress=report)
             microphone = settings.microphone[0].name
-            recording = RecordingSession(settings, microphone, source.device, self._watch)
+            recording = RecordingSession(settings, microphone, source, self._watch)
             try:
                 for event in source.events(Flag()):
                     recording.add(event)

@@ -221,7 +221,7 @@ def _entry(path: Path) -> HomeLog | None:
     if layer == AUDIO_LAYER:
         return None
     try:
-        moment = datetime.strptime(time, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        moment = datetime.strptime(time.partition("_")[0], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
         return HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, _NEVER)
     except ValueError:
         span = time_span(path)

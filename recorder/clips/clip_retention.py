@@ -91,7 +91,8 @@ def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple
     start : int
         When its log began, in nanoseconds of UTC.
     """
-    name = re.compile(rf"{re.escape(node)}_(\d{{8}}T\d{{6}}Z){re.escape(AUDIO_SUFFIX)}(\.damaged)?")
+    time, end = r"(\d{8}T\d{6}Z)(?:_\d+)?", rf"{re.escape(AUDIO_SUFFIX)}(\.damaged)?"
+    name = re.compile(rf"{re.escape(node)}_{time}{end}")
     for folder, folders, files in os.walk(root, onerror=failures.append):
         folders[:] = [each for each in folders if each.isdigit()]
         for file in files:

@@ -2,6 +2,7 @@
 
 import re
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,6 +62,31 @@ def log_path(root: Path, node: str, start: int) -> Path:
     """
     moment = datetime.fromtimestamp(start // NANOSECONDS, UTC)
     return root / f"{moment:%Y/%m/%d}" / f"{node}_{moment:%Y%m%dT%H%M%SZ}{SUFFIX}"
+
+
+def free_log_path(root: Path, node: str, start: int) -> Path:
+    """Name the log of a node that begins at a time, as no other log is named.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the logs.
+    node : str
+        Name of the node.
+    start : int
+        In nanoseconds of UTC.
+
+    Returns
+    -------
+    Path
+        As `log_path`; if that is taken, `<node>_YYYYMMDDTHHMMSSZ_2.mcap`, `…_3.mcap` and so on.
+    """
+    path = first = log_path(root, node, start)
+    for number in count(2):
+        if not (path.exists() or active_path(path).exists()):
+            break
+        path = first.with_name(f"{stem(first)}_{number}{SUFFIX}")  # '_' is behind '.'
+    return path
 
 
 def active_path(path: Path) -> Path:
