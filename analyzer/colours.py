@@ -7,6 +7,8 @@ from hearthlog.models.classes import find_class
 Colour = tuple[int, int, int]
 
 GAP: Colour = (200, 40, 40)
+_WHITE: Colour = (255, 255, 255)
+_LIGHT: Colour = (205, 205, 205)
 
 
 def colour(name: str) -> Colour:
@@ -22,3 +24,15 @@ def colour(name: str) -> Colour:
         return row.colour
     red, green, blue, *_ = hashlib.sha256(name.encode()).digest()
     return 70 + red % 186, 70 + green % 186, 70 + blue % 186
+
+
+def colour_on_paper(name: str) -> Colour:
+    """Return the colour of a class on a white ground.
+
+    Returns
+    -------
+    tuple of int
+        As of `colour`; light grey instead of white.
+    """
+    shade = colour(name)
+    return _LIGHT if shade == _WHITE else shade

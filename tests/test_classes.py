@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.colours import colour, colour_on_paper
 from hearthlog.analyzer.report.class_words import several_in_words
 from hearthlog.analyzer.training.scenario import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.transitions import (
@@ -176,3 +176,7 @@ def test_a_scenario_with_as_many_classes_as_a_model_may_have_has_no_unknown():
     names = [f"class_{number}" for number in range(MOST_CLASSES)]
     assert with_unknown(["dog"], names) is None
     assert with_unknown(["dog"], names[1:]) == ("dog",)
+
+
+def test_every_class_is_seen_on_paper():
+    assert all(min(colour_on_paper(row.name)) < 220 for row in CLASSES)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.report import class_words, interrai
 from hearthlog.analyzer.report.baseline import DAYS
 from hearthlog.analyzer.report.class_words import (
@@ -145,7 +145,7 @@ def _sounds(account: Account, day: Day) -> PageTable:
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
     rows = []
     for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
-        cells = [Cell(in_words(name), colour=colour(name))]
+        cells = [Cell(in_words(name), colour=colour_on_paper(name))]
         cells += _cells(account, minutes_of(name), day)
         if name == SILENCE:
             cells += [Cell("")] * (1 + account.comparable)

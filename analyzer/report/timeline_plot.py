@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import Spans, lengths, without
 from hearthlog.analyzer.report.baseline import Usual, usual
@@ -72,7 +72,7 @@ def _lanes(axes: Any, names: Sequence[str], days: Sequence[Day], bins: int) -> N
     """Draw a block for each class, and in it a line for each day."""
     count = len(days)
     for place, name in enumerate(names):
-        face = tuple(part / 255 for part in colour(name))
+        face = tuple(part / 255 for part in colour_on_paper(name))
         for line, day in enumerate(days):
             edges = _edges(day, bins)
             filled = lengths(day.home.spans[name], edges) / np.maximum(np.diff(edges), 1)
