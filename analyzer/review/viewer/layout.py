@@ -37,7 +37,7 @@ APPLICATION = "hearthlog"
 # The viewer keeps the range that linked time axes share under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on others they are in relation to each other.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 190, 90
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 60
 _NEAR = -60.0, 300.0  # seconds from the cursor, which stands at the start of what is asked
 _BELOW = 0.65  # of a lane: the axis of time
 _COLUMNS = (2, 10)  # of words, and of what they stand beside
