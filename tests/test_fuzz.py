@@ -10,7 +10,7 @@ import pytest
 import soundfile
 import zstandard
 from fuzzing import Victim
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from lossy import LossySource
 from mcap.opcode import Opcode
@@ -230,6 +230,9 @@ def test_a_file_whose_records_were_changed(log, victim, mutations, name):
     assert not victim.read(_written(records), name)
 
 
+@example(
+    mutations=[(chunk_records, 0, [(double, 16, 0)], "zstd")], name="home_20260301T070000Z.mcap"
+)
 @FEW
 @given(mutations=st.lists(CHUNKS, min_size=1, max_size=3), name=NAMES)
 def test_a_file_whose_chunks_were_changed_and_have_the_right_checksum(log, victim, mutations, name):

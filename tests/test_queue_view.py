@@ -123,7 +123,7 @@ def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timel
         ask(view, logs, start, start + 3 * SECOND)
         patiently(view.picture)
         memory.append(viewer.memory_info().rss)
-    assert memory[-1] - memory[3] < 8 * 6_000_000
+    assert memory[-1] - memory[3] < 8 * 8_000_000
 
 
 def test_a_sound_is_shown_as_long_as_it_lasts_and_none_without_an_error(view, timeline):

@@ -246,7 +246,7 @@ def test_a_worker_with_another_hearthlog_is_refused(cluster, tmp_path, site_of):
     with open_workers(scheduler=cluster) as workers:
         with running([*start, cluster, *options], paths=paths, cwd=tmp_path):
             until(lambda: workers.parallel == 2)
-            futures = [workers.submit(tasks.nap, 0.1) for _ in range(4)]
+            futures = [workers.submit(tasks.nap, 0.1) for _ in range(20)]
             errors = [future.exception(LONG) for future in futures]
             assert None in errors
             with pytest.raises(WorkerError, match=said):

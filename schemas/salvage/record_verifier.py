@@ -258,7 +258,9 @@ class RecordVerifier:
         span = whole_records.span_of(entries)
         wrong = "" if exact and (not entries or span == (start, end)) else "the head of a chunk"
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
-        return WholeRecord(offset, offset + first + number, WholeChunk(chunk, definitions), wrong)
+        leading = int((others < messages[0]).sum()) if len(messages) else len(others)
+        whole = WholeChunk(chunk, definitions, leading)
+        return WholeRecord(offset, offset + first + number, whole, wrong)
 
     def _data(self, offset: int, length: int) -> memoryview:
         """Read the data of a chunk, of which there may be any length."""

@@ -136,7 +136,7 @@ class SalvagedCopy:
         self.pieces += 1
         if isinstance(piece, WholeChunk):
             chunk = piece.stored
-            self._define(chunk.entries, piece.definitions)
+            self._define(chunk.entries, piece.definitions[: piece.leading])
             self._writer.copy_chunk(chunk)
             for number in chunk.entries:
                 times = chunk.times(number)
@@ -158,7 +158,7 @@ class SalvagedCopy:
             self._begun = True
 
     def _define(self, numbers: Iterable[int], inside: Iterable[Definition] = ()) -> None:
-        """Write what defines these channels before their first message, unless it is with them."""
+        """Write what defines these channels before their first message, unless it stands there."""
         self._written.update((type(record), record.id) for record in inside)
         definitions = self._salvage.definitions
         for number in numbers:

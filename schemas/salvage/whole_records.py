@@ -27,6 +27,7 @@ class WholeChunk(NamedTuple):
 
     stored: StoredChunk
     definitions: list[Definition]
+    leading: int  # how many of them stand before the first message
 
 
 class WholeAttachment(NamedTuple):
