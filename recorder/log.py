@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hearthlog.recorder.finishing import LogFinisher
 from hearthlog.recorder.stream_messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import free_log_path, log_path
@@ -49,14 +50,16 @@ class RollingLog:
         A power cut loses at most this much sound.
     live : bool, optional
         Whether a file whose name is taken gets another one, as where the clock was set back.
+    finisher : LogFinisher or None
+        Gives complete files their names; by default they get them at once.
 
     Attributes
     ----------
     finished : list of Path
-        Files that are complete.
+        Files that are complete, by their final names.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         description: LogDescription,
         file_seconds: int,
@@ -64,6 +67,7 @@ class RollingLog:
         sync_seconds: float,
         *,
         live: bool = False,
+        finisher: LogFinisher | None = None,
     ) -> None:
         self.finished: list[Path] = []
         self._description = description
@@ -71,6 +75,7 @@ class RollingLog:
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
         self._sync_seconds = sync_seconds - _DELAY_SECONDS
         self._name = free_log_path if live else log_path
+        self._finisher = finisher
         self._writer: LogWriter | None = None
         self._last = self._until = 0  # no time lies between: the first message opens a file
         self._flush_at: int | None = None
@@ -216,7 +221,12 @@ class RollingLog:
 
     def _finish_file(self) -> None:
         if self._writer is not None:
-            self.finished.append(self._writer.finish())
+            if self._finisher is None:
+                self._writer.finish()
+            else:
+                self._writer.complete()
+                self._finisher.add(self._writer.active_path)
+            self.finished.append(self._writer.path)
             self._writer = None
 
     def _append(self, message: EncodedMessage) -> None:

@@ -22,6 +22,7 @@ from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
+from hearthlog.recorder.finishing import LogFinisher
 from hearthlog.recorder.log import LogDescription, RollingLog
 from hearthlog.recorder.model_watch import Loaded, ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
@@ -231,12 +232,15 @@ class RecordingSession:
         self._pipeline = Pipeline(
             microphone, features, classifier, settings.statistics_every, candidate
         )
+        read_ahead = isinstance(source, FileSource) and not source.realtime
+        self._finisher = None if read_ahead else LogFinisher()
         self._log = RollingLog(
             self._describe(),
             settings.max_bag_duration,
             settings.flush_seconds,
             settings.sync_seconds,
             live=not isinstance(source, FileSource),
+            finisher=self._finisher,
         )
         self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
         self._now = 0  # time of the last event
@@ -274,7 +278,11 @@ class RecordingSession:
             If the log cannot be written; what was written stays, for the next start to complete.
         """
         notices = self._clips.finish()
-        self._log.finish([*self._pipeline.finish(), *self._clip_messages(notices)])
+        try:
+            self._log.finish([*self._pipeline.finish(), *self._clip_messages(notices)])
+        finally:
+            if self._finisher is not None:
+                self._finisher.close()
 
     def _clip_messages(self, notices: Sequence[Notice]) -> list[EncodedMessage]:
         return [

@@ -16,6 +16,9 @@ from hearthlog.schemas.salvage.recover import (
 )
 from hearthlog.schemas.salvage.salvaged_copy import Recovery
 from hearthlog.schemas.storage.new_files import sync_file, sync_folder
+from hearthlog.schemas.times import NANOSECONDS
+
+_CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log: it is read as a whole, not as it grows
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,30 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
     return completed
 
 
+def complete_log(active: Path) -> None:
+    """Complete one log as `recover_active` does.
+
+    Parameters
+    ----------
+    active : Path
+        If it is gone, or somebody else is at it, nothing is done.
+
+    Raises
+    ------
+    LogError
+        If it cannot be read or completed.
+    """
+    if not active.exists():
+        return
+    with lock_abandoned(active) as is_abandoned:
+        if is_abandoned:
+            _recover(active, active.with_name(stem(active) + SUFFIX))
+
+
 def _recover_clips(active: Path, path: Path) -> list[Recovered]:
     try:
         recovery = _complete(active, path)
-        active.unlink()
+        active.unlink(missing_ok=True)
         sync_folder(path.parent)
     except NothingWholeError:
         active.unlink()
@@ -101,7 +124,7 @@ def _recover(active: Path, path: Path) -> list[Recovered]:
     if damages or not recovery.messages:
         active.rename(active.with_name(path.name + ".damaged"))
     else:
-        active.unlink()
+        active.unlink(missing_ok=True)
     sync_folder(path.parent)
     if not recovery.messages:
         return []
@@ -115,13 +138,18 @@ def _complete(active: Path, path: Path) -> Recovery:
     """Copy what is whole in a log to its final name, unless an earlier start has done so."""
     copy = active.with_name(path.name + ".recovering")
     try:
-        recovery = recover_log(active, copy, path.name)
+        recovery = recover_log(active, copy, path.name, chunk_span=_CHUNK_SPAN)
         if not recovery.messages:
             return recovery
         if path.exists():
             check_copy(path, recovery.topics)
+            return recovery
+        sync_file(copy)
+        if all(damage.cut for damage in recovery.damages):
+            with lock_abandoned(copy):  # the log has one name at any time, and one owner
+                copy.replace(active)
+                active.rename(path)
         else:
-            sync_file(copy)
             copy.rename(path)
     finally:
         copy.unlink(missing_ok=True)

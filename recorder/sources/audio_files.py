@@ -34,6 +34,10 @@ class FileSource:
     progress : callable
         Told the share of the sound that was read, 0 to 1.
 
+    Attributes
+    ----------
+    realtime : bool
+
     Raises
     ------
     SourceError
@@ -53,7 +57,7 @@ class FileSource:
         self.device = _name(paths)
         self._paths = paths
         self._start = start
-        self._realtime = realtime
+        self.realtime = realtime
         self._progress = progress
 
     def events(self, stop: Flag) -> Iterator[Event]:
@@ -78,7 +82,7 @@ class FileSource:
         first = 0
         for samples in self._frames():
             frames = Frames(first, samples, self._stamps(first, len(samples)))
-            if self._realtime:
+            if self.realtime:
                 due = began + (first + len(samples)) * FRAME_NANOSECONDS / NANOSECONDS
                 stop.wait(max(due - time.monotonic(), 0.0))
             if stop.is_set():
@@ -97,7 +101,7 @@ class FileSource:
 
     def _frames(self) -> Iterator[Float32]:
         """Yield blocks of frames whose number divides the interval of the health reports."""
-        size = (_REALTIME_FRAMES if self._realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
+        size = (_REALTIME_FRAMES if self.realtime else _HEALTH_FRAMES) * FRAME_SAMPLES
         held = np.empty(0, np.float32)
         for path in self._paths:
             for block in read_audio(path):

@@ -19,7 +19,7 @@ class LogWriter:
     """One log being written.
 
     What was written is on its way to the disk after `flush`, and survives a power cut after
-    `sync`; only `finish` gives the file its name.
+    `sync`; only `finish` gives the file its name, and `complete` leaves that to others.
 
     Parameters
     ----------
@@ -118,6 +118,19 @@ class LogWriter:
         """
         os.fsync(self._stream.fileno())
 
+    def complete(self) -> None:
+        """Complete the log under its active name.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        """
+        self._content.finish(self.path.name)
+        self._stream.flush()
+        self.sync()
+        self._stream.close()
+
     def finish(self) -> Path:
         """Complete the log, give it its name, and return that.
 
@@ -126,10 +139,7 @@ class LogWriter:
         OSError
             If the file cannot be written or renamed.
         """
-        self._content.finish(self.path.name)
-        self._stream.flush()
-        self.sync()
-        self._stream.close()
+        self.complete()
         self.active_path.rename(self.path)
         sync_folder(self.path.parent)
         return self.path

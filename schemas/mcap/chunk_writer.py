@@ -243,6 +243,21 @@ class ChunkWriter:
         self.flush()
         self._put(chunk)
 
+    def join_chunk(self, chunk: StoredChunk, span: int) -> None:
+        """Append the records of another file's chunk to the chunk in progress.
+
+        Parameters
+        ----------
+        chunk : StoredChunk
+        span : int
+            Nanoseconds of log time that the joined chunk may have; a longer one is not joined.
+        """
+        begun = self._chunk
+        start, end = min(begun.start, chunk.start), max(begun.end, chunk.end)
+        if end - start > span or len(begun.content) + chunk.size > self._chunk_size:
+            self.flush()
+        self._chunk.add_chunk(chunk)
+
     def finish(self) -> None:
         """Write the chunk in progress, the index and the footer; the stream stays open."""
         self.flush()

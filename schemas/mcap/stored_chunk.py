@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64
 from hearthlog.schemas.mcap.formats import INDEX_ENTRIES, INDEX_ENTRY
+from hearthlog.schemas.mcap.records import ChunkHead, decompress
 
 LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
 
@@ -29,6 +30,17 @@ class StoredChunk(NamedTuple):
     def times(self, channel: int) -> Int64:
         """Return the log times of a channel's messages, as the message index has them."""
         return np.frombuffer(self.entries[channel], INDEX_ENTRIES)["time"]
+
+    def content(self) -> bytes:
+        """Decompress the records.
+
+        Raises
+        ------
+        McapError
+            If they are damaged.
+        """
+        head = ChunkHead(0, 0, self.size, 0, self.compression, slice(None))
+        return decompress(head, self.data)
 
 
 class _Local(threading.local):
@@ -96,6 +108,15 @@ class ChunkBuilder:
             self.entries.setdefault(channel, bytearray()).extend(same)
         times = entries["time"]
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
+
+    def add_chunk(self, chunk: StoredChunk) -> None:
+        """Append all records of a chunk."""
+        for channel, entries in chunk.entries.items():
+            moved = np.frombuffer(entries, INDEX_ENTRIES).copy()
+            moved["offset"] += len(self.content)
+            self.entries.setdefault(channel, bytearray()).extend(moved.tobytes())
+        self.content += chunk.content()
+        self.start, self.end = min(self.start, chunk.start), max(self.end, chunk.end)
 
     def compress(self) -> StoredChunk:
         """Compress the records; return the chunk as a file will hold it."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
@@ -24,7 +25,12 @@ class NothingWholeError(LogError):
 
 
 def recover_log(
-    source: Path, copy: Path, name: str, progress: Progress = ignore_progress
+    source: Path,
+    copy: Path,
+    name: str,
+    progress: Progress = ignore_progress,
+    *,
+    chunk_span: int = 0,
 ) -> Recovery:
     """Copy what is whole in a log to a new one, and check the copy.
 
@@ -38,6 +44,8 @@ def recover_log(
         File name that the copy will have in the end.
     progress : callable, optional
         Called with the share that is done, 0 to 1; starts again if a second attempt is needed.
+    chunk_span : int
+        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
 
     Returns
     -------
@@ -57,7 +65,7 @@ def recover_log(
     profile = ""
     while True:
         with Salvage(source, definitions) as salvage, copy.open("wb") as stream:
-            attempt = SalvagedCopy(stream, salvage, profile)
+            attempt = SalvagedCopy(stream, salvage, profile, chunk_span)
             attempt.write(name, progress)
         if not attempt.could_be_better():
             break
@@ -162,7 +170,7 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
 
 @contextmanager
 def lock_abandoned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a log, unless the recorder that writes the log holds it.
+    """Hold the lock of a log, unless the process that writes the log holds it.
 
     Parameters
     ----------
@@ -172,7 +180,7 @@ def lock_abandoned(path: Path) -> Iterator[bool]:
     Yields
     ------
     bool
-        Whether the lock is held, so that nobody writes the log.
+        Whether the lock is held, so that nobody writes the log, and it is still there.
 
     Raises
     ------
@@ -189,4 +197,12 @@ def lock_abandoned(path: Path) -> Iterator[bool]:
         except BlockingIOError:
             yield False
         else:
-            yield True
+            yield _is_at(stream, path)
+
+
+def _is_at(stream: BinaryIO, path: Path) -> bool:
+    """Tell whether a path still leads to an open file."""
+    try:
+        return os.path.samestat(os.fstat(stream.fileno()), path.stat())
+    except OSError:
+        return False

@@ -57,12 +57,17 @@ class SalvagedCopy:
         Of the damaged log; `write` goes through all its pieces.
     profile : str
         What the header of the new log says if that of the old one is lost.
+    chunk_span : int
+        Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
     """
 
-    def __init__(self, stream: BinaryIO, salvage: Salvage, profile: str) -> None:
+    def __init__(
+        self, stream: BinaryIO, salvage: Salvage, profile: str, chunk_span: int = 0
+    ) -> None:
         self.pieces = 0  # pieces that were copied
         self._salvage = salvage
         self._profile = profile
+        self._chunk_span = chunk_span
         self._writer = ChunkWriter(stream)
         self._begun = False
         self._written: set[tuple[type, int]] = set()
@@ -134,10 +139,15 @@ class SalvagedCopy:
     def _add(self, piece: Piece) -> None:
         self._begin()
         self.pieces += 1
+        if self._chunk_span and not isinstance(piece, WholeChunk):
+            self._writer.flush()
         if isinstance(piece, WholeChunk):
             chunk = piece.stored
             self._define(chunk.entries, piece.definitions[: piece.leading])
-            self._writer.copy_chunk(chunk)
+            if self._chunk_span:
+                self._writer.join_chunk(chunk, self._chunk_span)
+            else:
+                self._writer.copy_chunk(chunk)
             for number in chunk.entries:
                 times = chunk.times(number)
                 self._count(number, len(times), int(times.min()), int(times.max()))
@@ -166,6 +176,8 @@ class SalvagedCopy:
             schema = definitions.schemas.get(channel.schema_id)
             for record in (schema, channel):
                 if record is not None and (type(record), record.id) not in self._written:
+                    if self._chunk_span:
+                        self._writer.flush()  # what it refers to may be in there
                     self._writer.write_definition(record)
                     self._written.add((type(record), record.id))
 

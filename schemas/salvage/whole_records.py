@@ -15,7 +15,7 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.mcap.formats import ATTACHMENT, HEAD, INDEX_ENTRIES, MESSAGE, UINT32, UINT64
-from hearthlog.schemas.mcap.records import ChunkHead, decompress, parse
+from hearthlog.schemas.mcap.records import parse
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 
@@ -152,8 +152,7 @@ def chunk_messages(chunk: StoredChunk) -> Iterator[records.Message]:
     mcap.records.Message
         In the order of the chunk.
     """
-    head = ChunkHead(0, 0, chunk.size, 0, chunk.compression, slice(None))
-    content = decompress(head, chunk.data)
+    content = chunk.content()
     for opcode, start, end in iterate_records(content):
         if opcode == Opcode.MESSAGE:
             yield read_message(content[start:end])
