@@ -247,6 +247,15 @@ def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
     assert part.lines.texts.tolist() == lines.texts[inside].tolist()
 
 
+def test_a_span_that_ends_with_a_log_has_labels_to_its_end(tmp_path, day, model_file):
+    settings, hour = Settings(output=tmp_path, model=model_file), -(-START // HOUR) * HOUR
+    logs = record(settings, settings.microphone[0], FileSource([day], START), Flag()).logs
+    timeline = read_timeline(logs, end=hour)
+    frames = timeline.microphones["mic"].labellings[0].frames
+    assert hour - FRAME_NANOSECONDS <= max(part.times[-1] for part in frames) < hour
+    assert list(timeline.coverage["mic"].logs) == logs[:1]
+
+
 def test_a_span_in_which_there_is_nothing_is_one_line(folder):
     with pytest.raises(DataError, match="in this span of time; `hearthlog info` shows what"):
         read_timeline([folder], START + HOUR, START + 2 * HOUR)

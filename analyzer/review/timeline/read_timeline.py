@@ -86,9 +86,10 @@ def read_timeline(
         If there is nothing in this span of time, or no such time zone.
     """
     losses: list[str] = []
-    files = find_timed_files(paths, start, end, losses)
+    files = find_timed_files(paths, start, None if end is None else end + _LATE, losses)
+    inside = [file for file in files if end is None or file.first < end]
     limited = start is not None or end is not None
-    if not files:
+    if not inside:
         raise _nothing(losses, limited=limited)
     first = min(file.first for file in files) if start is None else start
     last = max(file.last for file in files) + FRAME_NANOSECONDS if end is None else end
@@ -110,7 +111,7 @@ def read_timeline(
         name: coverage_of(
             [
                 (file.first, file.last + FRAME_NANOSECONDS, file.path)
-                for file in files
+                for file in inside
                 if not file.layer and file.path in collector.logs(name)
             ]
         )
