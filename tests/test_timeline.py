@@ -817,7 +817,7 @@ def test_bands_are_filled_from_one_probability_to_the_next(recording, timeline):
     np.testing.assert_allclose(middles, timeline.grid.middles, atol=1e3)
     colours = fixed(recording, "/mic/live/shares", "SeriesLines:colors")
     assert [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in colours] == [colour(n) for n in names]
-    assert fixed(recording, "/mic/live/shares", "SeriesLines:names") == list(names)
+    assert fixed(recording, "/mic/live/shares", "SeriesLines:names") == [*map(in_words, names)]
 
 
 def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, folder, model_file):
@@ -835,7 +835,7 @@ def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, fo
     for start in after_gaps:
         assert hole[np.searchsorted(times, start) - 1]
     names = fixed(recording, "/mic/frames/live", "SeriesLines:names")
-    assert names == list(load_model(model_file).classes)
+    assert names == [*map(in_words, load_model(model_file).classes)]
 
 
 def test_the_frames_of_a_long_time_are_read_when_they_are_needed(folder, timeline, monkeypatch):

@@ -12,6 +12,7 @@ from hearthlog.analyzer.review.timeline.lanes import REVIEWED, Lane, timeline_la
 from hearthlog.analyzer.review.timeline.model import FrameValues, Timeline
 from hearthlog.analyzer.review.timeline.plots import LEVEL, SHARES, Plot, Style, timeline_plots
 from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.models.classes import in_words
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -235,7 +236,8 @@ def draw_frames(
             if labelling.probabilities is not None and labelling.frames:
                 entity = frames_entity(microphone.name, labelling.name)
                 names = labelling.probabilities.names
-                canvas.configure_lines(entity, names, [colour(name) for name in names])
+                words = [in_words(name) for name in names]
+                canvas.configure_lines(entity, words, [colour(name) for name in names])
                 parts = _between(labelling.frames, start, end)
                 canvas.draw_frames(entity, names, parts, _SHARE_STEP)
         if microphone.level_frames:
@@ -258,7 +260,8 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
         Is drawn on.
     """
     if plot.kind.style is Style.BANDS:
-        canvas.configure_bands(entity, plot.names, [colour(name) for name in plot.names])
+        words = [in_words(name) for name in plot.names]
+        canvas.configure_bands(entity, words, [colour(name) for name in plot.names])
     elif plot.kind.style is Style.HEAT_MAP:
         canvas.configure_heat_map(entity, plot.names)
     else:
