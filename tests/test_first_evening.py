@@ -85,6 +85,8 @@ def test_an_evening_with_nothing_but_a_microphone(
         trained = hearthlog("train", "--home", "logs")
         assert trained.returncode == 0, trained.stderr
         assert "home-1 refused: " in trained.stdout  # it is made all the same
+        info = hearthlog("info", "logs")
+        assert info.stdout.splitlines()[-1].endswith("hearthlog review logs --queue")
         refused = hearthlog("models", "promote", "home-1")
         assert refused.returncode == 1
         assert "record for some hours" in refused.stderr  # it has learned from all there is

@@ -816,7 +816,8 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         review.press("3")
         assert one_mark(home)[1:4] == (*selected, "music")
         assert review.quit() == 0
-    assert review.lines[-1].startswith("1 span reviewed in")
+    assert review.lines[-2].startswith("1 span reviewed in")
+    assert review.lines[-1].endswith(f"hearthlog train --home {home}")
 
 
 def shows_ruler(picture):

@@ -2,14 +2,16 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hearthlog.analyzer.logs.summary import Summary
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words
 from hearthlog.models.starter import GENERAL
+from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import REVIEW
+from hearthlog.tools.cli.options import models_folder
 from hearthlog.tools.cli.text import number
 
 
@@ -52,8 +54,15 @@ def next_step(summary: Summary, path: Path) -> str | None:
     if not heard.keys() - {SILENCE}:
         return "nothing but quiet was heard yet: leave it recording, or try the microphone"
     marked = any(name.endswith(f"/{REVIEW}") for name in summary.segments)
-    if marked and latest["starter"]:
+    if marked and latest["starter"] and not _has_learned(summary.layers):
         return f"a model of this home, from what is marked: hearthlog train --home {place}"
     kept = any(topic.type == RAW_AUDIO and topic.messages for topic in summary.topics.values())
     what = "listen to" if kept else "judge"
     return f"ten spans to {what}: hearthlog review {place} --queue"
+
+
+def _has_learned(layers: Sequence[Path]) -> bool:
+    """Tell whether a model of the home was made after the last mark."""
+    marks = [path.stat().st_mtime for path in layers if log_name(path).layer == REVIEW_LAYER]
+    models = [path.stat().st_mtime for path in models_folder().glob("home-*.safetensors")]
+    return max(models, default=0.0) > max(marks, default=0.0)

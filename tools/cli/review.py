@@ -1,5 +1,6 @@
 """`hearthlog review`: logs on one time axis, and marks made where they are seen."""
 
+import shlex
 import signal
 from contextlib import suppress
 from datetime import date, datetime, timedelta
@@ -230,7 +231,9 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     viewer.write_checked(timeline, checked_classes(timeline, find_home_logs(logs)))
     print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
     with read_keys(keys), suppress(KeyboardInterrupt):
-        session.run(keys)
+        if session.run(keys):
+            homes = shlex.join(word for log in logs for word in ("--home", str(log)))
+            tell(f"next: a model of this home, from what is marked: hearthlog train {homes}")
     _say_how_right(logs)
 
 
