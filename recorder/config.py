@@ -14,6 +14,9 @@ from pydantic_settings import (
 )
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
+from hearthlog.recorder.disk.keeping import KeepingRules
+from hearthlog.recorder.disk.retention import Limits
+from hearthlog.recorder.disk.sizes import Size
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone
@@ -85,9 +88,20 @@ class Settings(BaseSettings):
     clip_minutes_a_day: int = Field(default=30, ge=1, le=1500)
     clip_retention_days: int = Field(default=30, ge=1, le=3650)
     clip_min_free_space: int = Field(default=500, ge=0)  # MB: with less, only the log goes on
+    retention_days: int = Field(default=0, ge=0)  # on which something was recorded; 0: no limit
+    max_bag_files: int = Field(default=0, ge=0)  # finished logs; 0: no limit
+    max_record_size: Size = Field(default=0, ge=0)  # bytes of all of them; 0: no limit
+    min_free_space: Size = Field(default=500_000_000, ge=0)  # bytes on the disk; 0: no floor
     microphone: list[MicrophoneSettings] = Field(
         default=[MicrophoneSettings()], min_length=1, max_length=1
     )
+
+    def keeping_rules(self) -> KeepingRules:
+        """Return what is kept of the finished logs."""
+        limits = Limits(
+            self.retention_days, self.max_bag_files, self.max_record_size, self.min_free_space
+        )
+        return KeepingRules(str(self.output), self.node, limits)
 
     @classmethod
     def settings_customise_sources(

@@ -1,6 +1,7 @@
 """The recorder: a source of sound, the pipeline, and the log that it writes."""
 
 import hashlib
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
+from hearthlog.recorder.disk.keeper import DiskKeeper
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, SoundSource, event_time
 from hearthlog.recorder.finishing import LogFinisher
@@ -243,6 +245,8 @@ class RecordingSession:
             finisher=self._finisher,
         )
         self._clips = ClipRecorder(settings, self._pipeline, self._log.file_at)
+        is_live = not isinstance(source, FileSource)
+        self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
 
@@ -268,6 +272,11 @@ class RecordingSession:
         notices += self._clips.after(event, self._pipeline.last_labels)
         self._now = event_time(event)
         self._log.write(self._clip_messages(notices))
+        if self._keeper is not None:
+            messages, problems = self._keeper.tick(self._now)
+            self._log.write(messages)
+            for problem in problems:
+                sys.stderr.write(f"hearthlog: {problem}\n")
 
     def finish(self) -> None:
         """Complete the log and its clips.
@@ -278,6 +287,8 @@ class RecordingSession:
             If the log cannot be written; what was written stays, for the next start to complete.
         """
         notices = self._clips.finish()
+        if self._keeper is not None:
+            self._keeper.close()
         try:
             self._log.finish([*self._pipeline.finish(), *self._clip_messages(notices)])
         finally:

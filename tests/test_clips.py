@@ -43,7 +43,7 @@ from hearthlog.recorder.recording import record, record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
-from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer
+from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer, log_path
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.messages.message_types import nanoseconds
 
@@ -453,11 +453,20 @@ def old(noise, tmp_path):
     return layer, [_log(layer), *others]
 
 
+def recorded_later(layer, days):
+    """Put a log on each of the days after that of a layer."""
+    for day in range(1, days + 1):
+        path = log_path(layer.parents[3], "home", START + day * DAY)
+        path.parent.mkdir(parents=True)
+        shutil.copy(_log(layer), path)
+
+
 @pytest.mark.parametrize("mode", ["off", "always"])
 def test_old_clips_are_deleted_and_nothing_else(old, noise, tmp_path, mode):
     layer, others = old
     about = asked(tmp_path / "logs", keep_audio=mode, never_keep=[], clip_retention_days=30)
-    keep([noise(3)], about, START + 30 * DAY - HOUR)
+    recorded_later(layer, 28)
+    keep([noise(3)], about, START + 29 * DAY - HOUR)
     assert layer.exists()
     keep([noise(4)], about, START + 30 * DAY + HOUR)
     assert not layer.exists()
@@ -469,22 +478,32 @@ def test_old_clips_are_looked_for_every_hour(old, tmp_path):
     layer, _ = old
     retention = ClipRetention(tmp_path / "logs", "home", 1)
     assert retention.tick(START + DAY - 60 * SECOND) == []
+    recorded_later(layer, 1)
     assert retention.tick(START + DAY + 3000 * SECOND) == []
     assert layer.exists()
     assert len(retention.tick(START + DAY + 3600 * SECOND)) == 1
     assert not layer.exists()
 
 
+def test_a_clock_far_ahead_deletes_no_clips(old, noise, tmp_path):
+    layer, _ = old
+    about = asked(tmp_path / "logs", keep_audio="off", clip_retention_days=2)
+    keep([noise(3)], about, START + 60 * DAY)
+    assert layer.exists()
+
+
 def test_what_recovery_kept_of_damaged_clips_is_deleted_too(old, tmp_path):
     layer, _ = old
     damaged = layer.with_name(layer.name + ".damaged")
     layer.rename(damaged)
+    recorded_later(layer, 1)
     assert len(ClipRetention(tmp_path / "logs", "home", 1).tick(START + 2 * DAY)) == 1
     assert not damaged.exists()
 
 
 def test_clips_that_cannot_be_deleted_are_said_and_the_others_go(old, tmp_path):
     layer, _ = old
+    recorded_later(layer, 1)
     folder = tmp_path / "logs" / "2026" / "01"
     folder.mkdir()
     with small_disk(folder / "01", "1M") as disk:

@@ -110,12 +110,15 @@ def completed(*words):
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        (("hearthlog", "re"), ["record", "recover", "review", "report", "replay", "relabel"]),
+        (
+            ("hearthlog", "re"),
+            ["record", "recover", "retain", *["review", "report", "replay", "relabel"]],
+        ),
         (("hearthlog", "models", "pro"), ["promote"]),
         (("hearthlog", "evaluate", ""), [*_WAYS]),
         (("hearthlog", "evaluate", "--model", "m", "--he"), ["--help"]),
         (("hearthlog", "evaluate", "search", "--fo"), ["--folds"]),
-        (("hearthlog", "record", "--max"), ["--max-bag-duration"]),
+        (("hearthlog", "record", "--max-bag"), ["--max-bag-duration", "--max-bag-files"]),
         (("hearthlog", "cat", "--format", ""), ["text", "ndjson", "csv"]),
     ],
 )

@@ -33,6 +33,7 @@ MAKING = (
 )
 READING = (
     "info logs",
+    "retain --dry-run",
     "manifest folder clips --output folder.csv",
     "catalog logs",
     "cat logs --topics /mic/segment",

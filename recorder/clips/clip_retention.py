@@ -1,22 +1,18 @@
-"""Retention of clips: they are deleted once they are old enough. Nothing else ever is."""
+"""Retention of clips: they are deleted once they are old enough, without a question."""
 
-import os
-import re
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
+from hearthlog.recorder.disk.recorded import recorded_days, start_of, walk
 from hearthlog.recorder.events import OK, WARNING, Notice
-from hearthlog.schemas.logs.files import AUDIO_SUFFIX
+from hearthlog.schemas.logs.files import AUDIO_LAYER, AUDIO_SUFFIX, log_name
 from hearthlog.schemas.times import NANOSECONDS
 
-_DAY = 86_400 * NANOSECONDS
 _EVERY = 3600 * NANOSECONDS
-_TIME = "%Y%m%dT%H%M%SZ"
 
 
 class ClipRetention:
-    """Deletes the old clips of a recorder once an hour, by the time of the sound.
+    """Deletes the old clips of a recorder once an hour, by the days that were recorded since.
 
     Parameters
     ----------
@@ -25,13 +21,13 @@ class ClipRetention:
     node : str
         Node whose clips they are.
     days : int
-        Age at which a layer is deleted, counted from the start of its log.
+        Age at which a layer is deleted: on so many later days something was recorded.
     """
 
     def __init__(self, root: Path, node: str, days: int) -> None:
         self._root = root
         self._node = node
-        self._kept = days * _DAY
+        self._days = days
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
@@ -52,8 +48,9 @@ class ClipRetention:
         self._last = now
         deleted = 0
         failures: list[OSError] = []
+        days = recorded_days(self._root, self._node)
         for layer, start in find_clips(self._root, self._node, failures):
-            if start < now - self._kept:
+            if days.since(start) >= self._days:
                 try:
                     layer.unlink()
                     deleted += 1
@@ -61,8 +58,7 @@ class ClipRetention:
                     failures.append(error)
         notices = []
         if deleted:
-            days = self._kept // _DAY
-            text = f"clips of {deleted} logs deleted: they were {days} days old"
+            text = f"clips of {deleted} logs deleted: they were {self._days} days old"
             notices.append(Notice(OK, text))
         if failures:
             more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
@@ -91,18 +87,10 @@ def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple
     start : int
         When its log began, in nanoseconds of UTC.
     """
-    time, end = r"(\d{8}T\d{6}Z)(?:_\d+)?", rf"{re.escape(AUDIO_SUFFIX)}(\.damaged)?"
-    name = re.compile(rf"{re.escape(node)}_{time}{end}")
-    for folder, folders, files in os.walk(root, onerror=failures.append):
-        folders[:] = [each for each in folders if each.isdigit()]
+    for folder, files in walk(root, failures):
         for file in files:
-            if (match := name.fullmatch(file)) and (start := _start(match[1])) is not None:
-                yield Path(folder, file), start
-
-
-def _start(text: str) -> int | None:
-    try:
-        moment = datetime.strptime(text, _TIME).replace(tzinfo=UTC)
-    except ValueError:  # digits, but not a time
-        return None
-    return int(moment.timestamp()) * NANOSECONDS
+            name = file.removesuffix(".damaged")
+            if not name.endswith(AUDIO_SUFFIX) or log_name(Path(name)).layer != AUDIO_LAYER:
+                continue
+            if (start := start_of(name, node)) is not None:
+                yield folder / file, start

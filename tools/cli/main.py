@@ -35,6 +35,7 @@ from hearthlog.tools.cli.recover import recover
 from hearthlog.tools.cli.relabel import relabel
 from hearthlog.tools.cli.replay import replay
 from hearthlog.tools.cli.report import report
+from hearthlog.tools.cli.retain import retain
 from hearthlog.tools.cli.review import ReviewCommand, review
 from hearthlog.tools.cli.text import tell
 from hearthlog.tools.cli.train import train
@@ -45,7 +46,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover)
+_ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover, retain)
 _LEARNING = (manifest, train, enrol)
 for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)

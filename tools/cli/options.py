@@ -48,6 +48,31 @@ Start = Annotated[
     typer.Option(help="From this log time on, as 2026-03-01T07:00 (UTC unless it says otherwise)."),
 ]
 End = Annotated[str | None, typer.Option(help="Up to this log time, which is not part of it.")]
+RetentionDays = Annotated[
+    int | None,
+    typer.Option(
+        help="Delete logs that are older than so many days on which something was recorded.",
+        show_default="no limit",
+    ),
+]
+MaxBagFiles = Annotated[
+    int | None,
+    typer.Option(help="Delete the oldest logs beyond so many.", show_default="no limit"),
+]
+MaxRecordSize = Annotated[
+    str | None,
+    typer.Option(
+        help="Delete the oldest logs beyond so many bytes, such as 20G, of all.",
+        show_default="no limit",
+    ),
+]
+MinFreeSpace = Annotated[
+    str | None,
+    typer.Option(
+        help="Delete the oldest logs while fewer bytes are free on the disk; 0: none.",
+        show_default="500M",
+    ),
+]
 NewLog = Annotated[Path, typer.Option("--output", "-o", help="Log to make, *.mcap.")]
 Microphone = Annotated[
     str | None, typer.Option(help="Name of the microphone, where there are several.")

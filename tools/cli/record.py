@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.tools.cli.options import parse_time
+from hearthlog.tools.cli.options import (
+    MaxBagFiles,
+    MaxRecordSize,
+    MinFreeSpace,
+    RetentionDays,
+    parse_time,
+)
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -58,6 +64,10 @@ def record(
         int | None,
         typer.Option("--max-bag-duration", "-d", help="Seconds a file.", show_default="3600"),
     ] = None,
+    retention_days: RetentionDays = None,
+    max_bag_files: MaxBagFiles = None,
+    max_record_size: MaxRecordSize = None,
+    min_free_space: MinFreeSpace = None,
     keep_audio: Annotated[
         str | None,
         typer.Option(
@@ -83,6 +93,10 @@ def record(
         "model": model,
         "node": node,
         "max_bag_duration": max_bag_duration,
+        "retention_days": retention_days,
+        "max_bag_files": max_bag_files,
+        "max_record_size": max_record_size,
+        "min_free_space": min_free_space,
         "keep_audio": keep_audio,
     }
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))

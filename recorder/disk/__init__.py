@@ -1,0 +1,1 @@
+"""The disk: how long logs are kept, and how much of them."""

@@ -1,0 +1,44 @@
+"""Sizes of files in bytes, as people write them."""
+
+import re
+from typing import Annotated
+
+from pydantic import BeforeValidator
+
+_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+
+
+def parse_size(value: object) -> int:
+    """Read a size.
+
+    Parameters
+    ----------
+    value : object
+        A number of bytes, or a text such as "500M" or "1.5 GB".
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kmgt]?)b?", str(value).lower())
+    if match is None:
+        raise ValueError("say how many bytes, such as 500M or 20G")
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
+def size_text(size: int) -> str:
+    """Say a size in the unit that fits.
+
+    Parameters
+    ----------
+    size : int
+        Bytes.
+    """
+    for unit, text in (("g", "GB"), ("m", "MB"), ("k", "kB")):
+        if size >= _UNITS[unit]:
+            return f"{size / _UNITS[unit]:.1f} {text}"
+    return f"{size} B"
+
+
+Size = Annotated[int, BeforeValidator(parse_size)]
