@@ -17,6 +17,7 @@ from pydantic_settings.sources import PydanticBaseSettingsSource
 from hearthlog.recorder.disk.keeping import KeepingRules
 from hearthlog.recorder.disk.retention import Limits
 from hearthlog.recorder.disk.sizes import Size
+from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone
@@ -92,6 +93,9 @@ class Settings(BaseSettings):
     max_bag_files: int = Field(default=0, ge=0)  # finished logs; 0: no limit
     max_record_size: Size = Field(default=0, ge=0)  # bytes of all of them; 0: no limit
     min_free_space: Size = Field(default=500_000_000, ge=0)  # bytes on the disk; 0: no floor
+    drop_statistics_days: int = Field(default=0, ge=0)  # 0: never
+    drop_features_days: int = Field(default=0, ge=0)  # and the statistics; 0: never
+    labels_only_days: int = Field(default=0, ge=0)  # all but labels, segments, gaps; 0: never
     microphone: list[MicrophoneSettings] = Field(
         default=[MicrophoneSettings()], min_length=1, max_length=1
     )
@@ -101,7 +105,10 @@ class Settings(BaseSettings):
         limits = Limits(
             self.retention_days, self.max_bag_files, self.max_record_size, self.min_free_space
         )
-        return KeepingRules(str(self.output), self.node, limits)
+        thinning = ThinningDays(
+            self.drop_statistics_days, self.drop_features_days, self.labels_only_days
+        )
+        return KeepingRules(str(self.output), self.node, limits, thinning)
 
     @classmethod
     def settings_customise_sources(

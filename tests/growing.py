@@ -15,7 +15,7 @@ from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
 from hearthlog.analyzer.logs import typed_columns as known
-from hearthlog.analyzer.relabel.layer import log_digest
+from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
 from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.messages import fields as schema_fields

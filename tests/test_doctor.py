@@ -539,7 +539,7 @@ DATA = {
         {"frame-order", "frame-jump", "label-frames", "statistics-frames"},
     ),
     "statistics twice": (
-        lambda log: log.chunks()[2].records.append(log.messages(STATISTICS)[399]),
+        lambda log: log.chunks()[1].records.append(log.messages(STATISTICS)[399]),
         {"frame-order"},
     ),
     "a frame missing": (drop(FEATURES), {"frame-jump", "label-frames", "statistics-frames"}),

@@ -23,7 +23,7 @@ from stores import put
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.logs.layers import find_chains
-from hearthlog.analyzer.relabel.layer import log_digest, read_layer_metadata
+from hearthlog.analyzer.relabel.layer import read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.timing import label_timing
@@ -33,6 +33,7 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import find_logs, is_layer, relabel_path
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.salvage.recover import recover_log

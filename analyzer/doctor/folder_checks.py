@@ -15,6 +15,7 @@ _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock ma
 _LEFT = {
     f"{SUFFIX}.damaged": "is what could not be recovered whole; `hearthlog recover` may save more",
     f"{SUFFIX}.recovering": "was left by a recovery that was cut short; the next one makes it anew",
+    f"{SUFFIX}.thinning": "was left by a recorder that was killed; the next one deletes it",
     ".tmp": "was left by a command that was cut short; delete it",
 }
 

@@ -1,6 +1,6 @@
 """Frame numbers, stamps and gaps of one microphone: what the messages must say together."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,11 @@ class FrameSequence:
         Of the labels.
     labelled : bool
         Whether there is a model.
+    thinned : collection of str
+        Kinds of messages that were dropped when the log grew old.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         findings: Findings,
         microphone: str,
@@ -45,6 +47,7 @@ class FrameSequence:
         timing: LabelTiming,
         *,
         labelled: bool,
+        thinned: Collection[str] = (),
     ) -> None:
         self.first: tuple[int, int] | None = None  # frame and stamp of the first and the last frame
         self.last: tuple[int, int] | None = None
@@ -55,6 +58,7 @@ class FrameSequence:
         self._every = statistics_every
         self._timing = timing
         self._labelled = labelled
+        self._thinned = thinned
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
         self._run: tuple[int, int] | None = None  # the first frame since the last gap
@@ -112,8 +116,13 @@ class FrameSequence:
         features, statistics, labels, segments, gaps = (
             self._take(kind, until) for kind in (FEATURES, STATISTICS, LABEL, SEGMENT, GAP)
         )
+        if FEATURES in self._thinned:  # there is nothing to compare labels with
+            self._gap_ends = np.concatenate([self._gap_ends, gaps[:, 0]])
+            self._check_segments(segments)
+            return
         runs = self._check_features(features, gaps)
-        self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
+        if STATISTICS not in self._thinned:
+            self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
         if self._labelled:
             self._check_label_stamps(features, labels)
             # Their log time is the stamp of the last frame of the window.

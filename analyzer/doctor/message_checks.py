@@ -34,9 +34,11 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.provenance import METADATA, THINNED
 from hearthlog.schemas.messages.fields import difference
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.salvage.thin import dropped_kinds
 
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
@@ -189,7 +191,10 @@ class MessageChecks:
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
         every, timing = statistics_every(self._data), _label_timing(self._data, info)
         labelled = info is not None and len(info["labels"]) > 0
-        return FrameSequence(self._findings, microphone, every, timing, labelled=labelled)
+        thinned = _thinned_kinds(self._data)
+        return FrameSequence(
+            self._findings, microphone, every, timing, labelled=labelled, thinned=thinned
+        )
 
     def _check_health(self, columns: Columns) -> None:
         """Say once what the recorder said of itself that was not well."""
@@ -233,6 +238,12 @@ def statistics_every(data: DataSection) -> int | None:
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
     return every if isinstance(every, int) and every > 0 else None
+
+
+def _thinned_kinds(data: DataSection) -> set[str]:
+    """Return which kinds of messages a file says were dropped when it grew old."""
+    steps = {record.get(THINNED) for record in data.metadata.get(METADATA, [])}
+    return {kind for step in steps for kind in dropped_kinds(step)}
 
 
 def _label_timing(data: DataSection, info: Mapping[str, Any] | None) -> LabelTiming:

@@ -7,6 +7,7 @@ from hearthlog.analyzer.logs.layers import Chain
 from hearthlog.analyzer.relabel.layer import LayerMetadata
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.digest import earlier_digests
 from hearthlog.schemas.logs.files import relabel_path, stem
 
 _MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has a minute only
@@ -82,7 +83,8 @@ def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
             f"{job.layer}: was made by another model of this name ({inputs.model_sha256[:12]}, not "
             f"{job.model_sha256[:12]}); move it away, or give the model another name"
         )
-    if inputs.input_sha256 != log_sha256:
+    digest = inputs.input_sha256
+    if digest != log_sha256 and digest not in earlier_digests(job.log):
         raise LogError(
             f"{job.layer}: was made from another log of this name; move it away, and run again"
         )

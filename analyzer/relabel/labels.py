@@ -18,7 +18,6 @@ from hearthlog.analyzer.relabel.layer import (
     delete_parts,
     layer_record,
     layer_topics,
-    log_digest,
     part_path,
     read_layer_metadata,
 )
@@ -39,6 +38,7 @@ from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
 from hearthlog.schemas.logs.provenance import METADATA

@@ -1,7 +1,6 @@
 """The layer that a relabelling makes: its name, its topics and its `hearthlog` record."""
 
 import glob
-import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,6 @@ from hearthlog.schemas.logs.provenance import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 
-_TAIL = 1 << 16  # bytes
 _RUN = ("label", "start", "frames", "confidence")
 
 
@@ -60,32 +58,6 @@ def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[T
         model's name is `_` there.
     """
     return label_topics(microphone, relabelling(model), classes)
-
-
-def log_digest(log: Path) -> str:
-    """Identify a log: the SHA-256 of its size and its last 64 KiB.
-
-    The end of a log holds its index, or the end of that, and the index's checksum. So a log can be
-    recognised without reading all of it.
-
-    Parameters
-    ----------
-    log : Path
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or is no MCAP file.
-    """
-    with LogFile(log, indexed=False) as file:
-        size = file.size
-        tail = file.read(max(size - _TAIL, 0), _TAIL)
-    return hashlib.sha256(str(size).encode() + b"\0" + tail).hexdigest()
 
 
 def read_layer_metadata(layer: Path) -> LayerMetadata | None:

@@ -14,13 +14,13 @@ from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
 from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_log
 from hearthlog.analyzer.relabel.layer import (
     LayerMetadata,
-    log_digest,
     read_layer_metadata,
 )
 from hearthlog.analyzer.workers import Workers
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import is_active, relabel_path
 from hearthlog.schemas.logs.provenance import check_version
 from hearthlog.schemas.progress import Progress, ignore_progress

@@ -11,6 +11,7 @@ from pathlib import Path
 from hearthlog.recorder import rosout
 from hearthlog.recorder.disk.keeping import DiskReport, KeepingRules, keep_disk
 from hearthlog.recorder.disk.retention import Limits, disk_of
+from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.events import OK, WARNING
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.stream_messages import EncodedMessage
@@ -21,6 +22,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _COMMAND = module_command("hearthlog.recorder.disk.keeper")
 _EVERY = 3600 * NANOSECONDS
+_THIN = 24 * _EVERY  # for that all old logs are opened
 _LOOK = 60 * NANOSECONDS  # at how much is free
 _NICENESS = 19
 
@@ -38,6 +40,7 @@ class DiskKeeper:
         self._process: subprocess.Popen[bytes] | None = None
         self._began: int | None = None
         self._looked = 0
+        self._thinned: int | None = None
         self._said: set[str] = set()
         self._helpless = False
 
@@ -62,14 +65,18 @@ class DiskKeeper:
             report = self._read(self._process)
             self._process = None
             self._helpless = bool(report.problem)
+            if report.more:
+                self._thinned = None
             news = {report.problem} - self._said - {""}
             self._said |= news
             return report_messages(self._rules.node, now, report), sorted(news)
         if self._is_due(now):
             self._began = now
+            may_thin = self._thinned is None or abs(now - self._thinned) >= _THIN
+            self._thinned = now if may_thin else self._thinned
             with suppress(OSError):  # no memory for a process: in an hour again
                 self._process = subprocess.Popen(  # noqa: S603  our own module
-                    [*_COMMAND, json.dumps(self._rules)],
+                    [*_COMMAND, json.dumps([self._rules, may_thin])],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                 )
@@ -145,9 +152,10 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the recorder decides when this ends
     os.nice(_NICENESS)
-    root, node, limits = json.loads(sys.argv[1])
+    (root, node, limits, thinning), may_thin = json.loads(sys.argv[1])
+    rules = KeepingRules(root, node, Limits(*limits), ThinningDays(*thinning))
     try:
-        report = keep_disk(KeepingRules(root, node, Limits(*limits)))
+        report = keep_disk(rules, may_thin=may_thin)
     except OSError as error:
         report = DiskReport("", f"{root}: cannot be looked after ({error.strerror or error})", {})
     json.dump(report, sys.stdout)

@@ -14,6 +14,7 @@ from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.times import NANOSECONDS
 
 KEEP_SUFFIX = ".keep"  # of a file beside a log that is not to be deleted
+THINNING_SUFFIX = ".thinning"  # of a thinner copy of a log in the making
 _TIME = "%Y%m%dT%H%M%SZ"
 _DAY = 86_400 * NANOSECONDS
 # A clock that was never set says 1970, or when its system was made.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.recorder.disk.recorded import RecordedDays, RecordedLog, recorded_days, recorded_logs
+from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
 from hearthlog.recorder.disk.sizes import size_text
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import review_path
@@ -16,6 +16,7 @@ from hearthlog.schemas.logs.provenance import provenance_records
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.storage.new_files import locked_folder, sync_folder
 
+REVIEWED = "reviewed"
 _FEW = 2  # logs, all of which but the newest may go without a question
 
 
@@ -172,7 +173,7 @@ def kept_because(log: RecordedLog) -> str:
     if log.locked:
         return "locked by its .keep file"
     if is_reviewed(log.path):
-        return "reviewed"
+        return REVIEWED
     try:
         with LogFile(log.path) as file:
             whole, records = file.complete, provenance_records(file)
@@ -219,7 +220,8 @@ def carry_out(plan: Plan, failures: list[OSError]) -> list[RecordedLog]:
             with locked_folder(log.path.parent):  # a reviewer that writes a layer holds it
                 if is_reviewed(log.path):
                     continue
-                for path in (*log.layers, log.path):
+                left = log.path.with_name(log.path.name + THINNING_SUFFIX)
+                for path in (*log.layers, left, log.path):
                     path.unlink(missing_ok=True)
                 sync_folder(log.path.parent)
         except OSError as error:
@@ -230,25 +232,3 @@ def carry_out(plan: Plan, failures: list[OSError]) -> list[RecordedLog]:
         with suppress(OSError):
             folder.rmdir()
     return deleted
-
-
-def plan_for(root: Path, node: str, limits: Limits, failures: list[OSError]) -> Plan:
-    """Choose the logs in a folder that are to be deleted.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of logs.
-    node : str
-        Name of the node.
-    limits : Limits
-    failures : list of OSError
-        Errors of folders that cannot be read are appended.
-
-    Raises
-    ------
-    OSError
-        If the disk cannot be measured.
-    """
-    logs = recorded_logs(root, node, failures)
-    return plan_retention(logs, recorded_days(root, node), limits, disk_of(root))

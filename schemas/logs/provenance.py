@@ -13,6 +13,8 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 
 METADATA = "hearthlog"
+THINNED = "thinned"  # what was dropped of a log
+THINNED_OF = "thinned_of"  # digests that it had before, one for each time
 _KEY = "schema_version"
 _FIRST = "1"  # did not write it
 _KNOWN = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}

@@ -5,7 +5,7 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import BinaryIO
 
@@ -243,7 +243,7 @@ class ChunkWriter:
         self.flush()
         self._put(chunk)
 
-    def join_chunk(self, chunk: StoredChunk, span: int) -> None:
+    def join_chunk(self, chunk: StoredChunk, span: int, dropped: Collection[int] = ()) -> None:
         """Append the records of another file's chunk to the chunk in progress.
 
         Parameters
@@ -251,12 +251,14 @@ class ChunkWriter:
         chunk : StoredChunk
         span : int
             Nanoseconds of log time that the joined chunk may have; a longer one is not joined.
+        dropped : collection of int
+            Numbers of channels whose messages are left out.
         """
         begun = self._chunk
         start, end = min(begun.start, chunk.start), max(begun.end, chunk.end)
         if end - start > span or len(begun.content) + chunk.size > self._chunk_size:
             self.flush()
-        self._chunk.add_chunk(chunk)
+        self._chunk.add_chunk(chunk, dropped)
 
     def finish(self) -> None:
         """Write the chunk in progress, the index and the footer; the stream stays open."""

@@ -2,7 +2,7 @@
 
 import threading
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Bytes, Int64
-from hearthlog.schemas.mcap.formats import INDEX_ENTRIES, INDEX_ENTRY
+from hearthlog.schemas.mcap.formats import HEAD, INDEX_ENTRIES, INDEX_ENTRY
+from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import ChunkHead, decompress
 
 LATEST = 1 << 63  # log time, in nanoseconds, after all that a file may have
@@ -109,14 +110,32 @@ class ChunkBuilder:
         times = entries["time"]
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
 
-    def add_chunk(self, chunk: StoredChunk) -> None:
-        """Append all records of a chunk."""
-        for channel, entries in chunk.entries.items():
-            moved = np.frombuffer(entries, INDEX_ENTRIES).copy()
-            moved["offset"] += len(self.content)
+    def add_chunk(self, chunk: StoredChunk, dropped: Collection[int] = ()) -> None:
+        """Append the records of a chunk, without the messages of some channels.
+
+        Parameters
+        ----------
+        chunk : StoredChunk
+        dropped : collection of int
+            Numbers of the channels; if there are no others, nothing is appended.
+        """
+        kept = {channel: rows for channel, rows in chunk.entries.items() if channel not in dropped}
+        if not kept:
+            return
+        content = chunk.content()
+        gone = [rows for channel, rows in chunk.entries.items() if channel in dropped]
+        starts = np.sort(np.frombuffer(b"".join(gone), INDEX_ENTRIES)["offset"])
+        sizes = gather_heads(content, starts)["length"] + HEAD.size
+        before = np.concatenate([[0], np.cumsum(sizes)])  # bytes dropped before each message
+        for channel, rows in kept.items():
+            moved = np.frombuffer(rows, INDEX_ENTRIES).copy()
+            moved["offset"] += len(self.content) - before[starts.searchsorted(moved["offset"])]
             self.entries.setdefault(channel, bytearray()).extend(moved.tobytes())
-        self.content += chunk.content()
-        self.start, self.end = min(self.start, chunk.start), max(self.end, chunk.end)
+            self.start = min(self.start, int(moved["time"].min()))
+            self.end = max(self.end, int(moved["time"].max()))
+        firsts, lasts = [0, *(starts + sizes).tolist()], [*starts.tolist(), len(content)]
+        for first, last in zip(firsts, lasts, strict=True):
+            self.content += content[first:last]
 
     def compress(self) -> StoredChunk:
         """Compress the records; return the chunk as a file will hold it."""

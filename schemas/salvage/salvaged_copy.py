@@ -1,13 +1,13 @@
 """A new log of what is whole in a damaged one, and the count of what it holds."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from mcap.records import Channel, Header, Message
 
-from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs import provenance, rosbag2
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.definitions import Definition
@@ -46,6 +46,17 @@ class Recovery:
         return all(damage.lossless for damage in self.damages)
 
 
+class Selection(Protocol):
+    """What a copy leaves out, and says of it."""
+
+    @property
+    def note(self) -> Mapping[str, str]:
+        """What the `hearthlog` record of the copy says besides."""
+
+    def drops(self, topic: str) -> bool:
+        """Tell whether the messages of a topic are left out."""
+
+
 class SalvagedCopy:
     """Copies the whole pieces of a damaged log into a new one.
 
@@ -59,15 +70,23 @@ class SalvagedCopy:
         What the header of the new log says if that of the old one is lost.
     chunk_span : int
         Nanoseconds of log time up to which chunks are joined; 0 to copy them unchanged.
+    selection : Selection or None
+        What is left out; chunks are joined then.
     """
 
     def __init__(
-        self, stream: BinaryIO, salvage: Salvage, profile: str, chunk_span: int = 0
+        self,
+        stream: BinaryIO,
+        salvage: Salvage,
+        profile: str,
+        chunk_span: int = 0,
+        selection: Selection | None = None,
     ) -> None:
         self.pieces = 0  # pieces that were copied
         self._salvage = salvage
         self._profile = profile
         self._chunk_span = chunk_span
+        self._selection = selection
         self._writer = ChunkWriter(stream)
         self._begun = False
         self._written: set[tuple[type, int]] = set()
@@ -125,7 +144,7 @@ class SalvagedCopy:
             topic = topics.setdefault(channel.topic, TopicRecovery(kind))
             topic.messages += self._counts[number]
             topic.end = max(topic.end, self._ends.get(number, 0))
-            if expected is not None:
+            if expected is not None and not self._drops(number):
                 topic.expected = (topic.expected or 0) + expected.get(number, 0)
         damages = self._salvage.damages()
         return Recovery(topics, [*damages, *_untraced(topics, damages)], self._salvage.complete)
@@ -142,24 +161,40 @@ class SalvagedCopy:
         if self._chunk_span and not isinstance(piece, WholeChunk):
             self._writer.flush()
         if isinstance(piece, WholeChunk):
-            chunk = piece.stored
-            self._define(chunk.entries, piece.definitions[: piece.leading])
-            if self._chunk_span:
-                self._writer.join_chunk(chunk, self._chunk_span)
-            else:
-                self._writer.copy_chunk(chunk)
-            for number in chunk.entries:
-                times = chunk.times(number)
-                self._count(number, len(times), int(times.min()), int(times.max()))
+            self._add_chunk(piece)
         elif isinstance(piece, Message):
+            if self._drops(piece.channel_id):
+                return
             self._define([piece.channel_id])
             number, time = piece.channel_id, piece.log_time
             self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
             self._count(number, 1, time, time)
         elif isinstance(piece, WholeAttachment):
             self._writer.copy_attachment(piece.record, piece.index_record)
+        elif piece.name == provenance.METADATA and self._selection is not None:
+            self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
         elif piece.name != rosbag2.METADATA:
             self._writer.add_metadata(piece.name, piece.metadata)
+
+    def _add_chunk(self, piece: WholeChunk) -> None:
+        chunk = piece.stored
+        dropped = {number for number in chunk.entries if self._drops(number)}
+        kept = [number for number in chunk.entries if number not in dropped]
+        if not kept:
+            return
+        self._define(kept, piece.definitions[: piece.leading])
+        if self._chunk_span:
+            self._writer.join_chunk(chunk, self._chunk_span, dropped)
+        else:
+            self._writer.copy_chunk(chunk)
+        for number in kept:
+            times = chunk.times(number)
+            self._count(number, len(times), int(times.min()), int(times.max()))
+
+    def _drops(self, number: int) -> bool:
+        if self._selection is None:
+            return False
+        return self._selection.drops(self._salvage.definitions.channels[number].topic)
 
     def _begin(self) -> None:
         if not self._begun:

@@ -1,0 +1,118 @@
+"""Thinning: what old logs hold frame by frame is dropped before they are deleted as a whole."""
+
+import fcntl
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.recorder.disk.recorded import THINNING_SUFFIX, RecordedDays, RecordedLog
+from hearthlog.recorder.disk.retention import REVIEWED, is_reviewed, kept_because
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.salvage.thin import thin_log, thinned_step
+from hearthlog.schemas.storage.new_files import locked_folder, sync_file, sync_folder
+
+_STATISTICS = 1  # the step that lessons do not miss
+
+
+class ThinningDays(NamedTuple):
+    """After how many days with sound a log loses what; 0 for never.
+
+    Attributes
+    ----------
+    statistics : int
+    features : int
+        These, and the statistics.
+    rest : int
+        All but labels, segments and gaps.
+    """
+
+    statistics: int = 0
+    features: int = 0
+    rest: int = 0
+
+    def step(self, age: int) -> int:
+        """Return how far a log is to be thinned: a place in `hearthlog.schemas.salvage.thin.STEPS`.
+
+        Parameters
+        ----------
+        age : int
+            Days with sound since.
+        """
+        due = [step for step, days in enumerate(self, 1) if days and age >= days]
+        return max(due, default=0)
+
+
+class Thinned(NamedTuple):
+    """A log that is to be thinned, and the step."""
+
+    log: RecordedLog
+    step: int
+
+
+def plan_thinning(
+    logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays
+) -> Iterator[Thinned]:
+    """Choose the logs to thin; one that is reviewed only of statistics, for it is learned from.
+
+    Parameters
+    ----------
+    logs : sequence of RecordedLog
+        The oldest first. The newest is left as it is.
+    days : RecordedDays
+    limits : ThinningDays
+
+    Yields
+    ------
+    Thinned
+        The oldest first.
+    """
+    for log in logs[:-1]:
+        due = limits.step(days.since(log.start))
+        if not due or (kept := kept_because(log)) not in {"", REVIEWED}:
+            continue
+        step = min(due, _STATISTICS) if kept else due
+        try:
+            if thinned_step(log.path) < step:
+                yield Thinned(log, step)
+        except LogError:  # of a newer version
+            continue
+
+
+def thin(log: Path, step: int) -> bool:
+    """Put a thinner log in the place of one, in one step that nothing can halve.
+
+    Parameters
+    ----------
+    log : Path
+    step : int
+        A place in `hearthlog.schemas.salvage.thin.STEPS`.
+
+    Returns
+    -------
+    bool
+        False if somebody else is at it, or it was reviewed meanwhile.
+
+    Raises
+    ------
+    LogError
+        If it is damaged.
+    OSError
+        If the copy cannot be written.
+    """
+    copy = log.with_name(log.name + THINNING_SUFFIX)
+    with copy.open("ab") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        try:
+            thin_log(log, copy, step)
+            sync_file(copy)
+            with locked_folder(log.parent):  # a reviewer that writes a layer holds it
+                if step > _STATISTICS and is_reviewed(log):
+                    return False
+                copy.replace(log)
+                sync_folder(log.parent)
+        finally:
+            copy.unlink(missing_ok=True)
+    return True
