@@ -21,7 +21,8 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
-from hearthlog.schemas.messages.message_types import duration_message, encode, header, message
+from hearthlog.schemas.messages.gaps import encode_gap
+from hearthlog.schemas.messages.message_types import encode, header, message
 from hearthlog.schemas.messages.topics import CANDIDATE, DIAGNOSTICS, LIVE, ROSOUT, topic
 
 
@@ -226,15 +227,7 @@ class Pipeline:
         self._recent_floors = None
         if self._floor is not None:
             self._floor.restart()
-        data = encode(
-            message(
-                message_types.GAP,
-                header=header(gap.start, self.microphone),
-                duration=duration_message(gap.end - gap.start),
-                reason=gap.reason,
-                frames_lost=gap.frames_lost,
-            )
-        )
+        data = encode_gap(self.microphone, gap.start, gap.end, gap.reason, gap.frames_lost)
         return [
             *self._close(self._end),
             EncodedMessage(gap.end, topic(self.microphone, "gap"), data),

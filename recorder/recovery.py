@@ -28,7 +28,7 @@ class Recovered:
     Attributes
     ----------
     end : int
-        End of the last frame, in nanoseconds of UTC; 0 if the log has none.
+        End of the last frame or gap, in nanoseconds of UTC; 0 if the log has none.
     damage : str
         What is damaged in the file, and what was lost; empty if the file only ended early.
     completed : bool
@@ -157,9 +157,12 @@ def _complete(active: Path, path: Path) -> Recovery:
 
 
 def _end_of_frames(recovery: Recovery) -> int:
-    ends = [
-        topic.end + FRAME_NANOSECONDS
-        for topic in recovery.topics.values()
-        if topic.type == message_types.FEATURES and topic.messages
-    ]
-    return max(ends, default=0)
+    ends = {message_types.FEATURES: FRAME_NANOSECONDS, message_types.GAP: 0}
+    return max(
+        (
+            topic.end + ends[topic.type]
+            for topic in recovery.topics.values()
+            if topic.type in ends and topic.end
+        ),
+        default=0,
+    )

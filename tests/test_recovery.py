@@ -88,7 +88,8 @@ def test_of_a_damaged_log_the_whole_chunks_are_recovered_and_the_original_kept(l
     path = left_behind(log, tmp_path, data)
     (recovered,) = recover_active(tmp_path, "home")
     assert "damaged at byte" in recovered.damage
-    kept, everything = content(path), content(log)
+    kept = [item for item in content(path) if item[0] != "/mic/gap"]  # the log has none
+    everything = content(log)
     lost = set(everything) - set(kept)
     assert kept == [item for item in everything if item not in lost]
     assert 0 < len(lost) < 1000 < len(kept)

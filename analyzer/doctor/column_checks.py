@@ -16,10 +16,11 @@ from hearthlog.analyzer.doctor.topic_types import (
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages.gaps import LOG_DAMAGED
 from hearthlog.schemas.messages.topics import ROSOUT
 
 STAMP = "header.stamp"
-_CLOCK_SET = "the clock was set"
+_ANY_DURATION = ("the clock was set", LOG_DAMAGED)  # with which the reasons begin
 _SUM_TOLERANCE = 1e-4
 _LATE = {  # ns, with what stamps may be off
     LABEL: 1_010_000_000,
@@ -208,6 +209,8 @@ def check_segments(findings: Findings, columns: Columns, classes: list[str] | No
 def check_gaps(findings: Findings, columns: Columns) -> None:
     """Report every gap, and check that its lost frames last as long as it does.
 
+    What a damaged log has lost may have had gaps in which the clock was set.
+
     Parameters
     ----------
     findings : Findings
@@ -232,12 +235,12 @@ def check_gaps(findings: Findings, columns: Columns) -> None:
         ),
         level="warning",
     )
-    moved = np.array([reason.startswith(_CLOCK_SET) for reason in reasons], bool)
+    free = np.array([reason.startswith(_ANY_DURATION) for reason in reasons], bool)
     frames = durations.astype(np.float64) / FRAME_NANOSECONDS
     differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
     findings.rows(
         "gap-duration",
-        differ & ~moved & (durations >= 0),
+        differ & ~free & (durations >= 0),
         times,
         lambda i: f"{columns.topic}: {lost[i]} lost frames do not last {durations[i] / 1e9:.3f} s",
     )

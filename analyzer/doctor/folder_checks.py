@@ -102,6 +102,7 @@ def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
         if frames.first is None or frames.first[0] == 0 or last is None:
             continue
         missing = frames.first[0] - last[0] - 1 - frames.lost_before
+        missing -= earlier.frames[microphone].lost_behind
         if missing and not _goes_on(frames, [each.frames[microphone] for each in files]):
             _say_missing(microphone, earlier, file, missing)
 

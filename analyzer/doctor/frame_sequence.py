@@ -31,41 +31,38 @@ class FrameSequence:
         Its name.
     statistics_every : int or None
         Frames from one statistics message to the next, if the file has that.
-    timing : LabelTiming
-        Of the labels.
-    labelled : bool
-        Whether there is a model.
+    timing : LabelTiming or None
+        Of the labels; None if there are none, or it is not known.
     thinned : collection of str
         Kinds of messages that were dropped when the log grew old.
     """
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
         findings: Findings,
         microphone: str,
         statistics_every: int | None,
-        timing: LabelTiming,
-        *,
-        labelled: bool,
+        timing: LabelTiming | None,
         thinned: Collection[str] = (),
     ) -> None:
         self.first: tuple[int, int] | None = None  # frame and stamp of the first and the last frame
         self.last: tuple[int, int] | None = None
         self.lost_before = 0  # frames that gaps before the first frame lost
+        self.lost_behind = 0  # and gaps behind the last one
         self.gap_before: tuple[int, int] | None = None  # start and end of the first of these gaps
         self._findings = findings
         self._name = microphone
         self._every = statistics_every
         self._timing = timing
-        self._labelled = labelled
         self._thinned = thinned
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
         self._run: tuple[int, int] | None = None  # the first frame since the last gap
         self._heard = _NONE  # features of the last frames, of which there is no label yet
         self._first_end = 0  # frame at which the first window since then ends
-        self._segment_end: int | None = None
+        self._segment: tuple[int, int] | None = None  # log time and end of the last one
         self._gap_ends: Int64 = np.empty(0, np.int64)
+        self._damages = _NONE  # the gaps of a damaged log
         self._begins = np.empty(0, bool)  # which of the frames that were settled begin a run
 
     def add(self, kind: str, rows: Int64) -> None:
@@ -81,11 +78,23 @@ class FrameSequence:
         """
         self._pending.setdefault(kind, []).append(rows)
 
+    def add_damages(self, gaps: Int64) -> None:
+        """Note which gaps, added before or now, say that a damaged log has lost what was there.
+
+        The sound itself had no gap there: labels go on, and segments reach over it.
+
+        Parameters
+        ----------
+        gaps : np.ndarray [shape=(n, 3)], int64
+            As `add` takes them.
+        """
+        self._damages = np.concatenate([self._damages, gaps])
+
     def interrupt(self) -> None:
         """Note that messages are missing here, because the file is damaged."""
         self.finish()
         self._pending.clear()
-        self._previous = self._run = self._segment_end = None
+        self._previous = self._run = self._segment = None
         self._heard = _NONE
 
     def begin_anew(self, time: int) -> None:
@@ -97,12 +106,13 @@ class FrameSequence:
             Nanoseconds of UTC.
         """
         self.settle(time)
-        self._previous = self._run = self._segment_end = None
+        self._previous = self._run = self._segment = None
         self._heard = _NONE
 
     def finish(self) -> None:
         """Check the last frame; what a killed recorder did not write of it is not reported."""
         self._check_features(self._take(FEATURES, None), self._take(GAP, None))
+        self.lost_behind = sum(int(gaps[:, 2].sum()) for gaps in self._pending.get(GAP, []))
         self._check_segments(self._take(SEGMENT, None))
 
     def settle(self, until: int | None) -> None:
@@ -123,11 +133,8 @@ class FrameSequence:
         runs = self._check_features(features, gaps)
         if STATISTICS not in self._thinned:
             self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
-        if self._labelled:
-            self._check_label_stamps(features, labels)
-            # Their log time is the stamp of the last frame of the window.
-            ends = np.stack([labels[:, 0], labels[:, 1] + self._timing.delay, labels[:, 0]], axis=1)
-            self._check_same(features, ends, LABEL, self._with_label(features, ends, runs))
+        if self._timing is not None:
+            self._check_labels(features, labels, runs, self._timing)
         self._check_segments(segments)
 
     def _take(self, kind: str, until: int | None) -> Int64:
@@ -143,7 +150,7 @@ class FrameSequence:
         return rows[done]
 
     def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
-        """Compare frame numbers, stamps and gaps; return at which frames a gap ends."""
+        """Compare frame numbers, stamps and gaps; return at which frames the sound begins anew."""
         following = np.searchsorted(rows[:, 2], gaps[:, 0])
         waiting = following == len(rows)
         if waiting.any():  # for the next frame
@@ -173,7 +180,16 @@ class FrameSequence:
         self._begins = (count > 0) | (numbers != 1) | ~has_previous
         self._check_rate(rows)
         self._previous = self.last = int(rows[-1, 1]), int(rows[-1, 2])
-        return (count > 0) | (rows[:, 1] == 0)
+        last = np.zeros(len(rows), np.int64)
+        last[following] = gaps[:, 0]
+        return ((count > 0) & ~np.isin(last, self._damages[:, 0])) | (rows[:, 1] == 0)
+
+    def _are_damaged(self, times: Int64) -> NDArray[np.bool_]:
+        """Tell for which log times the log is damaged, or right behind them."""
+        ends, starts, _ = self._damages.T
+        place = np.searchsorted(ends, times, "right")
+        begins = np.append(starts, np.iinfo(np.int64).max)[place] - FRAME_NANOSECONDS
+        return begins <= times
 
     def _check_rate(self, rows: Int64) -> None:
         """Compare stamps with frame numbers, from the last gap on."""
@@ -199,23 +215,35 @@ class FrameSequence:
         return features[:, 1] % self._every == 0
 
     def _with_label(
-        self, features: Int64, labels: Int64, known_start: NDArray[np.bool_]
+        self,
+        features: Int64,
+        labels: Int64,
+        known_start: NDArray[np.bool_],
+        timing: LabelTiming,
     ) -> NDArray[np.bool_]:
         """Tell which frames end a window without a gap; labels have the numbers of such frames."""
         first_end = np.full(len(features), self._first_end)
         for start in np.flatnonzero(self._begins).tolist():
             frame = int(features[start, 1])
-            self._first_end = self._timing.first_window_end(frame)
+            self._first_end = timing.first_window_end(frame)
             later = labels[labels[:, 1] >= frame, 1]
             if len(later) and not known_start[start]:  # the sound may have begun before the file
                 self._first_end = min(self._first_end, int(later[0]))
             first_end[start:] = self._first_end
         return features[:, 1] >= first_end
 
-    def _check_label_stamps(self, features: Int64, labels: Int64) -> None:
+    def _check_labels(
+        self, features: Int64, labels: Int64, runs: NDArray[np.bool_], timing: LabelTiming
+    ) -> None:
+        self._check_label_stamps(features, labels, timing.delay)
+        # Their log time is the stamp of the last frame of the window.
+        ends = np.stack([labels[:, 0], labels[:, 1] + timing.delay, labels[:, 0]], axis=1)
+        self._check_same(features, ends, LABEL, self._with_label(features, ends, runs, timing))
+
+    def _check_label_stamps(self, features: Int64, labels: Int64, delay: int) -> None:
         """Compare labels with the features of the frames that they speak of."""
         heard = np.concatenate([self._heard, features])
-        self._heard = heard[max(len(heard) - self._timing.delay, 0) :]
+        self._heard = heard[max(len(heard) - delay, 0) :]
         order = np.argsort(heard[:, 1], kind="stable")
         known = np.flatnonzero(np.isin(labels[:, 1], heard[:, 1]))
         at = order[np.searchsorted(heard[order, 1], labels[known, 1])]
@@ -244,14 +272,14 @@ class FrameSequence:
         )
         report(
             f"{kind}-frames",
-            extra,
+            extra & ~self._are_damaged(times),
             times,
             lambda i: f"there should be no {kind} of frame {frames[i]}",
         )
         if expects is not None:
             report(
                 f"{kind}-frames",
-                ~np.isin(expected[:, 1], frames),
+                ~np.isin(expected[:, 1], frames) & ~self._are_damaged(expected[:, 0]),
                 expected[:, 0],
                 lambda i: f"there is no {kind} of frame {expected[i, 1]}",
             )
@@ -268,12 +296,16 @@ class FrameSequence:
         )
 
     def _check_segments(self, rows: Int64) -> None:
-        """Segments follow each other, with nothing but gaps between them."""
+        """Segments follow each other, with nothing but gaps between them.
+
+        Those that were decided while the log was damaged are lost.
+        """
         if not len(rows):
             return
         times, starts, ends = rows.T
-        first = int(starts[0]) if self._segment_end is None else self._segment_end
-        before = np.concatenate([[first], ends[:-1]])
+        first = (int(times[0]), int(starts[0])) if self._segment is None else self._segment
+        decided = np.concatenate([[first[0]], times[:-1]])
+        before = np.concatenate([[first[1]], ends[:-1]])
         late = starts - before
         self._report(
             "segment-overlap",
@@ -283,14 +315,16 @@ class FrameSequence:
         )
         gaps = np.searchsorted(self._gap_ends, starts, "right")
         gaps -= np.searchsorted(self._gap_ends, before, "right")
+        damages = np.searchsorted(self._damages[:, 1], times)
+        damages -= np.searchsorted(self._damages[:, 0], decided, "right")
         self._report(
             "segment-hole",
-            (late > 0) & (gaps <= 0),
+            (late > 0) & (gaps <= 0) & (damages <= 0),
             times,
             lambda i: f"nothing is said of the {late[i] / 1e9:.3f} s before a segment",
         )
-        self._segment_end = int(ends[-1])
-        self._gap_ends = self._gap_ends[self._gap_ends > self._segment_end]
+        self._segment = int(times[-1]), int(ends[-1])
+        self._gap_ends = self._gap_ends[self._gap_ends > ends[-1]]
 
     def _report(
         self, rule: str, wrong: NDArray[np.bool_], times: Int64, what: Callable[[int], str]

@@ -34,8 +34,9 @@ from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
-from hearthlog.schemas.logs.provenance import METADATA, THINNED
+from hearthlog.schemas.logs.provenance import METADATA, THINNED, describes_model
 from hearthlog.schemas.messages.fields import difference
+from hearthlog.schemas.messages.gaps import LOG_DAMAGED
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.salvage.thin import dropped_kinds
@@ -174,6 +175,8 @@ class MessageChecks:
         rows = _sequence_rows(kind, columns)
         if rows is not None:
             self.frames[microphone].add(kind, rows)
+        if kind == GAP and rows is not None:
+            self.frames[microphone].add_damages(rows[columns["reason"] == LOG_DAMAGED])
 
     def _check_content(self, kind: str, columns: Columns, info: Mapping[str, Any] | None) -> None:
         if kind in _WIDTHS and info is not None:
@@ -189,12 +192,11 @@ class MessageChecks:
             column_checks.check_gaps(self._findings, columns)
 
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
-        every, timing = statistics_every(self._data), _label_timing(self._data, info)
-        labelled = info is not None and len(info["labels"]) > 0
+        every, timing = statistics_every(self._data), None
+        if info is not None and len(info["labels"]):
+            timing = _label_timing(self._data, info)
         thinned = _thinned_kinds(self._data)
-        return FrameSequence(
-            self._findings, microphone, every, timing, labelled=labelled, thinned=thinned
-        )
+        return FrameSequence(self._findings, microphone, every, timing, thinned)
 
     def _check_health(self, columns: Columns) -> None:
         """Say once what the recorder said of itself that was not well."""
@@ -246,14 +248,20 @@ def _thinned_kinds(data: DataSection) -> set[str]:
     return {kind for step in steps for kind in dropped_kinds(step)}
 
 
-def _label_timing(data: DataSection, info: Mapping[str, Any] | None) -> LabelTiming:
-    """Return the timing of the model in a file; at the end of a window if it does not say."""
+def _label_timing(data: DataSection, info: Mapping[str, Any]) -> LabelTiming | None:
+    """Return the timing of the model in a file; None if what says it was lost.
+
+    In the first version nothing says it, and labels speak of the end of a window.
+    """
+    records = data.metadata.get(METADATA, [])
+    if DESCRIPTION not in data.attachments and all(map(describes_model, records)):
+        return None
     try:
         content = json.loads(data.attachments[DESCRIPTION][0])
         named = {key: value for key, value in content.items() if key not in {"name", "sha256"}}
         description = read_description(json.dumps(named))
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, ModelError):
-        seconds = DEFAULT.window_seconds if info is None else float(info["window_seconds"])
+        seconds = float(info["window_seconds"])
         if not FRAME_SECONDS <= seconds <= _LONGEST_WINDOW:
             seconds = DEFAULT.window_seconds
         frames = round(seconds / FRAME_SECONDS)

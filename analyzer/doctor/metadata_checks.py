@@ -25,7 +25,7 @@ from hearthlog.models.modelfile.card import CARD, DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.log_stream import PROFILE, SCHEMA_ENCODING
-from hearthlog.schemas.logs.provenance import METADATA, schema_version
+from hearthlog.schemas.logs.provenance import METADATA, describes_model, schema_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
 from hearthlog.schemas.messages.fields import difference, type_hash_of
 from hearthlog.schemas.messages.topics import Topic, topics_of
@@ -99,7 +99,8 @@ class MetadataChecks:
             self._error("metadata", f"metadata {METADATA} lacks {', '.join(missing)}")
         attachments = self._data.attachments
         one = 1 if records[0].get("model") else 0
-        counts = {_CONFIGURATION: (1, 1), _MODEL_CARD: (one, one), _MODEL: (0, one)}
+        least_models = one if describes_model(records[0]) else 0
+        counts = {_CONFIGURATION: (1, 1), _MODEL_CARD: (one, one), _MODEL: (least_models, one)}
         for name, (least, most) in counts.items():
             count = len(attachments.get(name, ()))
             if not least <= count <= most:

@@ -106,6 +106,18 @@ def schema_version(record: Mapping[str, str]) -> int | None:
     return _KNOWN.get(version_text(record))
 
 
+def describes_model(record: Mapping[str, str]) -> bool:
+    """Tell whether a log with such a record has `model.json`, if it has labels.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        As `read_provenance` gives it.
+    """
+    version = schema_version(record)
+    return version is not None and version > 1
+
+
 def unknown_version(record: Mapping[str, str]) -> str:
     """Say that a record has a schema version that this version does not know.
 

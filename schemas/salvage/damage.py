@@ -2,9 +2,11 @@
 
 import zlib
 from array import array
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +17,16 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
-from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, MESSAGE
+from hearthlog.schemas.mcap.formats import (
+    CHUNK,
+    FOOTER,
+    FOOTER_SIZE,
+    HEAD,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX_HEAD,
+)
 from hearthlog.schemas.mcap.records import LIMIT, read_footer
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
@@ -63,6 +74,9 @@ class DamageList:
         # By channel: messages, first and last log time, and the bytes of the file between them.
         self.unnamed: dict[int, tuple[int, tuple[int, int], tuple[int, int]]] = {}
         self._damages: list[tuple[Damage, dict[int, int]]] = []
+
+    def __len__(self) -> int:
+        return len(self._damages)
 
     def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
         """Add a damage, which must be behind all others in the file.
@@ -135,11 +149,14 @@ class Index(NamedTuple):
 
     Attributes
     ----------
-    chunks : np.ndarray [shape=(n, 5)], int64
-        Offset, length, length of the message indexes, first and last log time of each chunk, in
-        the order of the file.
+    reader : RecordVerifier
+        Of the whole file.
+    chunks : np.ndarray [shape=(n, 6)], int64
+        Offset, length, length of the message indexes, first and last log time of each chunk, and
+        the byte at which its record in the index begins; in the order of the file.
     """
 
+    reader: RecordVerifier
     start: int  # byte at which it begins
     definitions: list[Definition]
     messages: dict[int, int]  # by channel
@@ -184,7 +201,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     Parameters
     ----------
     reader : RecordVerifier
-        Of the file, up to its end.
+        Of the file, up to its end, where it stays.
     limit : int
         Bytes; a larger index is not read.
 
@@ -227,7 +244,7 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
         elif isinstance(record, records.ChunkIndex):
             chunks.extend([record.chunk_start_offset, record.chunk_length])
             chunks.extend([record.message_index_length, record.message_start_time])
-            chunks.append(record.message_end_time)
+            chunks.extend([record.message_end_time, offset])
         elif isinstance(record, records.MetadataIndex):
             if record.name != rosbag2.METADATA:  # it is made anew
                 names[record.offset] = f"the metadata {record.name!r}"
@@ -236,12 +253,12 @@ def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
         elif not isinstance(record, records.SummaryOffset):
             raise McapError("here should be the index")
         offset = whole.end
-    table = np.array(chunks, np.int64).reshape(-1, 5)
+    table = np.array(chunks, np.int64).reshape(-1, 6)
     table = table[np.argsort(table[:, 0])]
     ends = table[:, :3].sum(axis=1)
     if (table < 0).any() or (ends[:-1] > table[1:, 0]).any():
         raise McapError("chunks overlap")
-    return Index(start, definitions, messages, table, names)
+    return Index(reader, start, definitions, messages, table, names)
 
 
 def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) -> Loss:
@@ -266,12 +283,25 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
         exact = bool(len(index.chunks)) or damaged.end - damaged.start < MESSAGE.size
         return Loss({}, exact, None, others)
     chunks = index.chunks[first:last]
-    messages: dict[int, int] = {}
-    exact = True
-    for offset, length, index_length, _, _ in chunks.tolist():
-        end, _ = _count(reader, offset + length, messages)
-        exact &= end == offset + length + index_length
-    return Loss(messages, exact, (int(chunks[:, 3].min()), int(chunks[:, 4].max())), others)
+    messages: Counter[int] = Counter()
+    for place in chunks[:, 5].tolist():
+        record = index.reader.whole(place).record
+        assert isinstance(record, records.ChunkIndex)
+        messages.update(_messages_of(record))
+    times = int(chunks[:, 3].min()), int(chunks[:, 4].max())
+    return Loss(messages, exact=True, times=times, others=others)
+
+
+def _messages_of(chunk: records.ChunkIndex) -> dict[int, int]:
+    """Count the messages of a chunk, by channel, from the lengths of its message indexes."""
+    places = sorted(chunk.message_index_offsets.items(), key=itemgetter(1))
+    ends = [place for _, place in places[1:]]
+    ends.append(chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length)
+    head = MESSAGE_INDEX_HEAD.itemsize
+    return {
+        channel: max(end - place - head, 0) // INDEX_ENTRY.size
+        for (channel, place), end in zip(places, ends, strict=False)
+    }
 
 
 def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:

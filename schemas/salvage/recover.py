@@ -147,14 +147,14 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
     path : Path
         The recovered log.
     topics : dict of str to TopicRecovery
-        What was saved, by topic; only `messages` is compared.
+        What was saved and stated, by topic.
 
     Raises
     ------
     LogError
         If it is damaged or cannot be read, or does not hold the messages that were recovered.
     """
-    expected = Counter({name: topic.messages for name, topic in topics.items() if topic.messages})
+    expected = Counter({name: topic.messages + topic.stated for name, topic in topics.items()})
     counts: Counter[str] = Counter()
     with LogFile(path) as file:
         for location in file.record_locations:

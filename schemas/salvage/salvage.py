@@ -88,7 +88,7 @@ class Salvage:
         self._reader = RecordVerifier(self._file, self.size)
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
-        self._index = read_index(self._reader, _KEPT_LIMIT)
+        self._index = read_index(RecordVerifier(self._file, self.size), _KEPT_LIMIT)
         self.complete = self._index is not None
         self.expected = None if self._index is None else self._index.messages
         if self._index is not None:
@@ -113,6 +113,11 @@ class Salvage:
     def damages(self) -> list[Damage]:
         """List the damages met so far by offset, then the messages of undefined channels."""
         return self._damages.resolve(self.definitions)
+
+    @property
+    def damage_count(self) -> int:
+        """How many damages were met so far; as many of `damages` come first."""
+        return len(self._damages)
 
     def pieces(self) -> Iterator[Piece]:
         """Read whatever is whole, in the order of the file.

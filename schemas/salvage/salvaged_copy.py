@@ -1,7 +1,7 @@
 """A new log of what is whole in a damaged one, and the count of what it holds."""
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, Protocol
 
@@ -11,10 +11,13 @@ from hearthlog.schemas.logs import provenance, rosbag2
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.definitions import Definition
+from hearthlog.schemas.messages.gaps import LOG_DAMAGED, encode_gap
 from hearthlog.schemas.progress import Progress
 from hearthlog.schemas.salvage.damage import Damage
+from hearthlog.schemas.salvage.gap_channel import gap_channel
+from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames
 from hearthlog.schemas.salvage.salvage import Piece, Salvage
-from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
+from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk, chunk_messages
 
 
 @dataclass
@@ -23,6 +26,7 @@ class TopicRecovery:
 
     type: str
     messages: int = 0
+    stated: int = 0  # gaps that were not in the log, and say what could not be saved
     expected: int | None = None  # messages that there should be, if the index of the log says so
     end: int = 0  # log time of the last message, in nanoseconds
 
@@ -87,10 +91,12 @@ class SalvagedCopy:
         self._profile = profile
         self._chunk_span = chunk_span
         self._selection = selection
+        self._search = FrameSearch(salvage)
         self._writer = ChunkWriter(stream)
         self._begun = False
         self._written: set[tuple[type, int]] = set()
         self._counts: Counter[int] = Counter()
+        self._stated: Counter[int] = Counter()  # gaps that were not in the log
         self._ends: dict[int, int] = {}
         self._span = (1 << 63, 0)
 
@@ -109,6 +115,8 @@ class SalvagedCopy:
             progress(self._salvage.offset / self._salvage.size)
             del piece  # before the next is read, which may be as large
         self._begin()
+        for lost in self._search.at_end(self._ends):
+            self._add_gap(lost)
         self._writer.flush()
         definitions = self._salvage.definitions
         schemas = definitions.schemas
@@ -142,7 +150,8 @@ class SalvagedCopy:
         expected = self._salvage.expected
         for number, channel, kind in self._channel_types():
             topic = topics.setdefault(channel.topic, TopicRecovery(kind))
-            topic.messages += self._counts[number]
+            topic.messages += self._counts[number] - self._stated[number]
+            topic.stated += self._stated[number]
             topic.end = max(topic.end, self._ends.get(number, 0))
             if expected is not None and not self._drops(number):
                 topic.expected = (topic.expected or 0) + expected.get(number, 0)
@@ -161,14 +170,11 @@ class SalvagedCopy:
         if self._chunk_span and not isinstance(piece, WholeChunk):
             self._writer.flush()
         if isinstance(piece, WholeChunk):
-            self._add_chunk(piece)
+            self._add_chunk(piece, self._search.before(piece))
         elif isinstance(piece, Message):
-            if self._drops(piece.channel_id):
-                return
-            self._define([piece.channel_id])
-            number, time = piece.channel_id, piece.log_time
-            self._writer.add_message(number, time, piece.data, piece.publish_time, piece.sequence)
-            self._count(number, 1, time, time)
+            for lost in self._search.before(piece):
+                self._add_gap(lost)
+            self._add_message(piece)
         elif isinstance(piece, WholeAttachment):
             self._writer.copy_attachment(piece.record, piece.index_record)
         elif piece.name == provenance.METADATA and self._selection is not None:
@@ -176,8 +182,14 @@ class SalvagedCopy:
         elif piece.name != rosbag2.METADATA:
             self._writer.add_metadata(piece.name, piece.metadata)
 
-    def _add_chunk(self, piece: WholeChunk) -> None:
+    def _add_chunk(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+        """Copy a chunk, as it is unless something is dropped or gaps stand between its messages."""
         chunk = piece.stored
+        if any(lost.end > chunk.start for lost in losses):
+            self._add_messages(piece, losses)
+            return
+        for lost in losses:
+            self._add_gap(lost)
         dropped = {number for number in chunk.entries if self._drops(number)}
         kept = [number for number in chunk.entries if number not in dropped]
         if not kept:
@@ -195,6 +207,34 @@ class SalvagedCopy:
         if self._selection is None:
             return False
         return self._selection.drops(self._salvage.definitions.channels[number].topic)
+
+    def _add_messages(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+        waiting = deque(losses)
+        for message in chunk_messages(piece.stored):
+            while waiting and waiting[0].end <= message.log_time:
+                self._add_gap(waiting.popleft())
+            self._add_message(message)
+        for lost in waiting:
+            self._add_gap(lost)
+
+    def _add_message(self, message: Message) -> None:
+        number, time = message.channel_id, message.log_time
+        if self._drops(number):
+            return
+        self._define([number])
+        self._writer.add_message(number, time, message.data, message.publish_time, message.sequence)
+        self._count(number, 1, time, time)
+
+    def _add_gap(self, lost: LostFrames) -> None:
+        """Say that frames are missing, unless log time is beyond them already."""
+        end, start, microphone, frames = lost
+        number = gap_channel(self._salvage.definitions, microphone)
+        if number is None or end < self._span[1]:
+            return
+        self._add_message(
+            Message(number, end, encode_gap(microphone, start, end, LOG_DAMAGED, frames), end, 0)
+        )
+        self._stated[number] += 1
 
     def _begin(self) -> None:
         if not self._begun:

@@ -1,0 +1,34 @@
+"""Gaps: sound that a log does not have."""
+
+from hearthlog.schemas.messages.message_types import (
+    GAP,
+    duration_message,
+    encode,
+    header,
+    message,
+)
+
+LOG_DAMAGED = "the log was damaged"  # the reason of a gap that `recover` writes
+
+
+def encode_gap(microphone: str, start: int, end: int, reason: str, frames_lost: int) -> bytes:
+    """Encode an `AudioGap` as CDR.
+
+    Parameters
+    ----------
+    microphone : str
+        Its name.
+    start, end : int
+        In nanoseconds of UTC.
+    reason : str
+    frames_lost : int
+    """
+    return encode(
+        message(
+            GAP,
+            header=header(start, microphone),
+            duration=duration_message(end - start),
+            reason=reason,
+            frames_lost=frames_lost,
+        )
+    )
