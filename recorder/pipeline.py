@@ -287,6 +287,9 @@ class Pipeline:
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         if health.level == OK and (problem := self._watch.problem()):
             health = replace(health, level=WARNING, summary=problem)
+        # A report of a later time than the sound says that there is none: what is still to be said
+        # of the sound is older, and comes first.
+        closing = self._close(self._end) if health.stamp > self._end else []
         name = f"hearthlog: {self.microphone}"
         values = {**health.values, **self._floor_value()}
         messages = [self._diagnostics(health.stamp, health.level, name, health.summary, values)]
@@ -294,7 +297,7 @@ class Pipeline:
             self._level = health.level
             line = rosout.health_line(self.microphone, health)
             messages.append(EncodedMessage(health.stamp, ROSOUT, line))
-        return messages
+        return [*closing, *messages]
 
     def _floor_value(self) -> dict[str, str]:
         if self._recent_floors is None or not len(self._recent_floors):

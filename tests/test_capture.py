@@ -10,8 +10,10 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features, read
 
+from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 
 RATE = 16_000
@@ -20,11 +22,11 @@ SECONDS = 1_000_000_000
 
 
 @contextmanager
-def recording(microphone, folder):
+def recording(microphone, folder, *options):
     """Run `hearthlog record` on a microphone; at the end it is asked to stop."""
     # One file a day, or an hour that ends just now would make two.
     command = [*HEARTHLOG, "record", "--device", microphone.device, "-o", str(folder)]
-    command += ["--max-bag-duration", "86400"]
+    command += ["--max-bag-duration", "86400", *options]
     with subprocess.Popen(
         command, env=microphone.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -121,6 +123,23 @@ def test_a_microphone_that_is_unplugged_and_comes_back_leaves_a_gap(labmic, tmp_
     levels = [s.level for m in read(tmp_path / "logs", "diagnostics") for s in m.status]
     assert 2 in levels
     assert levels[-1] == 0
+
+
+def test_a_loss_of_the_microphone_leaves_one_log_that_is_labelled_and_whole(labmic, tmp_path):
+    labmic.configure(data=sound())
+    logs = tmp_path / "logs"
+    with recording(labmic, logs, "--model", "general"):
+        wait_for_frames(logs, 60)
+        for _ in range(2):
+            labmic.unplug()
+            time.sleep(5)
+            labmic.restore()
+            wait_for_frames(logs, len(features(logs)[0]) + 60)
+    (log,) = find_logs(logs)
+    assert len(read(log, "gap")) == 2
+    assert len(read(log, "segment")) >= 2
+    (findings,) = examine(log)
+    assert not [line for line in map(str, findings.shown) if line.startswith("error")]
 
 
 def test_a_microphone_that_freezes_is_started_again(labmic, tmp_path):
