@@ -54,7 +54,7 @@ def record_logs(paths: Sequence[Path], folder: Path, model: Path) -> Path:
     """
 
     def copy_active() -> None:
-        (active,) = (folder / "logs").rglob("*.active")
+        active = max((folder / "logs").rglob("*.active"))  # the others get their names
         shutil.copy(active, folder / "unfinished.mcap.active")
 
     settings = Settings(output=folder / "logs", model=model, max_bag_duration=60)
