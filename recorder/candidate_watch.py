@@ -10,7 +10,8 @@ from threading import Thread
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import CANDIDATE
-from hearthlog.recorder.model_watch import LOOK_SECONDS, Loaded, file_identity, load_checked, say
+from hearthlog.recorder.journal import say
+from hearthlog.recorder.model_watch import LOOK_SECONDS, Loaded, file_identity, load_checked
 
 
 class CandidateWatch:

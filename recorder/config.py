@@ -48,6 +48,7 @@ class MicrophoneSettings(BaseModel):
 
     name: Annotated[str, _checked(check_microphone_name)] = "mic"
     device: str = ""  # as `hearthlog devices` lists it; empty: the default one
+    model: Path | None = None  # instead of the recorder's
 
 
 class _Environment(EnvSettingsSource):
@@ -97,7 +98,7 @@ class Settings(BaseSettings):
     drop_features_days: int = Field(default=0, ge=0)  # and the statistics; 0: never
     labels_only_days: int = Field(default=0, ge=0)  # all but labels, segments, gaps; 0: never
     microphone: list[MicrophoneSettings] = Field(
-        default=[MicrophoneSettings()], min_length=1, max_length=1
+        default=[MicrophoneSettings()], min_length=1, max_length=16
     )
 
     def keeping_rules(self) -> KeepingRules:
@@ -165,6 +166,14 @@ def load_settings(
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     try:
         settings = Settings(file=content, **command_line)  # type: ignore[call-arg]
+        _check_microphones(settings.microphone)
+        if not microphone:
+            return settings
+        if len(settings.microphone) > 1:
+            raise ConfigurationError(
+                f"{file}: has {len(settings.microphone)} microphones; say there what is to be said "
+                f"of one, not on the command line ({', '.join(microphone)})"
+            )
         merged = settings.microphone[0].model_dump() | microphone
         return settings.model_copy(update={"microphone": [MicrophoneSettings(**merged)]})
     except ValidationError as error:
@@ -174,3 +183,14 @@ def load_settings(
             raise ConfigurationError(f"{file or 'configuration'}: unknown key {key!r}") from error
         message = first["msg"].removeprefix("Value error, ")
         raise ConfigurationError(f"configuration: {key}: {message}") from error
+
+
+def _check_microphones(microphones: list[MicrophoneSettings]) -> None:
+    for key in ("name", "device"):
+        values = [getattr(each, key) for each in microphones]
+        twice = next((value for value in values if values.count(value) > 1), None)
+        if twice is not None:
+            what = f"{key} {twice!r}" if twice else "the default device"
+            raise ConfigurationError(
+                f"configuration: two microphones have {what}; say which is which"
+            )

@@ -9,3 +9,7 @@ class SourceError(HearthlogError):
 
 class ConfigurationError(HearthlogError):
     """The configuration is unknown, wrong or contradicts itself."""
+
+
+class DeviceError(SourceError):
+    """A microphone is not there, or cannot be opened now."""

@@ -55,7 +55,9 @@ Event = Frames | Gap | SourceHealth
 class SoundSource(Protocol):
     """Where sound comes from."""
 
-    device: str  # its name
+    @property
+    def device(self) -> str:
+        """Name of what is heard."""
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield what the source gives.

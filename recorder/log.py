@@ -2,38 +2,25 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from hearthlog.recorder.events import Notice
 from hearthlog.recorder.finishing import LogFinisher
+from hearthlog.recorder.log_description import LogDescription
 from hearthlog.recorder.stream_messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import free_log_path, log_path
-from hearthlog.schemas.logs.log_stream import Attachment
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import header
-from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
 
 # The longest time from a sound to its writing: a block of frames, and the delay of the capture.
 _DELAY_SECONDS = 0.9
 _FILES = 256  # to remember: even with one a second, longer than clips are held back
+_LATE = 10 * NANOSECONDS  # of one microphone behind another: beyond that the clock was set back
 _NEVER = (1 << 63) - 1
-
-
-@dataclass(frozen=True)
-class LogDescription:
-    """What every file of a recording says of itself."""
-
-    root: Path  # folder of the logs
-    node: str  # name of the recorder
-    topics: Sequence[Topic]
-    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
-    metadata: Mapping[str, str]  # the `hearthlog` record
-    attachments: Sequence[Attachment]
 
 
 class RollingLog:
@@ -57,6 +44,8 @@ class RollingLog:
     ----------
     finished : list of Path
         Files that are complete, by their final names.
+    safe : int
+        How many of the messages that were given are on the disk.
     """
 
     def __init__(  # noqa: PLR0913
@@ -70,6 +59,8 @@ class RollingLog:
         finisher: LogFinisher | None = None,
     ) -> None:
         self.finished: list[Path] = []
+        self.safe = 0
+        self._given = 0  # messages that were appended, those that open a file not counted
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
@@ -77,6 +68,8 @@ class RollingLog:
         self._name = free_log_path if live else log_path
         self._finisher = finisher
         self._writer: LogWriter | None = None
+        self._abandoned: LogWriter | None = None  # of the file that the disk refused
+        self._late = _LATE if len(description.infos) > 1 else 0
         self._last = self._until = 0  # no time lies between: the first message opens a file
         self._flush_at: int | None = None
         self._synced = time.monotonic()
@@ -100,9 +93,10 @@ class RollingLog:
         """
         with self._keeping_what_was_written():
             for message in messages:
-                if not self._last <= message.log_time < self._until:
+                if not self._last - self._late <= message.log_time < self._until:
                     self._roll(message.log_time)
                 self._append(message)
+                self._given += 1
             if self._flush_at is not None and self._last >= self._flush_at:
                 self.flush()
             if time.monotonic() - self._synced >= self._sync_seconds:
@@ -131,6 +125,7 @@ class RollingLog:
         self.flush()
         if self._writer is not None:
             self._writer.sync()
+        self.safe = self._given
         self._synced = time.monotonic()
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
@@ -150,6 +145,7 @@ class RollingLog:
             if self._writer is not None:
                 for message in messages:
                     self._append(message)
+                    self._given += 1
             self._finish_file()
 
     def may_begin(self, stamp: int) -> bool:
@@ -163,6 +159,15 @@ class RollingLog:
         description = self._description
         path = log_path(description.root, description.node, stamp)
         return free_log_path(description.root, description.node, stamp) == path
+
+    @property
+    def is_full(self) -> bool:
+        """Whether sound must be dropped; what cannot be written raises an error instead."""
+        return False
+
+    def notices(self) -> list[Notice]:
+        """Return what people should know of the disk."""
+        return []
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
         """Find the file that contains a time; the later one where the clock was set back.
@@ -180,6 +185,8 @@ class RollingLog:
             When the next file begins, in nanoseconds of UTC.
         """
         until = _NEVER
+        if not self._begun:
+            return log_path(self._description.root, self._description.node, stamp), until
         for start, path in reversed(self._begun):
             if start <= stamp:
                 return path, until
@@ -205,6 +212,21 @@ class RollingLog:
         self._description = description
         self._until = 0
 
+    def begin_after_failure(self) -> None:
+        """Go on after an error: the messages that are not `safe` are to be written again.
+
+        Raises
+        ------
+        OSError
+            If the disk still refuses.
+        """
+        if self._abandoned is not None:
+            self._abandoned.discard_unsynced()
+            self._abandoned = None
+        self._given = self.safe
+        self._until = 0
+        self._flush_at = None
+
     @contextmanager
     def _keeping_what_was_written(self) -> Iterator[None]:
         try:
@@ -213,7 +235,7 @@ class RollingLog:
             kept = ""
             if self._writer is not None:
                 self._writer.abandon()
-                self._writer = None
+                self._abandoned, self._writer = self._writer, None
                 kept = "; what was recorded is kept and completed at the next start"
             what = error.strerror or str(error)
             root = self._description.root
@@ -228,11 +250,12 @@ class RollingLog:
                 self._finisher.add(self._writer.active_path)
             self.finished.append(self._writer.path)
             self._writer = None
+        self.safe = self._given
 
     def _append(self, message: EncodedMessage) -> None:
         assert self._writer is not None
         self._writer.write(message.topic, message.log_time, message.data)
-        self._last = message.log_time
+        self._last = max(self._last, message.log_time)
         if self._flush_at is None:
             self._flush_at = message.log_time + self._flush_nanoseconds
 

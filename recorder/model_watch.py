@@ -3,7 +3,6 @@
 A model that replaces another one labels only if there is a judgement that lets it.
 """
 
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +17,7 @@ from hearthlog.models.modelfile.judgement import judgement_path, read_judgement
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 from hearthlog.models.starter import GENERAL
+from hearthlog.recorder.journal import say
 
 LOOK_SECONDS = 1.0
 
@@ -29,6 +29,23 @@ class Loaded(NamedTuple):
 
     model: Model
     classifier: Classifier
+
+
+class ReloadRequests:
+    """Asks all watches to look at their files at once; a signal handler may do so."""
+
+    def __init__(self) -> None:
+        self._queues: list[SimpleQueue[None]] = []
+
+    def queue(self) -> SimpleQueue[None]:
+        """Return what another watch is to be asked by."""
+        self._queues.append(SimpleQueue())
+        return self._queues[-1]
+
+    def ask(self) -> None:
+        """Ask them."""
+        for queue in self._queues:
+            queue.put(None)
 
 
 class ModelWatch:
@@ -166,18 +183,6 @@ def _warn_if_simulated(model: Model) -> None:
             f"model {model.name} has learned from simulated sounds alone and is mostly wrong about "
             "real ones, however sure it is; train one from recordings"
         )
-
-
-def say(text: str) -> None:
-    """Print a line on standard error.
-
-    Parameters
-    ----------
-    text : str
-    """
-    with suppress(OSError):  # the log says it too
-        sys.stderr.write(f"hearthlog: {text}\n")
-        sys.stderr.flush()
 
 
 def load_checked(path: Path) -> Loaded:

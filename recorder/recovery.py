@@ -5,9 +5,10 @@ from pathlib import Path
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.files import SUFFIX, is_layer, is_log, stem
-from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
-from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.logs.files import SUFFIX, is_layer, is_log, log_name, log_path, stem
+from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.salvage.recover import (
     NothingWholeError,
     check_copy,
@@ -27,16 +28,13 @@ class Recovered:
 
     Attributes
     ----------
-    end : int
-        End of the last frame or gap, in nanoseconds of UTC; 0 if the log has none.
     damage : str
         What is damaged in the file, and what was lost; empty if the file only ended early.
     completed : bool
-        False for clips that cannot be completed now.
+        False for a log that cannot be completed now, or that was empty.
     """
 
     path: Path
-    end: int
     damage: str
     completed: bool = True
 
@@ -46,8 +44,8 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
 
     What is whole is copied to the final name, read again and counted; only then the original is
     removed. A log that is damaged, or holds no message, is kept beside it as `*.damaged`. Layers
-    of sound are not kept, for they are to be forgotten some day, and none of them keeps the
-    recorder from starting.
+    of sound are not kept, for they are to be forgotten some day. A log that cannot be completed is
+    left for the next start; an empty file, as a power cut leaves it, is deleted.
 
     Parameters
     ----------
@@ -59,19 +57,16 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
     Returns
     -------
     list of Recovered
-        By name; a log without a message is not there.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read or completed.
+        By name; a log that begins but has no message is not there.
     """
     completed = []
     for active in sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}"))):
-        with lock_abandoned(active) as is_abandoned:
-            if is_abandoned:
-                recover = _recover_clips if is_layer(active) else _recover
-                completed += recover(active, active.with_name(stem(active) + SUFFIX))
+        try:
+            completed += _recover_abandoned(active)
+        except (LogError, OSError) as error:
+            what = error if isinstance(error, LogError) else error.strerror or error
+            text = f"{active}: cannot be completed ({what}); it is left as it is"
+            completed.append(Recovered(active, text, completed=False))
     return completed
 
 
@@ -95,6 +90,63 @@ def complete_log(active: Path) -> None:
             _recover(active, active.with_name(stem(active) + SUFFIX))
 
 
+def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
+    """Find until when a node has recorded a microphone, in all its logs.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the logs.
+    node, microphone : str
+        Their names.
+    before : int
+        Logs that begin later are not looked at: the clock was wrong when they were made. In
+        nanoseconds of UTC.
+
+    Returns
+    -------
+    int
+        End of the last frame, or of the gap behind it, in nanoseconds of UTC; 0 if there is none.
+    """
+    latest = log_path(root, node, before).name
+    ours = [path for path in root.rglob(f"{node}_*{SUFFIX}*") if _is_log_of(path, node)]
+    for path in sorted(ours, key=lambda path: path.name, reverse=True):
+        if path.name > latest:
+            continue
+        try:
+            with LogFile(path) as file:
+                end = _end_in(file, microphone)
+        except LogError:
+            continue
+        if end:
+            return end
+    return 0
+
+
+def _is_log_of(path: Path, node: str) -> bool:
+    return is_log(path) and not is_layer(path) and log_name(path).node == node
+
+
+def _end_in(file: LogFile, microphone: str) -> int:
+    later = {topic(microphone, "features"): FRAME_NANOSECONDS, topic(microphone, "gap"): 0}
+    for number in reversed(range(len(file.chunks))):
+        read = read_chunks(file, file.chunks[number : number + 1], later)
+        if read:
+            return max(int(raw.log_times.max()) + later[raw.channel.topic] for raw in read)
+    return 0
+
+
+def _recover_abandoned(active: Path) -> list[Recovered]:
+    with lock_abandoned(active) as is_abandoned:
+        if not is_abandoned:
+            return []
+        if not active.stat().st_size:
+            active.unlink()
+            return [Recovered(active, f"{active}: was empty, and is deleted", completed=False)]
+        recover = _recover_clips if is_layer(active) else _recover
+        return recover(active, active.with_name(stem(active) + SUFFIX))
+
+
 def _recover_clips(active: Path, path: Path) -> list[Recovered]:
     try:
         recovery = _complete(active, path)
@@ -103,13 +155,9 @@ def _recover_clips(active: Path, path: Path) -> list[Recovered]:
     except NothingWholeError:
         active.unlink()
         return []
-    except (LogError, OSError) as error:
-        what = error if isinstance(error, LogError) else error.strerror or error
-        text = f"{active}: cannot be completed ({what}); it is left as it is"
-        return [Recovered(path, 0, text, completed=False)]
     damages = [damage for damage in recovery.damages if not damage.cut]
     damage = f"{active}: {damages[0]}; this sound is deleted" if damages else ""
-    return [Recovered(path, 0, damage)] if recovery.messages else []
+    return [Recovered(path, damage)] if recovery.messages else []
 
 
 def _recover(active: Path, path: Path) -> list[Recovered]:
@@ -117,9 +165,6 @@ def _recover(active: Path, path: Path) -> list[Recovered]:
         recovery = _complete(active, path)
     except NothingWholeError:
         recovery = Recovery({}, [], complete=False)
-    except OSError as error:
-        what = error.strerror or str(error)
-        raise LogError(f"{active}: cannot be completed ({what}); it is left as it is") from error
     damages = [damage for damage in recovery.damages if not damage.cut]
     if damages or not recovery.messages:
         active.rename(active.with_name(path.name + ".damaged"))
@@ -131,7 +176,7 @@ def _recover(active: Path, path: Path) -> list[Recovered]:
     more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
     kept = "; the original is kept as *.damaged"
     damage = f"{active}: {damages[0]}{more}{kept}" if damages else ""
-    return [Recovered(path, _end_of_frames(recovery), damage)]
+    return [Recovered(path, damage)]
 
 
 def _complete(active: Path, path: Path) -> Recovery:
@@ -154,15 +199,3 @@ def _complete(active: Path, path: Path) -> Recovery:
     finally:
         copy.unlink(missing_ok=True)
     return recovery
-
-
-def _end_of_frames(recovery: Recovery) -> int:
-    ends = {message_types.FEATURES: FRAME_NANOSECONDS, message_types.GAP: 0}
-    return max(
-        (
-            topic.end + ends[topic.type]
-            for topic in recovery.topics.values()
-            if topic.type in ends and topic.end
-        ),
-        default=0,
-    )

@@ -133,7 +133,6 @@ def _record(folder: Path, model: Path, paths: list[Path], half: int) -> None:
     source = FileSource(paths, START + half * 12 * HOUR)
     record(
         settings,
-        settings.microphone[0],
         LossySource(source, {_LOST: _LOST_FRAMES} if half else {}),
         Flag(),
     )

@@ -284,7 +284,7 @@ def test_marks_that_contradict_the_floor_of_the_room_are_left_out_and_counted(
 
 def test_the_floor_at_a_mark_is_that_of_a_recorder_that_did_not_begin_with_its_log(day, tmp_path):
     settings = Settings(output=tmp_path, max_bag_duration=60)
-    record(settings, settings.microphone[0], FileSource([day], 1_772_348_400 * 10**9), Event())
+    record(settings, FileSource([day], 1_772_348_400 * 10**9), Event())
     logs = find_logs(tmp_path)
     whole = read_columns(logs, ["/mic/features"])["/mic/features"]
     stamps = whole["header.stamp"]
@@ -405,7 +405,7 @@ def test_the_last_weeks_are_labelled_as_a_recorder_does_and_long_silence_is_cut(
 ):
     model = load_model(smoothed)
     settings = Settings(output=tmp_path, model=smoothed)
-    record(settings, settings.microphone[0], FileSource([day], 1_772_348_400 * 10**9), Event())
+    record(settings, FileSource([day], 1_772_348_400 * 10**9), Event())
     (columns,) = read_columns(find_logs(tmp_path), ["/mic/label"]).values()
     sound, losses = read_home_sound([tmp_path], model)
     assert losses == []
@@ -427,7 +427,7 @@ def test_of_two_weeks_only_what_can_be_read_is_learned_from(smoothed, day, tmp_p
         output = tmp_path / "logs"
         start = int(np.datetime64(date, "ns").astype(int))
         settings = Settings(output=output, model=None)
-        record(settings, settings.microphone[0], FileSource([day], start), Event())
+        record(settings, FileSource([day], start), Event())
         assert len(find_logs(output)) == number + 1
     _, second, last = find_logs(tmp_path / "logs")
     assert len(read_home_sound([tmp_path / "logs"], model).sound) == 2

@@ -33,7 +33,7 @@ FUNCTIONS = [name for name in PUBLIC if inspect.isfunction(getattr(hearthlog, na
 
 def make_logs(folder, model, sounds, **options):
     settings = Settings(output=folder, model=model, **options)
-    record(settings, settings.microphone[0], FileSource(sounds, START), Flag())
+    record(settings, FileSource(sounds, START), Flag())
     return folder
 
 

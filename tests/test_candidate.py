@@ -27,6 +27,7 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote, target
 from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.labelling_models import LabellingModels
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.logs.files import find_logs
@@ -155,11 +156,13 @@ def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CountingWatch(folder, DEFAULT)
-    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, watch, candidates)
+    session = RecordingSession(
+        Settings(output=tmp_path), {"mic": MICROPHONE}, {"mic": LabellingModels(watch, candidates)}
+    )
     frames = iter(range(0, 100_000, 30))
 
     def told():
-        session.add(block(next(frames), 30))
+        session.add("mic", block(next(frames), 30))
         return candidates.told
 
     shutil.copy(folder / "two.safetensors", folder / "copy")
@@ -388,8 +391,10 @@ def test_a_candidate_that_has_just_begun_cannot_be_compared_yet(folder, tmp_path
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CandidateWatch(folder, DEFAULT)
-    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, watch, candidates)
-    session.add(block(0, 30))
+    session = RecordingSession(
+        Settings(output=tmp_path), {"mic": MICROPHONE}, {"mic": LabellingModels(watch, candidates)}
+    )
+    session.add("mic", block(0, 30))
     done = run(capfd, "models", "compare", "--live", "--logs", tmp_path)
     assert done.returncode == 1
     assert done.stderr.startswith("hearthlog: nothing to compare two with one by yet: /mic/")

@@ -218,7 +218,7 @@ def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_pa
     log = find_logs(fleet / "north")[0]
     layer = relabelled(log, [(12, "speech"), (6, "music")])
     hall = Settings(output=tmp_path, model=model_file, microphone=[MicrophoneSettings(name="hall")])
-    (other,) = record(hall, hall.microphone[0], FileSource([day], START), Event()).logs
+    (other,) = record(hall, FileSource([day], START), Event()).logs
     merged = fleet / "merged.mcap"
     assert run(capfd, "merge", log, layer, other, "-o", merged).returncode == 0
     catalog = write_catalog(fleet)

@@ -51,9 +51,7 @@ def logs(sounds, tmp_path_factory, model_file):
     settings = load_settings(
         None, {"output": folder, "model": model_file, "max_bag_duration": 60}, {}
     )
-    found = record_files(
-        settings, settings.microphone[0], FileSource(sounds, 1_772_348_370_123_456_789), Event()
-    ).logs
+    found = record_files(settings, FileSource(sounds, 1_772_348_370_123_456_789), Event()).logs
     assert len(found) > 2
     return found
 

@@ -53,7 +53,7 @@ def days(tmp_path_factory):
         truth = write_day(sound, 1.5, seed=20 + number, manifest=None)
         start = START + number * DAY
         settings = Settings(output=folder / "logs")
-        (log,) = record(settings, settings.microphone[0], FileSource([sound], start), Flag()).logs
+        (log,) = record(settings, FileSource([sound], start), Flag()).logs
         marks = [
             Mark("mic", *(start + round(time * SECOND) for time in span[:2]), span[2])
             for span in truth.spans

@@ -216,7 +216,7 @@ def test_the_logs_are_those_that_the_recorder_leaves_of_the_sound(evening, model
         settings = Settings(output=tmp_path / name, model=model_file)
         if name == "recorded":
             source = FileSource([tmp_path / "evening.flac"], START)
-            logs = record_files(settings, settings.microphone[0], source, Flag()).logs
+            logs = record_files(settings, source, Flag()).logs
         else:
             logs = record_composition(evening, settings, START, "evening.flac")
         assert [log.name for log in logs] == ["home_20260301T000000Z.mcap"]

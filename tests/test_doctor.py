@@ -43,8 +43,9 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
 from hearthlog.recorder.log import RollingLog
+from hearthlog.recorder.log_description import describe_log
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.recording import describe_log, record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream_messages import stream_info
@@ -67,7 +68,7 @@ def recorded(tmp_path_factory, day, model_file):
     soundfile.write(folder / "sound.wav", samples, rate)
     settings = Settings(output=folder, model=model_file, statistics_every=1)
     source = LossySource(FileSource([folder / "sound.wav"], START), {2: 7})
-    (path,) = record(settings, settings.microphone[0], source, Flag()).logs
+    (path,) = record(settings, source, Flag()).logs
     return path
 
 
@@ -1130,9 +1131,7 @@ def series(tmp_path_factory, recorded, model_file):
     folder = tmp_path_factory.mktemp("series")
     settings = Settings(output=folder, model=model_file, max_bag_duration=10)
     sound = next(recorded.parents[3].glob("*.wav"))
-    record(
-        settings, settings.microphone[0], LossySource(FileSource([sound], START), {2: 7}), Flag()
-    )
+    record(settings, LossySource(FileSource([sound], START), {2: 7}), Flag())
     return folder
 
 
@@ -1149,7 +1148,7 @@ def test_logs_that_follow_each_other_are_sound(folder):
 def test_a_recorder_that_starts_again_begins_with_frame_0(folder, recorded, model_file):
     settings = Settings(output=folder, model=model_file)
     sound = next(recorded.parents[3].glob("*.wav"))
-    record(settings, settings.microphone[0], FileSource([sound], START + 60 * NANOSECONDS), Flag())
+    record(settings, FileSource([sound], START + 60 * NANOSECONDS), Flag())
     assert found(folder) == {("warning", GAP)}
 
 

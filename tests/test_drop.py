@@ -23,9 +23,7 @@ def test_a_bare_log_opens_with_a_list_of_what_was_heard(
     tmp_path, viewer, day, model_file, with_model
 ):
     settings = Settings(output=tmp_path / "logs", model=model_file if with_model else None)
-    (log,) = record(
-        settings, settings.microphone[0], LossySource(FileSource([day], START), {5: 7}), Flag()
-    ).logs
+    (log,) = record(settings, LossySource(FileSource([day], START), {5: 7}), Flag()).logs
 
     picture, state = shown(viewer, log, views=1)
 

@@ -23,7 +23,8 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.finishing import LogFinisher, finish_log
 from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.recording import describe_log, record
+from hearthlog.recorder.log_description import describe_log
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.stream_messages import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
@@ -124,9 +125,7 @@ def test_all_messages_are_kept_in_their_order_whatever_their_times(tmp_path_fact
 
 def test_a_log_that_was_recorded_live_has_chunks_of_ten_seconds(tmp_path):
     about = Settings(output=tmp_path, model="none")
-    logs = record(
-        about, about.microphone[0], Live(START + HOUR - 25 * NANOSECONDS, 60), Flag()
-    ).logs
+    logs = record(about, Live(START + HOUR - 25 * NANOSECONDS, 60), Flag()).logs
     assert find_logs(tmp_path) == logs
     for log, seconds in zip(logs, (25, 35), strict=True):
         assert spans(log).max() <= 10

@@ -42,7 +42,7 @@ def minute(tmp_path_factory):
     soundfile.write(folder / "noise.wav", noise, 16_000)
     settings = Settings(output=folder / "logs", model=None)
     source = FileSource([folder / "noise.wav"], START)
-    (log,) = record(settings, settings.microphone[0], source, Flag()).logs
+    (log,) = record(settings, source, Flag()).logs
     return log
 
 

@@ -67,7 +67,7 @@ def lived(tmp_path_factory, model_file):
     sound = folder / "day.flac"
     write_day(sound, MINUTES, seed=33, manifest=None)
     settings = Settings(output=folder / "logs", model=folder / "models" / "one.safetensors")
-    record(settings, settings.microphone[0], FileSource([sound], START), Flag())
+    record(settings, FileSource([sound], START), Flag())
     return folder
 
 

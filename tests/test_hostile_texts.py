@@ -38,9 +38,7 @@ def log(tmp_path_factory, day, model_file):
     samples, rate = soundfile.read(day, frames=10 * 16_000, dtype="int16")
     soundfile.write(folder / "sound.wav", samples, rate)
     settings = Settings(output=folder / "logs", model=model_file)
-    (path,) = record(
-        settings, settings.microphone[0], FileSource([folder / "sound.wav"], START), Flag()
-    ).logs
+    (path,) = record(settings, FileSource([folder / "sound.wav"], START), Flag()).logs
     return path
 
 

@@ -10,10 +10,12 @@ from logs import features
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.log import LogDescription, RollingLog
+from hearthlog.recorder.log import RollingLog
+from hearthlog.recorder.log_description import LogDescription, describe_log
 from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.recording import Settings, describe_log, record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream_messages import stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
@@ -90,7 +92,7 @@ def test_where_time_runs_backwards_another_file_begins(description):
 def test_a_clock_that_is_set_back_over_a_full_hour_ends_nothing(tmp_path, back, names):
     source = ClockSetBack(START + HOUR - 20 * NANOSECONDS, back)
     settings = Settings(output=tmp_path)
-    logs = record(settings, settings.microphone[0], source, Flag()).logs
+    logs = record(settings, source, Flag()).logs
     assert sorted(path.stem.partition("T")[2] for path in logs) == names
     numbers = np.concatenate([features(log)[0] for log in logs])
     np.testing.assert_array_equal(numbers, np.delete(np.arange(1801), 600))

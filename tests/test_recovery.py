@@ -13,9 +13,8 @@ from logs import features
 
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
-from hearthlog.recorder.recovery import recover_active
+from hearthlog.recorder.recovery import end_of_sound, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.writer import LogWriter
@@ -32,9 +31,7 @@ def log(tmp_path_factory, day, model_file):
 
     folder = tmp_path_factory.mktemp("whole")
     settings = load_settings(None, {"output": folder, "model": model_file}, {})
-    (path,) = record_files(
-        settings, settings.microphone[0], FileSource([day], 10**18), Event()
-    ).logs
+    (path,) = record_files(settings, FileSource([day], 10**18), Event()).logs
     return path
 
 
@@ -56,7 +53,8 @@ def test_a_log_cut_anywhere_is_completed_with_all_that_is_whole(log, tmp_path, s
     kept = content(active_path(path))
     (recovered,) = recover_active(tmp_path, "home")
     assert recovered.path == path
-    assert recovered.end == features(path)[1][-1] + FRAME_NANOSECONDS
+    end = features(path)[1][-1] + FRAME_NANOSECONDS
+    assert end_of_sound(tmp_path, "home", "mic", 2 * 10**18) == end
     assert content(path) == kept == content(log)[: len(kept)]
     reader = LogReader(path)
     list(reader.messages())
@@ -69,11 +67,32 @@ def test_a_log_cut_anywhere_is_completed_with_all_that_is_whole(log, tmp_path, s
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("length", [0, 3, 60, 700])
+@pytest.mark.parametrize("length", [3, 60, 700])
 def test_a_log_without_a_message_is_kept_under_another_name(log, tmp_path, length):
     path = left_behind(log, tmp_path, log.read_bytes()[:length])
     assert recover_active(tmp_path, "home") == []
     assert [p.name for p in tmp_path.iterdir()] == [path.name + ".damaged"]
+
+
+def test_an_empty_file_is_deleted_and_named(log, tmp_path):
+    path = left_behind(log, tmp_path, b"")
+    (recovered,) = recover_active(tmp_path, "home")
+    assert not recovered.completed
+    assert recovered.damage == f"{active_path(path)}: was empty, and is deleted"
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_end_of_the_sound_is_that_of_the_newest_log_with_sound(log, tmp_path):
+    later = log.name.replace("T014640Z", "T024640Z")
+    assert later != log.name
+    LogWriter(tmp_path / later, topics_of("mic", ["a"], None), {}).finish()
+    (tmp_path / later.replace("T02", "T03")).write_bytes(b"no log")
+    shutil.copy(log, tmp_path)
+    end = features(log)[1][-1] + FRAME_NANOSECONDS
+    assert end_of_sound(tmp_path, "home", "mic", 2 * 10**18) == end
+    assert end_of_sound(tmp_path, "home", "hall", 2 * 10**18) == 0
+    assert end_of_sound(tmp_path, "hom", "mic", 2 * 10**18) == 0
+    assert end_of_sound(tmp_path, "home", "mic", 10**18 - 10**9) == 0  # made with a wrong clock
 
 
 @pytest.mark.parametrize("length", [0, 5, 8])
@@ -138,8 +157,9 @@ def test_a_recovery_that_only_lacked_its_last_step_is_ended(log, tmp_path):
 def test_a_log_that_was_finished_under_the_same_name_is_not_overwritten(log, tmp_path):
     path = left_behind(log, tmp_path, log.read_bytes()[:90_000])
     path.write_bytes(log.read_bytes())
-    with pytest.raises(LogError, match="of"):
-        recover_active(tmp_path, "home")
+    (recovered,) = recover_active(tmp_path, "home")
+    assert not recovered.completed
+    assert "it is left as it is" in recovered.damage
     assert path.read_bytes() == log.read_bytes()
     assert active_path(path).exists()
 

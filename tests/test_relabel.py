@@ -61,7 +61,6 @@ def recording(tmp_path_factory, sounds, model):
     settings = Settings(output=folder, model=model, max_bag_duration=60)
     record(
         settings,
-        settings.microphone[0],
         LossySource(FileSource(sounds, START), {5: 7, 90: 150}),
         Flag(),
     )
@@ -142,7 +141,7 @@ def night(tmp_path_factory):
     noise = np.random.default_rng(5).standard_normal(5 * 60 * SAMPLE_RATE) / 3000
     soundfile.write(folder / "night.wav", noise, SAMPLE_RATE)
     settings = Settings(output=folder / "logs", max_bag_duration=60)
-    record(settings, settings.microphone[0], FileSource([folder / "night.wav"], START), Flag())
+    record(settings, FileSource([folder / "night.wav"], START), Flag())
     return folder / "logs"
 
 

@@ -64,8 +64,8 @@ LOST = {5: 7, 12: 150}  # frames, before blocks of ten seconds
 def record_day(folder, day, model, **settings):
     """Record three minutes with gaps, stop, and go on two minutes later; a file a minute."""
     asked = Settings(output=folder, model=model, max_bag_duration=60, **settings)
-    record(asked, asked.microphone[0], LossySource(FileSource([day], START), LOST), Flag())
-    record(asked, asked.microphone[0], FileSource([day], START + 300 * SECOND), Flag())
+    record(asked, LossySource(FileSource([day], START), LOST), Flag())
+    record(asked, FileSource([day], START + 300 * SECOND), Flag())
     return folder
 
 
@@ -128,7 +128,7 @@ def test_with_its_model_a_recording_comes_out_again_message_for_message(
 def test_so_does_real_sound(household, model_file, tmp_path):
     files = spread_files(household, 26)
     settings = Settings(output=tmp_path / "recorded", model=model_file, max_bag_duration=60)
-    record(settings, settings.microphone[0], LossySource(FileSource(files, START), LOST), Flag())
+    record(settings, LossySource(FileSource(files, START), LOST), Flag())
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)
     assert result.seconds > 60
     assert content(tmp_path / "again") == content(tmp_path / "recorded")
@@ -163,7 +163,7 @@ def test_so_does_a_microphone_that_was_unplugged_and_a_clock_that_was_set_back(
     day, model_file, tmp_path
 ):
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, settings.microphone[0], Trouble(day), Flag())
+    record(settings, Trouble(day), Flag())
     recorded = content(tmp_path / "recorded")
     assert len(recorded) == 3
     result = replay(tmp_path / "recorded", tmp_path / "again", model_file)
@@ -247,7 +247,7 @@ def test_a_segment_that_began_long_before_the_start_is_as_recorded(day, model_fi
     sound = np.concatenate([sound, np.zeros(200 * 16_000, np.float32)])
     soundfile.write(tmp_path / "still.wav", sound, 16_000)
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, settings.microphone[0], FileSource([tmp_path / "still.wav"], START), Flag())
+    record(settings, FileSource([tmp_path / "still.wav"], START), Flag())
     result = replay(tmp_path / "recorded", tmp_path / "part", model_file, start_offset=190)
     assert read(tmp_path / "recorded", "segment")[-1:] == read(tmp_path / "part", "segment")
     assert (result.compared.segments, result.compared.identical_segments) == (1, 1)
@@ -315,7 +315,6 @@ def test_a_recording_that_was_killed_comes_out_with_the_segment_that_was_open(
     settings = Settings(output=tmp_path / "logs", model=model_file)
     record(
         settings,
-        settings.microphone[0],
         LossySource(FileSource([day], START), {}, at_end=keep),
         Flag(),
     )
@@ -492,7 +491,7 @@ def test_clips_of_a_recording_give_what_the_recording_gave(
     sound = np.stack([sound, sound[::-1]][:channels], axis=1)
     soundfile.write(tmp_path / "sound.wav", sound, rate, subtype="PCM_16")
     settings = Settings(output=tmp_path / "recorded", model=model_file)
-    record(settings, settings.microphone[0], FileSource([tmp_path / "sound.wav"], START), Flag())
+    record(settings, FileSource([tmp_path / "sound.wav"], START), Flag())
     lengths = [rate * 7, 12_345, 11, *[rate] * 30]
     clips = write_clips(tmp_path / "clips.mcap", pieces(sound, rate, lengths), rate)
     replay(clips, tmp_path / "again", model_file, kind="audio")
@@ -653,7 +652,7 @@ def test_layers_are_no_part_of_a_recording(folder, model_file, tmp_path):
 def test_logs_of_two_recorders_are_not_mixed(folder, day, hearthlog, tmp_path):
     shutil.copytree(folder, tmp_path / "recorded")
     asked = Settings(output=tmp_path / "recorded", node="flat")
-    record(asked, asked.microphone[0], FileSource([day], START), Flag())
+    record(asked, FileSource([day], START), Flag())
     result = hearthlog("replay", tmp_path / "recorded")
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()

@@ -54,9 +54,7 @@ def recorded_home(tmp_path_factory, model_file, hmm_file, day):
     """Logs of three minutes, and a second labelling of them."""
     folder = tmp_path_factory.mktemp("home") / "logs"
     options = Settings(output=folder, model=model_file, max_bag_duration=60)
-    recording = record(
-        options, options.microphone[0], LossySource(FileSource([day], START), LOST), Flag()
-    )
+    recording = record(options, LossySource(FileSource([day], START), LOST), Flag())
     assert len(recording.logs) == 4
     command = [*HEARTHLOG, "relabel", str(folder), "--model", str(hmm_file)]
     subprocess.run(command, check=True, capture_output=True)
@@ -215,9 +213,7 @@ def test_marks_of_one_of_two_homes_in_a_folder_are_beside_its_own_logs(
     options = Settings(
         output=tmp_path / "both", model=model_file, node="other", microphone=[{"name": "bath"}]
     )
-    others = record(
-        options, options.microphone[0], FileSource([day], START + 7 * SECOND), Flag()
-    ).logs
+    others = record(options, FileSource([day], START + 7 * SECOND), Flag()).logs
     timeline = read_timeline([tmp_path / "both"])
     assert sorted(timeline.microphones) == ["bath", "mic"]
     assert timeline.coverage["bath"].logs == others

@@ -93,9 +93,7 @@ def log(tmp_path_factory, day, model_file):
     settings = load_settings(
         None, {"output": tmp_path_factory.mktemp("logs"), "model": model_file}, {}
     )
-    (path,) = record_files(
-        settings, settings.microphone[0], FileSource([folder / "minute.wav"], 10**18), Event()
-    ).logs
+    (path,) = record_files(settings, FileSource([folder / "minute.wav"], 10**18), Event()).logs
     data = path.read_bytes()
     return data, structure(data)
 

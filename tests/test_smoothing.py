@@ -377,7 +377,6 @@ def folder(tmp_path_factory, day, hmm_file):
     settings = Settings(output=folder, model=hmm_file, max_bag_duration=60)
     record(
         settings,
-        settings.microphone[0],
         LossySource(FileSource([day], START), {5: 7, 12: 150}),
         Flag(),
     )

@@ -44,7 +44,7 @@ def logs(all_household, model_file, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=300)
     sounds = spread_files(all_household, 175)
-    record(settings, settings.microphone[0], FileSource(sounds, START), threading.Event())
+    record(settings, FileSource(sounds, START), threading.Event())
     assert len(find_logs(folder)) > 2
     return folder
 

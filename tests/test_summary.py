@@ -56,9 +56,7 @@ def logs(tmp_path_factory, model_file, day):
         microphone=[MicrophoneSettings(name="hall")],
         max_bag_duration=60,
     )
-    return record(
-        settings, settings.microphone[0], LossySource(FileSource([day], START), LOST), Event()
-    ).logs
+    return record(settings, LossySource(FileSource([day], START), LOST), Event()).logs
 
 
 def counted(paths):

@@ -26,6 +26,7 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.labelling_models import LabellingModels
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import RecordingSession
@@ -263,12 +264,14 @@ def ready(watch):
 def record_and_promote(folder, logs, events):
     """Record events; before the second block of frames another model is ready."""
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
-    recording = RecordingSession(Settings(output=logs), "mic", MICROPHONE, watch)
-    recording.add(events[0])
+    recording = RecordingSession(
+        Settings(output=logs), {"mic": MICROPHONE}, {"mic": LabellingModels(watch)}
+    )
+    recording.add("mic", events[0])
     promote(folder, "two")
     ready(watch)
     for event in events[1:]:
-        recording.add(event)
+        recording.add("mic", event)
     recording.finish()
     watch.close()
     return recording.summary.logs

@@ -77,9 +77,7 @@ def folder(tmp_path_factory, model_file, day):
     """Logs of one recording with gaps, and a mark that reaches from one log into the next."""
     folder = tmp_path_factory.mktemp("logs")
     settings = Settings(output=folder, model=model_file, max_bag_duration=60)
-    recording = record(
-        settings, settings.microphone[0], LossySource(FileSource([day], START), LOST), Flag()
-    )
+    recording = record(settings, LossySource(FileSource([day], START), LOST), Flag())
     assert len(recording.logs) > 2
     edge = int(features(recording.logs[1])[1][0])
     write_marks(recording.logs[0], [Mark("mic", edge - SECOND, edge, "yelling", "Ann", 5, "live")])
@@ -211,7 +209,6 @@ def test_what_is_open_when_a_log_is_cut_off_is_labelled_by_its_frames(tmp_path, 
     settings = Settings(output=tmp_path / "logs", model=model_file)
     record(
         settings,
-        settings.microphone[0],
         LossySource(FileSource([day], START), {}, copy_active),
         Flag(),
     )
@@ -249,7 +246,7 @@ def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
 
 def test_a_span_that_ends_with_a_log_has_labels_to_its_end(tmp_path, day, model_file):
     settings, hour = Settings(output=tmp_path, model=model_file), -(-START // HOUR) * HOUR
-    logs = record(settings, settings.microphone[0], FileSource([day], START), Flag()).logs
+    logs = record(settings, FileSource([day], START), Flag()).logs
     timeline = read_timeline(logs, end=hour)
     frames = timeline.microphones["mic"].labellings[0].frames
     assert hour - FRAME_NANOSECONDS <= max(part.times[-1] for part in frames) < hour
@@ -303,7 +300,7 @@ def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
     data, scenario = blobs(3, 12)
     save_model(train_model(data, scenario, ignore_progress), tmp_path / "other.safetensors")
     settings = Settings(output=tmp_path / "logs", model=tmp_path / "other.safetensors")
-    later = record(settings, settings.microphone[0], FileSource([day], START + HOUR), Flag()).logs
+    later = record(settings, FileSource([day], START + HOUR), Flag()).logs
     both = read_timeline([*later, folder]).microphones["mic"].labellings[0]
     classes = (*load_model(model_file).classes, *scenario.classes)
     assert both.probabilities.names == classes
@@ -653,7 +650,7 @@ def test_what_was_not_heard_has_a_lane_while_the_recorder_is_off_too(tmp_path, m
     for hour in (7, 9):
         settings = Settings(output=tmp_path, model=model_file)
         start = at(2026, 3, 1, hour, zone="UTC")
-        record(settings, settings.microphone[0], LossySource(FileSource([day], start), {}), Flag())
+        record(settings, LossySource(FileSource([day], start), {}), Flag())
     timeline = read_timeline([tmp_path], *(at(2026, 3, 1, hour, zone="UTC") for hour in (6, 12)))
     ends = timeline.coverage["mic"].ends
     off = [(6, 7), (ends[0], 9), (ends[1], 12)]

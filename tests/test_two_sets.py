@@ -36,7 +36,7 @@ TAKE_ANOTHER = "take a model for auros21; `hearthlog train --method room21` lear
 
 def record_run(folder, day, start, feature_set):
     settings = Settings(output=folder, feature_set=feature_set, max_bag_duration=120)
-    return record(settings, settings.microphone[0], FileSource([day], start), Event()).logs
+    return record(settings, FileSource([day], start), Event()).logs
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from pathlib import Path
 from hearthlog.analyzer.doctor.file_checks import ExaminedFile
 from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
+from hearthlog.analyzer.doctor.message_checks import ALLOWED_DELAY
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX
 from hearthlog.schemas.times import NANOSECONDS, millisecond_text
@@ -73,7 +74,8 @@ def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
         assert file.span is not None
         assert latest.span is not None
         start, end = file.span[0], min(file.span[1], latest.span[1])
-        if start < latest.span[1] and not any(a <= start and end <= b for a, b in twice):
+        delay = ALLOWED_DELAY if len(file.frames) > 1 else 0
+        if start < latest.span[1] - delay and not any(a <= start and end <= b for a, b in twice):
             what = f"begins before {latest.findings.path.name} of the same node ends"
             advice = "move the one away that does not belong here"
             file.findings.error("overlap", what, advice, time=start)

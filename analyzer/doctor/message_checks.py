@@ -29,7 +29,7 @@ from hearthlog.models.classifiers.description import read_description
 from hearthlog.models.classifiers.timing import LabelTiming, label_timing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.card import DESCRIPTION
+from hearthlog.models.modelfile.card import DESCRIPTION, attachment_of
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -40,9 +40,25 @@ from hearthlog.schemas.messages.gaps import LOG_DAMAGED
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.salvage.thin import dropped_kinds
+from hearthlog.schemas.times import NANOSECONDS
 
+# In ns, by how much the messages of one microphone may come behind those of another.
+ALLOWED_DELAY = 10 * NANOSECONDS
 _WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _LONGEST_WINDOW = 3600.0  # seconds; what claims more is no log of ours
+
+
+def allowed_delay(data: DataSection) -> int:
+    """Return by how much messages of one microphone may come behind those of another, in ns.
+
+    Parameters
+    ----------
+    data : DataSection
+        Of a log.
+    """
+    channels = data.definitions.channels.values()
+    infos = [channel for channel in channels if split_topic(channel.topic)[1] == "info"]
+    return ALLOWED_DELAY if len(infos) > 1 else 0
 
 
 class MessageChecks:
@@ -125,7 +141,7 @@ class MessageChecks:
         report = self._findings.rows
         report(
             "log-time",
-            times < before,
+            times < before - allowed_delay(self._data),
             times,
             lambda i: f"log time runs backwards by {(before[i] - times[i]) / 1e9:.3f} s",
         )
@@ -194,7 +210,7 @@ class MessageChecks:
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
         every, timing = statistics_every(self._data), None
         if info is not None and len(info["labels"]):
-            timing = _label_timing(self._data, info)
+            timing = _label_timing(self._data, microphone, info)
         thinned = _thinned_kinds(self._data)
         return FrameSequence(self._findings, microphone, every, timing, thinned)
 
@@ -248,7 +264,9 @@ def _thinned_kinds(data: DataSection) -> set[str]:
     return {kind for step in steps for kind in dropped_kinds(step)}
 
 
-def _label_timing(data: DataSection, info: Mapping[str, Any]) -> LabelTiming | None:
+def _label_timing(
+    data: DataSection, microphone: str, info: Mapping[str, Any]
+) -> LabelTiming | None:
     """Return the timing of the model in a file; None if what says it was lost.
 
     In the first version nothing says it, and labels speak of the end of a window.
@@ -257,7 +275,9 @@ def _label_timing(data: DataSection, info: Mapping[str, Any]) -> LabelTiming | N
     if DESCRIPTION not in data.attachments and all(map(describes_model, records)):
         return None
     try:
-        content = json.loads(data.attachments[DESCRIPTION][0])
+        own = attachment_of(DESCRIPTION, microphone)
+        name = own if own in data.attachments else DESCRIPTION
+        content = json.loads(data.attachments[name][0])
         named = {key: value for key, value in content.items() if key not in {"name", "sha256"}}
         description = read_description(json.dumps(named))
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError, ModelError):

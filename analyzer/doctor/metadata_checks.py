@@ -5,14 +5,14 @@ import json
 import re
 from collections import Counter
 from contextlib import suppress
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.mcap.data_section import DataSection
-from hearthlog.analyzer.doctor.message_checks import MessageChecks
+from hearthlog.analyzer.doctor.message_checks import MessageChecks, allowed_delay
 from hearthlog.analyzer.doctor.topic_types import (
     CANDIDATE_LABEL,
     LOG_NAME,
@@ -33,6 +33,7 @@ from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.messages.versions import SCHEMA_VERSION
 from hearthlog.schemas.times import NANOSECONDS
 
+_TIME = "%Y%m%dT%H%M%SZ"
 _FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
 _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
@@ -129,10 +130,12 @@ class MetadataChecks:
             start = datetime.fromtimestamp(self._data.span[0] // NANOSECONDS, UTC)
         except (OverflowError, ValueError, OSError):
             start = datetime.min.replace(tzinfo=UTC)
-        if f"{start:%Y%m%dT%H%M%SZ}" != named["time"]:
+        latest = start + timedelta(seconds=allowed_delay(self._data) / NANOSECONDS)
+        if not f"{start:{_TIME}}" <= named["time"] <= f"{latest:{_TIME}}":
             self._error("name", f"the name says {named['time']}, the first message {start:%c}")
         folders = "/".join(path.absolute().parts[-4:-1])
-        if _FOLDERS.fullmatch(folders) and folders != f"{start:%Y/%m/%d}":
+        days = {f"{start:%Y/%m/%d}", f"{latest:%Y/%m/%d}"}
+        if _FOLDERS.fullmatch(folders) and folders not in days:
             self._error("name", f"the folder says {folders}, the first message {start:%Y/%m/%d}")
 
     def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
@@ -144,7 +147,8 @@ class MetadataChecks:
             features = feature_set(str(info["feature_set"]))
             expected["window_seconds"] = features.window_seconds
             expected["feature_names"] = list(features.feature_names)
-        for record in self._data.metadata.get(METADATA, [])[:1]:
+        is_first = microphone == next(iter(self._infos))  # the record is about its model
+        for record in self._data.metadata.get(METADATA, [])[:is_first]:
             expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
         for name, value in expected.items():
             if _plain(info[name]) != value:

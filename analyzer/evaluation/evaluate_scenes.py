@@ -35,6 +35,7 @@ from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.labelling_models import LabellingModels
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -305,10 +306,11 @@ class _Recorder:
             settings = load_settings(None, asked, {})
             source = FileSource([sound], _START, progress=report)
             microphone = settings.microphone[0].name
-            recording = RecordingSession(settings, microphone, source, self._watch)
+            models = {microphone: LabellingModels(self._watch)}
+            recording = RecordingSession(settings, {microphone: source}, models)
             try:
                 for event in source.events(Flag()):
-                    recording.add(event)
+                    recording.add(microphone, event)
             finally:
                 recording.finish()
             found = read_labelling(logs).labelling

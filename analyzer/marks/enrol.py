@@ -130,7 +130,7 @@ def enrol_microphone(
         If the log cannot be written.
     """
     _check_label(label)
-    with closing(MicrophoneSource(device)) as source:
+    with closing(MicrophoneSource(device, waits=False)) as source:
         listening()
         stop = threading.Event()
         timer = threading.Timer(seconds + _PATIENCE, stop.set)
@@ -217,7 +217,7 @@ def _enrol(
             "max_bag_duration": 86_400,
         } | _feature_set(home)
         settings = load_settings(None, options, microphone.model_dump())
-        logs = record(settings, microphone, _First(source, seconds), stop).logs
+        logs = record(settings, _First(source, seconds), stop).logs
         frames = {log: _frames([log], microphone.name) for log in logs}
         _check_sound(label, np.concatenate([np.empty(0), *(e for _, e in frames.values())]))
         enrolled = []

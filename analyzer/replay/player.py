@@ -15,7 +15,8 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.log import LogDescription, RollingLog
+from hearthlog.recorder.log import RollingLog
+from hearthlog.recorder.log_description import LogDescription
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.statistics import LOGGED_EVERY
 from hearthlog.recorder.stream_messages import EncodedMessage

@@ -15,6 +15,20 @@ DESCRIPTION = "model.json"
 _FEW = 12  # sources
 
 
+def attachment_of(name: str, microphone: str) -> str:
+    """Name an attachment about the model of one microphone, where others have another model.
+
+    Parameters
+    ----------
+    name : str
+        `CARD` or `DESCRIPTION`.
+    microphone : str
+        Its name.
+    """
+    stem, suffix = name.rsplit(".", 1)
+    return f"{stem}.{microphone}.{suffix}"
+
+
 def model_attachments(model: Model) -> list[Attachment]:
     """Return the attachments of a log with labels of a model: its card and its description.
 

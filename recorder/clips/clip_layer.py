@@ -43,18 +43,21 @@ class ClipWriter:
     Parameters
     ----------
     settings : Settings
-    microphone : str
-        Its name.
+    microphones : sequence of str
+        Their names.
     file_at : callable
         Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
         log; see `RollingLog.file_at`.
     """
 
     def __init__(
-        self, settings: Settings, microphone: str, file_at: Callable[[int], tuple[Path, int]]
+        self,
+        settings: Settings,
+        microphones: Sequence[str],
+        file_at: Callable[[int], tuple[Path, int]],
     ) -> None:
         self._settings = settings
-        self._topic = audio_topic(microphone)
+        self._topics = {name: audio_topic(name) for name in microphones}
         self._file_at = file_at
         self._zone = time_zone(settings.timezone)
         self._log: Path | None = None
@@ -65,11 +68,13 @@ class ClipWriter:
         self._day = range(0)
         self._used = 0  # frames kept of the day
 
-    def write(self, sounds: Sequence[KeptSound]) -> list[Notice]:
+    def write(self, microphone: str, sounds: Sequence[KeptSound]) -> list[Notice]:
         """Append sound to the layers of the logs that contain its time.
 
         Parameters
         ----------
+        microphone : str
+            Whose sound it is.
         sounds : sequence of KeptSound
             In the order of time.
 
@@ -86,7 +91,7 @@ class ClipWriter:
                 split = int(sound.stamps.searchsorted(until))
                 last = min(max(split, first + 1), first + _MESSAGE_FRAMES)
                 part = KeptSound(sound.stamps[first:last], sound.samples[first:last])
-                notices += self._write(log, part)
+                notices += self._write(log, microphone, part)
                 first = last
         return notices
 
@@ -129,14 +134,14 @@ class ClipWriter:
             return self._report(f"their layer cannot be completed ({error.strerror or error})")
         return []
 
-    def _write(self, log: Path, sound: KeptSound) -> list[Notice]:
+    def _write(self, log: Path, microphone: str, sound: KeptSound) -> list[Notice]:
         notices = []
         if log != self._log:
             notices = self.finish()
             self._log, self._broken = log, ""
         reason = self._broken or self._full(int(sound.stamps[0]), len(sound.stamps))
         if not reason:
-            reason = self._broken = self._append(log, sound)
+            reason = self._broken = self._append(log, self._topics[microphone].name, sound)
         return [*notices, *self._report(reason)]
 
     def _report(self, reason: str) -> list[Notice]:
@@ -149,7 +154,7 @@ class ClipWriter:
         # What the configuration asks for is no trouble.
         return [Notice(OK if reason.endswith(_ALL_KEPT) else WARNING, f"no clips: {reason}")]
 
-    def _append(self, log: Path, sound: KeptSound) -> str:
+    def _append(self, log: Path, topic: str, sound: KeptSound) -> str:
         """Write one message; return why that failed, or an empty text."""
         start = int(sound.stamps[0])
         data = encode(
@@ -164,8 +169,10 @@ class ClipWriter:
         )
         try:
             if self._writer is None:
-                self._writer = LogWriter(audio_path(log), [self._topic], self._metadata(log))
-            self._writer.write(self._topic.name, start, data)
+                self._writer = LogWriter(
+                    audio_path(log), list(self._topics.values()), self._metadata(log)
+                )
+            self._writer.write(topic, start, data)
             self._writer.flush()
         except (OSError, LogError) as error:
             if self._writer is not None:

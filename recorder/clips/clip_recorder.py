@@ -16,13 +16,13 @@ from hearthlog.schemas.times import NANOSECONDS
 
 
 class ClipRecorder:
-    """Keeps the clips of one recording, if that is configured, and always deletes old ones.
+    """Keeps the clips of a recording, if that is configured, and always deletes old ones.
 
     Parameters
     ----------
     settings : Settings
-    pipeline : Pipeline
-        Of the microphone whose sound it is.
+    pipelines : sequence of Pipeline
+        Of the microphones whose sound it is.
     file_at : callable
         Told a time in nanoseconds of UTC; returns the log that contains it, and the end of that
         log; see `RollingLog.file_at`.
@@ -30,47 +30,48 @@ class ClipRecorder:
     Raises
     ------
     ConfigurationError
-        If sound is to be kept and the model cannot tell what must not be.
+        If sound is to be kept and a model cannot tell what must not be.
     """
 
     def __init__(
         self,
         settings: Settings,
-        pipeline: Pipeline,
+        pipelines: Sequence[Pipeline],
         file_at: Callable[[int], tuple[Path, int]],
     ) -> None:
-        self._keep = settings.keep_audio
-        self._never = settings.never_keep
         self._retention = ClipRetention(
             settings.output, settings.node, settings.clip_retention_days
         )
-        frames = round(settings.clip_pre_roll_seconds * NANOSECONDS / FRAME_NANOSECONDS)
-        self._finder = ClipFinder(
-            self._keep, self._never, frames, pipeline.feature_set.window_frames
-        )
-        self._writer = ClipWriter(settings, pipeline.microphone, file_at)
-        self._classes: Sequence[str] | None = pipeline.classes
-        self._refused = self._refusal()  # why no sound may be kept, or empty
-        if self._refused:
-            raise ConfigurationError(self._refused)
+        names = [pipeline.microphone for pipeline in pipelines]
+        self._writer = ClipWriter(settings, names, file_at)
+        self._microphones = {
+            pipeline.microphone: _MicrophoneClips(settings, pipeline, self._writer)
+            for pipeline in pipelines
+        }
 
-    def before(self, event: Event) -> list[Notice]:
+    def before(self, microphone: str, event: Event) -> list[Notice]:
         """Prepare for an event that is about to be logged: a gap ends the sound before it.
+
+        Parameters
+        ----------
+        microphone : str
+            Whose event it is.
+        event : Event
 
         Returns
         -------
         list of Notice
             What people should know: sound that cannot be kept, or is kept again.
         """
-        if isinstance(event, Gap) and not self._refused:
-            return self._writer.write(self._finder.close())
-        return []
+        return self._microphones[microphone].close() if isinstance(event, Gap) else []
 
-    def after(self, event: Event, labels: FrameLabels | None) -> list[Notice]:
+    def after(self, microphone: str, event: Event, labels: FrameLabels | None) -> list[Notice]:
         """Keep the sound of an event that was logged, and delete what is old.
 
         Parameters
         ----------
+        microphone : str
+            Whose event it is.
         event : Event
         labels : FrameLabels or None
             Of its last frames, if they are labelled.
@@ -81,15 +82,9 @@ class ClipRecorder:
             What people should know: sound that cannot be kept or deleted, and what was deleted.
         """
         now = event_time(event)
-        notices = self._retention.tick(now)
-        if self._keep == "off":
-            return notices
-        notices += self._writer.tick(now)
+        notices = [*self._retention.tick(now), *self._writer.tick(now)]
         if isinstance(event, Frames):
-            if labels is not None and labels.classes != self._classes:
-                notices += self._change_classes(labels.classes)
-            if not self._refused:
-                notices += self._writer.write(self._finder.push(event, labels))
+            notices += self._microphones[microphone].push(event, labels)
         return notices
 
     def finish(self) -> list[Notice]:
@@ -100,8 +95,43 @@ class ClipRecorder:
         list of Notice
             What people should know: sound that cannot be kept, or is kept again.
         """
-        notices = [] if self._refused else self._writer.write(self._finder.close())
+        notices = [notice for each in self._microphones.values() for notice in each.close()]
         return [*notices, *self._writer.finish()]
+
+
+class _MicrophoneClips:
+    """Chooses the clips of one microphone."""
+
+    def __init__(self, settings: Settings, pipeline: Pipeline, writer: ClipWriter) -> None:
+        self._keep = settings.keep_audio
+        self._never = settings.never_keep
+        self._microphone = pipeline.microphone
+        self._writer = writer
+        frames = round(settings.clip_pre_roll_seconds * NANOSECONDS / FRAME_NANOSECONDS)
+        self._finder = ClipFinder(
+            self._keep, self._never, frames, pipeline.feature_set.window_frames
+        )
+        self._classes: Sequence[str] | None = pipeline.classes
+        self._refused = self._refusal()  # why no sound may be kept, or empty
+        if self._refused:
+            raise ConfigurationError(self._refused)
+
+    def close(self) -> list[Notice]:
+        """Write the sound that is held back."""
+        if self._refused or self._keep == "off":
+            return []
+        return self._writer.write(self._microphone, self._finder.close())
+
+    def push(self, frames: Frames, labels: FrameLabels | None) -> list[Notice]:
+        """Write the sound of frames that is to be kept."""
+        if self._keep == "off":
+            return []
+        notices = []
+        if labels is not None and labels.classes != self._classes:
+            notices = self._change_classes(labels.classes)
+        if not self._refused:
+            notices += self._writer.write(self._microphone, self._finder.push(frames, labels))
+        return notices
 
     def _change_classes(self, classes: Sequence[str]) -> list[Notice]:
         """Go on with another model, unless it cannot tell what is never kept."""
@@ -111,7 +141,7 @@ class ClipRecorder:
             return []
         if not self._refused:
             return [CLIPS_AGAIN]
-        notices = self._writer.write(self._finder.close())
+        notices = self._writer.write(self._microphone, self._finder.close())
         return [*notices, Notice(WARNING, f"no clips: {self._refused}")]
 
     def _refusal(self) -> str:

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any
 
-from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.devices import Device, find_device, list_devices, load_portaudio
 
 # index of the first sample, samples, flags of PortAudio, time of the first sample by the ADC
@@ -40,10 +40,12 @@ class CaptureFormat:
 
 
 def main() -> None:
-    """Capture from the device named by the argument, until killed or without a parent.
+    """Capture from the device named by the first argument, until killed or without a parent.
 
-    Without an argument, list the devices.
+    Without an argument, list the devices. A second argument: take no other device whose name
+    contains this one.
     """
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # the sound libraries print as they like
@@ -53,9 +55,11 @@ def main() -> None:
         if len(sys.argv) == 1:
             output.write(json.dumps([asdict(device) for device in devices]).encode())
         else:
-            _capture(sounddevice, find_device(devices, sys.argv[1]), output)
+            device = find_device(devices, sys.argv[1], exact=len(sys.argv) > 2)
+            _capture(sounddevice, device, output)
     except SourceError as error:
-        output.write(json.dumps({"error": str(error)}).encode() + b"\n")
+        answer = {"error": str(error), "device": isinstance(error, DeviceError)}
+        output.write(json.dumps(answer).encode() + b"\n")
     except BrokenPipeError:
         pass
     # A stream of a device that is gone never closes.
@@ -111,7 +115,7 @@ def _open(sounddevice: ModuleType, device: Device, callback: Any) -> tuple[Any, 
                 reason = str(error)
             else:
                 return stream, rate, channels
-    raise SourceError(f"microphone {device.name!r} cannot be opened ({reason})")
+    raise DeviceError(f"microphone {device.name!r} cannot be opened ({reason})")
 
 
 def _first_channel(samples: bytes, channels: int) -> bytes:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
-from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.errors import DeviceError, SourceError
 
 _CARD_NUMBER = re.compile(r" ?\((hw|plughw):\d+,\d+\)$")
 
@@ -80,7 +80,7 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
     return numbered
 
 
-def find_device(devices: list[Device], name: str) -> Device:
+def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Device:
     """Choose a microphone by its name.
 
     Parameters
@@ -90,24 +90,27 @@ def find_device(devices: list[Device], name: str) -> Device:
     name : str
         A name or a part of one, in which capitals make no difference; empty for the default
         microphone.
+    exact : bool, optional
+        Whether only a whole name will do.
 
     Raises
     ------
-    SourceError
+    DeviceError
         If there is no microphone, or none or several match; then the message lists all of them.
     """
     if not devices:
-        raise SourceError("no microphone found: connect one and check `hearthlog devices`")
+        raise DeviceError("no microphone found: connect one and check `hearthlog devices`")
     if not name:
         defaults = [device for device in devices if device.is_default]
         return (defaults or devices)[0]
-    exact = [device for device in devices if device.name == name]
-    matching = exact or [device for device in devices if name.lower() in device.name.lower()]
+    matching = [device for device in devices if device.name == name]
+    if not matching and not exact:
+        matching = [device for device in devices if name.lower() in device.name.lower()]
     if len(matching) == 1:
         return matching[0]
     listed = ", ".join(repr(device.name) for device in devices)
     what = "no microphone" if not matching else "more than one microphone"
-    raise SourceError(f"{what} is called {name!r}; there are {listed}")
+    raise DeviceError(f"{what} is called {name!r}; there are {listed}")
 
 
 def _device(info: dict[str, Any], *, is_default: bool) -> Device:

@@ -8,7 +8,7 @@ from threading import Event as Flag
 
 import numpy as np
 
-from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import CaptureProcess
@@ -26,30 +26,40 @@ _STEP_SECONDS = 0.25
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
+    The device that is heard first is the only one that is ever heard.
+
     Parameters
     ----------
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
+    waits : bool, optional
+        Whether a device that is not there at the start is waited for, as it is later.
 
     Attributes
     ----------
     device : str
-        Name of the microphone that was opened first.
+        Name of the device that is heard, or was last; before that, as given.
 
     Raises
     ------
     SourceError
-        If the microphone cannot be opened at the start; later it is waited for.
+        If no microphone can be captured on this machine, or this one not, unless it is waited for.
     """
 
-    def __init__(self, device: str) -> None:
-        self._device_option = device
-        self._capture: CaptureProcess | None = CaptureProcess(device)
-        self.device = self._capture.format.device
+    def __init__(self, device: str, *, waits: bool = True) -> None:
+        self.device = device
+        self._heard = False  # whether `device` is the name of a device, and not a part of one
+        self._capture: CaptureProcess | None = None
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
         self._health = (OK, "starting")
+        try:
+            self._open()
+        except DeviceError as error:
+            if not waits:
+                raise
+            self._health = (ERROR, f"{error}; waiting for it")
         self._last_health = self._health
         self._reported = -math.inf
         self._wall_offset = _wall_offset()
@@ -107,12 +117,16 @@ class MicrophoneSource:
                 yield from self._report(self._framer.last_stamp)
         return "the recorder was stopped"
 
+    def _open(self) -> None:
+        self._capture = CaptureProcess(self.device, exact=self._heard)
+        self.device, self._heard = self._capture.format.device, True
+
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         for pause in itertools.chain(_RETRY_SECONDS, itertools.repeat(_RETRY_SECONDS[-1])):
             try:
-                self._capture = CaptureProcess(self._device_option)
+                self._open()
             except SourceError as error:
-                self._health = (ERROR, str(error))
+                self._health = (ERROR, f"{error}; waiting for it")
             else:
                 return
             yield from self._report(self._now())

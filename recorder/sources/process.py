@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from hearthlog.recorder.errors import SourceError
+from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
 from hearthlog.recorder.sources.devices import Device
@@ -56,6 +56,8 @@ class CaptureProcess:
     ----------
     device : str
         As `hearthlog devices` lists it, or empty for the default one.
+    exact : bool, optional
+        Whether no other device will do whose name contains this one.
 
     Attributes
     ----------
@@ -63,14 +65,16 @@ class CaptureProcess:
 
     Raises
     ------
+    DeviceError
+        If the device is not there or cannot be opened, in the words of the capture process; or if
+        PortAudio hangs or crashes.
     SourceError
-        If the device cannot be opened, in the words of the capture process; or if PortAudio hangs
-        or crashes.
+        If PortAudio is missing or cannot start.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, *, exact: bool = False) -> None:
         self._process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, device],
+            [*_CAPTURE, device, *(["exact"] if exact else [])],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
             bufsize=0,
@@ -126,15 +130,15 @@ class CaptureProcess:
         deadline = time.monotonic() + _START_SECONDS
         while b"\n" not in self._held:
             if not self._wait(deadline - time.monotonic()):
-                raise SourceError(_HANGS)
+                raise DeviceError(_HANGS)
             data = self._read()
             if not data:
-                raise SourceError(_CRASHES)
+                raise DeviceError(_CRASHES)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)
         if "error" in answer:
-            raise SourceError(answer["error"])
+            raise (DeviceError if answer["device"] else SourceError)(answer["error"])
         return CaptureFormat(**answer)
 
     def _wait(self, timeout: float) -> bool:

@@ -1,5 +1,6 @@
 """Write a log: MCAP of profile `ros2`, under another name until it is complete."""
 
+import errno
 import fcntl
 import os
 from collections.abc import Mapping, Sequence
@@ -55,11 +56,18 @@ class LogWriter:
     ) -> None:
         self.path = path
         self.active_path = active_path(path)
+        self._synced = 0  # bytes
         self._stream = _create(path, self.active_path)
-        self._content = LogStreamWriter(self._stream, topics)
-        self._content.add_metadata(METADATA, metadata)
-        for attachment in attachments:
-            self._content.add_attachment(attachment, created)
+        self._status = os.fstat(self._stream.fileno())
+        try:
+            self._content = LogStreamWriter(self._stream, topics)
+            self._content.add_metadata(METADATA, metadata)
+            for attachment in attachments:
+                self._content.add_attachment(attachment, created)
+        except OSError:
+            self.abandon()
+            self.discard_unsynced()
+            raise
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         """Append one encoded message.
@@ -114,9 +122,12 @@ class LogWriter:
         Raises
         ------
         OSError
-            If the file cannot be written.
+            If the file cannot be written, or has been deleted.
         """
         os.fsync(self._stream.fileno())
+        if not self._has_its_name():
+            raise FileNotFoundError(errno.ENOENT, "the file was deleted or moved away")
+        self._synced = os.fstat(self._stream.fileno()).st_size
 
     def complete(self) -> None:
         """Complete the log under its active name.
@@ -148,6 +159,27 @@ class LogWriter:
         """Stop writing and leave the active file as it is, after the disk refused it."""
         with suppress(OSError):  # it is the reason for being here
             self._stream.close()
+
+    def discard_unsynced(self) -> None:
+        """Cut the abandoned file to what is known to be on the disk, or delete it if nothing is.
+
+        Raises
+        ------
+        OSError
+            If the disk refuses that too.
+        """
+        if not self._has_its_name():
+            return
+        if self._synced:
+            os.truncate(self.active_path, self._synced)
+        else:
+            self.active_path.unlink()
+
+    def _has_its_name(self) -> bool:
+        try:
+            return os.path.samestat(self._status, self.active_path.stat())
+        except FileNotFoundError:
+            return False
 
 
 def _create(path: Path, active: Path) -> BinaryIO:

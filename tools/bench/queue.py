@@ -234,7 +234,7 @@ def recorded(folder: Path, conditions: Conditions, room: Room, seed: int) -> Rec
     wav = folder / "scene.wav"
     soundfile.write(wav, scene.samples, SAMPLE_RATE, "PCM_16")
     settings = Settings(output=folder / "logs", model=conditions.model, timezone="UTC")
-    record(settings, settings.microphone[0], FileSource([wav], _START), Flag())
+    record(settings, FileSource([wav], _START), Flag())
     times = np.array([span[:2] for span in scene.truth])
     starts, ends = _START + np.rint(times * NANOSECONDS).astype(np.int64).T
     labels = [_SCENARIO.find(span.label) or UNKNOWN for span in scene.truth]

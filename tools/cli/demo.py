@@ -50,7 +50,7 @@ def demo(
     settings = load_settings(None, {"output": logs, "model": Path(GENERAL)}, {})
     start = start_time(_START, day)
     began = time.perf_counter()
-    record_files(settings, settings.microphone[0], FileSource([day], start), Flag())
+    record_files(settings, FileSource([day], start), Flag())
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
     right, of_known = _agreement(logs, start, truth.spans, model)

@@ -3,7 +3,6 @@
 import signal
 import sys
 from pathlib import Path
-from queue import SimpleQueue
 from threading import Event as Flag
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +19,7 @@ from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.recorder.config import Settings
+    from hearthlog.recorder.model_watch import ReloadRequests
     from hearthlog.recorder.recording import RecordingSummary
 
 
@@ -84,7 +84,7 @@ def record(
     left by an earlier recorder was damaged, or a new model was refused.
     """
     from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.recording import record_files, record_microphone
+    from hearthlog.recorder.recording import record_files, record_microphones
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.tools.cli.progress import share_done
 
@@ -101,22 +101,23 @@ def record(
     }
     settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
     settings = _with_model(settings)
-    (microphone,) = settings.microphone
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda *_: stop.set())
     reload_requests = _look_at_hangup(stop)
     if files:
+        if len(settings.microphone) > 1:
+            wrong_use("files take the place of one microphone; the configuration has several")
         begin = start_time(start, files[0])
         with share_done("recording") as progress:
             source = FileSource(files, begin, realtime=realtime, progress=progress)
-            recording = record_files(settings, microphone, source, stop, reload_requests)
+            recording = record_files(settings, source, stop, reload_requests)
     elif start is not None or realtime:
         wrong_use("--start and --realtime go with files")
     else:
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")
-        recording = record_microphone(settings, microphone, stop, reload_requests)
+        recording = record_microphones(settings, stop, reload_requests)
     _say(recording)
 
 
@@ -151,16 +152,18 @@ def _say(recording: "RecordingSummary") -> None:
         raise typer.Exit(3)
 
 
-def _look_at_hangup(stop: Flag) -> SimpleQueue[None]:
+def _look_at_hangup(stop: Flag) -> "ReloadRequests":
     """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
-    reload_requests: SimpleQueue[None] = SimpleQueue()
+    from hearthlog.recorder.model_watch import ReloadRequests
+
+    reload_requests = ReloadRequests()
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it
     at_terminal = sys.stderr.isatty() and not ignored
 
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
-        reload_requests.put(None)
+        reload_requests.ask()
 
     signal.signal(signal.SIGHUP, handle)
     return reload_requests
