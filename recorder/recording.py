@@ -40,6 +40,8 @@ from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.stream_messages import EncodedMessage
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
+_NOT_RUNNING = "the recorder was not running"
+
 
 @dataclass
 class RecordingSummary:
@@ -48,7 +50,7 @@ class RecordingSummary:
     logs: list[Path]  # finished ones
     recovered: Sequence[Recovered] = ()  # logs of an earlier recorder, completed first
     frames_lost: int = 0
-    gaps: int = 0
+    gaps: int = 0  # while it was running
     models_refused: int = 0  # files that could not be used
 
 
@@ -148,7 +150,7 @@ class _Resumed:
                 now = int(event.stamps[0])
                 if start < now:
                     lost = round((now - start) / FRAME_NANOSECONDS)
-                    yield Gap(start, now, "the recorder was not running", lost)
+                    yield Gap(start, now, _NOT_RUNNING, lost)
             yield event
 
 
@@ -299,7 +301,7 @@ class RecordingSession:
             self._log.write(stream.pipeline.report("disk", self._now, notice))
 
     def _record(self, stream: MicrophoneStream, event: Event) -> None:
-        if isinstance(event, Gap):
+        if isinstance(event, Gap) and event.reason != _NOT_RUNNING:
             self.summary.gaps += 1
             self.summary.frames_lost += event.frames_lost
         if isinstance(event, Frames):

@@ -179,6 +179,19 @@ def test_a_recorder_that_is_killed_loses_a_second_and_the_next_start_says_so(lab
     assert nanoseconds(gap.header.stamp) + nanoseconds(gap.duration) == later[0]
 
 
+def test_the_time_between_two_recordings_is_a_gap_and_no_failure(labmic, tmp_path):
+    logs = tmp_path / "logs"
+    for _ in range(2):
+        with recording(labmic, logs) as process:
+            wait_for_frames(logs, 20 if not logs.exists() else len(features(logs)[0]) + 20)
+        assert process.returncode == 0, process.errors
+    first, second = sorted(logs.rglob("*.mcap"))
+    (gap,) = read(second, "gap")
+    assert gap.reason == "the recorder was not running"
+    assert nanoseconds(gap.header.stamp) == features(first)[1][-1] + FRAME
+    assert not [line for one in examine(logs) for line in one.shown if line.level == "error"]
+
+
 def test_a_microphone_at_another_rate_is_resampled(labmic, tmp_path):
     time_axis = np.arange(48_000 * 2) / 48_000
     tone = (8000 * np.sin(2 * np.pi * 1000 * time_axis)).astype(np.int16)
