@@ -4,7 +4,14 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
 from pydantic_settings import (
     BaseSettings,
@@ -28,6 +35,7 @@ from hearthlog.schemas.storage.small_file import read_toml
 
 Keep = Literal["off", "events", "unsure", "always"]  # which sound is kept as clips
 NO_MODEL = Path("none")  # in place of a model file: there are no labels
+_LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
 _PREFIX = "HEARTHLOG_"
 
 
@@ -80,6 +88,7 @@ class Settings(BaseSettings):
     model: Path | None = None
     feature_set: str = ""  # empty: that of the model, or the default one
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds a file
+    max_bag_size: Size = 0  # bytes a file; 0: any
     flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
     sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut
     statistics_every: int = Field(default=LOGGED_EVERY, ge=1)  # frames
@@ -110,6 +119,13 @@ class Settings(BaseSettings):
             self.drop_statistics_days, self.drop_features_days, self.labels_only_days
         )
         return KeepingRules(str(self.output), self.node, limits, thinning)
+
+    @field_validator("max_bag_size")
+    @classmethod
+    def _check_bag_size(cls, size: int) -> int:
+        if 0 < size < _LEAST_BAG_SIZE:
+            raise ValueError("at least 1M, which is some minutes; or 0, for any size")
+        return size
 
     @classmethod
     def settings_customise_sources(

@@ -37,6 +37,8 @@ class RollingLog:
         A power cut loses at most this much sound.
     live : bool, optional
         Whether a file whose name is taken gets another one, as where the clock was set back.
+    file_bytes : int
+        Another file begins where one has grown so large; 0 for any size.
     finisher : LogFinisher or None
         Gives complete files their names; by default they get them at once.
 
@@ -56,6 +58,7 @@ class RollingLog:
         sync_seconds: float,
         *,
         live: bool = False,
+        file_bytes: int = 0,
         finisher: LogFinisher | None = None,
     ) -> None:
         self.finished: list[Path] = []
@@ -63,6 +66,7 @@ class RollingLog:
         self._given = 0  # messages that were appended, those that open a file not counted
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
+        self._file_bytes = file_bytes
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
         self._sync_seconds = sync_seconds - _DELAY_SECONDS
         self._name = free_log_path if live else log_path
@@ -113,6 +117,8 @@ class RollingLog:
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
             self._flush_at = None
+            if self._file_bytes and self._writer.size >= self._file_bytes:
+                self._until = 0
 
     def sync(self) -> None:
         """Wait until what was written is on the disk.

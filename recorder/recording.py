@@ -265,6 +265,7 @@ class RecordingSession:
             settings.flush_seconds,
             settings.sync_seconds,
             live=is_live,
+            file_bytes=settings.max_bag_size,
             finisher=self._finisher,
         )
         self._log = LiveLog(log, settings.output, settings.node) if is_live else log

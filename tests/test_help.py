@@ -118,7 +118,10 @@ def completed(*words):
         (("hearthlog", "evaluate", ""), [*_WAYS]),
         (("hearthlog", "evaluate", "--model", "m", "--he"), ["--help"]),
         (("hearthlog", "evaluate", "search", "--fo"), ["--folds"]),
-        (("hearthlog", "record", "--max-bag"), ["--max-bag-duration", "--max-bag-files"]),
+        (
+            ("hearthlog", "record", "--max-bag"),
+            ["--max-bag-duration", "--max-bag-files", "--max-bag-size"],
+        ),
         (("hearthlog", "cat", "--format", ""), ["text", "ndjson", "csv"]),
     ],
 )

@@ -138,3 +138,20 @@ def test_every_file_says_in_words_what_is_recorded(description):
         assert first.log_time == nanoseconds(said.stamp) == features(path)[1][0]
         assert (said.level, said.name) == (said.INFO, "hearthlog.mic")
         assert said.msg == "recording test: no model, no labels"
+
+
+def test_another_file_begins_where_one_has_grown_large(description, tmp_path):
+    log = RollingLog(description, 3600, 1.0, 5.0, file_bytes=60_000)
+    for first in range(0, 2000, 10):
+        log.write(records(first, 10, START + first * FRAME_NANOSECONDS))
+    log.finish()
+    assert len(log.finished) > 3
+    sizes = [path.stat().st_size for path in log.finished[:-1]]
+    assert 60_000 < min(sizes) < max(sizes) < 90_000  # with their indexes
+    np.testing.assert_array_equal(features(tmp_path)[0], np.arange(2000))
+
+
+def test_files_are_not_so_small_that_two_begin_in_a_second(tmp_path, hearthlog):
+    result = hearthlog("record", "-o", tmp_path, "--max-bag-size", "900k")
+    assert (result.returncode, len(result.stderr.splitlines())) == (1, 1)
+    assert "max_bag_size: at least 1M" in result.stderr

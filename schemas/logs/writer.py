@@ -69,6 +69,11 @@ class LogWriter:
             self.discard_unsynced()
             raise
 
+    @property
+    def size(self) -> int:
+        """Bytes that were flushed."""
+        return self._stream.tell()
+
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         """Append one encoded message.
 

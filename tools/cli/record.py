@@ -64,6 +64,10 @@ def record(
         int | None,
         typer.Option("--max-bag-duration", "-d", help="Seconds a file.", show_default="3600"),
     ] = None,
+    max_bag_size: Annotated[
+        str | None,
+        typer.Option("--max-bag-size", "-b", help="Bytes a file, such as 10M.", show_default="any"),
+    ] = None,
     retention_days: RetentionDays = None,
     max_bag_files: MaxBagFiles = None,
     max_record_size: MaxRecordSize = None,
@@ -93,6 +97,7 @@ def record(
         "model": model,
         "node": node,
         "max_bag_duration": max_bag_duration,
+        "max_bag_size": max_bag_size,
         "retention_days": retention_days,
         "max_bag_files": max_bag_files,
         "max_record_size": max_record_size,
