@@ -1,9 +1,10 @@
 """A timeline that goes on: a server that viewers connect to, and leave, as they like."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import UTC, tzinfo
 from typing import Self
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -31,10 +32,12 @@ from hearthlog.analyzer.review.viewer.layout import (
     tabs,
 )
 from hearthlog.analyzer.review.viewer.process import free_port
+from hearthlog.schemas.times import NANOSECONDS
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told
 _APPLICATION = "hearthlog_watch"  # of its own: viewers keep the layout of each
-_MEMORY = "200MB"
+_MEMORY = "20MB"
+_TOGETHER = 4 * NANOSECONDS  # at least, of a plot: each message costs a viewer kilobytes for ever
 _MOST_STROKES = 1_200  # of a band on the screen
 _STATES = "lanes"  # entity of all lanes
 _HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
@@ -46,6 +49,8 @@ Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names 
 class LiveServer:
     """Draws updates for all viewers that connect, and keeps the last of them for later ones.
 
+    Lanes and lines are drawn at once, plots every few seconds.
+
     Parameters
     ----------
     port : int
@@ -55,7 +60,7 @@ class LiveServer:
     minutes : float
         Length of the time axes, which end with the newest data.
     memory : str, optional
-        How much is kept for viewers that come later, as `200MB`; then the oldest is dropped.
+        How much is kept for viewers that come later, as `20MB`; then the oldest is dropped.
 
     Attributes
     ----------
@@ -80,6 +85,7 @@ class LiveServer:
         self._minutes = minutes
         self._strokes = max(1, round(_MOST_STROKES / (60 * minutes)))
         self._plots: Plots = {}
+        self._waiting: dict[str, list[Plot]] = {}  # by entity: what is too short to be sent yet
         self._lanes: dict[str, dict[str, Colour]] = {}
         self._is_laid_out = True  # there is nothing to lay out
 
@@ -147,7 +153,16 @@ class LiveServer:
             same.append(plot._replace(times=plot.times[:0], values=plot.values[:0]))
             configure_plot(plot, entity, canvas)
             self._is_laid_out = False
-        add_to_plot(plot, entity, canvas, self._strokes)
+        waiting = [*self._waiting.pop(entity, []), plot]
+        if is_new or abs(int(plot.times[-1] - waiting[0].times[0])) >= _TOGETHER:
+            add_to_plot(_joined(waiting), entity, canvas, self._strokes)
+        else:
+            self._waiting[entity] = waiting
+
+
+def _joined(parts: Sequence[Plot]) -> Plot:
+    times = np.concatenate([part.times for part in parts])
+    return parts[0]._replace(times=times, values=np.concatenate([part.values for part in parts]))
 
 
 def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
