@@ -486,6 +486,7 @@ DATA = {
     "another model": (metadata("hearthlog", model_sha256="0"), {"info"}),
     "no configuration": (drop_attachment("configuration.json"), {"attachments"}),
     "no model card": (drop_attachment("model_card.md"), {"attachments"}),
+    "no description of the model": (drop_attachment("model.json"), {"attachments"}),
     "two models": (twice(lambda log: attachment(log, "model.json")), {"attachments"}),
     "two model cards": (twice(lambda log: attachment(log, "model_card.md")), {"attachments"}),
     "no rosbag2": (lambda log: log.drop(log.metadata("rosbag2")), {"rosbag2"}),

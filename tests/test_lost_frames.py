@@ -11,7 +11,7 @@ from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
 from mcap.opcode import Opcode
-from rewriting import HEAD, split
+from rewriting import HEAD, Chunked, Log, split
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
@@ -175,6 +175,13 @@ def test_a_gap_stands_where_its_log_time_belongs_and_comes_in_the_topics_own_cha
     ]
 
 
+def test_only_behind_a_gap_that_says_so_does_the_doctor_expect_labels_to_go_on(log, recover):
+    path = recover(broken(log.read_bytes(), 9))
+    rewritten = Log(path)
+    rewritten.change(rewritten.messages("/mic/gap")[0], reason="the sound card lost samples")
+    assert ("error", "label-frames") in found(rewritten.write(path))
+
+
 @pytest.mark.parametrize(
     "chunks", [(15,), (17,), (14, 15), (17, 18), (15, 17), (16,), (15, 16, 17)]
 )
@@ -194,6 +201,13 @@ def test_frames_lost_at_both_ends_are_stated_as_the_index_counts_them(log, recov
     assert beginning == (START, stamps[BLOCK], BLOCK, LOG_DAMAGED)
     assert end == (stamps[-BLOCK], stamps[-1] + FRAME_NANOSECONDS, BLOCK, LOG_DAMAGED)
     assert found(path) == FOUND
+
+
+def test_frames_before_which_nothing_was_saved_are_stated_by_the_index_alone(log, recover):
+    path = recover(broken(log.read_bytes(), 0, 1))
+    _, stamps, _ = features(log)
+    assert gaps(path)[0] == (START, stamps[BLOCK], BLOCK, LOG_DAMAGED)
+    assert {rule for level, rule in found(path) if level == "error"} == {"info-first", "name"}
 
 
 def test_a_segment_that_was_saved_tells_of_frames_lost_at_the_end(log, recover):
@@ -248,8 +262,8 @@ def test_whole_chunks_that_are_missing_from_an_unfinished_log_leave_a_gap(log, r
 
 def test_a_chunk_that_is_there_twice_loses_nothing(log, recover):
     data = log.read_bytes()
-    start, end = places(data)[6][0], places(data)[7][0]
-    assert gaps(recover(data[:end] + data[start:])) == gaps(log)
+    (start, end), (behind, _) = places(data)[6], places(data)[9]
+    assert gaps(recover(data[:behind] + data[start:end] + data[behind:])) == gaps(log)
 
 
 def test_each_microphone_has_its_own_gaps_in_the_order_of_log_time(recover, tmp_path):
@@ -330,6 +344,21 @@ def test_a_log_that_has_lost_its_end_goes_on_with_the_next_one(sound, model_file
     first.with_name(first.name + ".damaged").unlink()
     assert len(find_logs(tmp_path)) == 4
     assert found(tmp_path) == FOUND
+
+
+@pytest.mark.parametrize("size", [97, 98, 99, 100, 101])
+def test_a_chunk_may_end_between_the_messages_of_one_frame(log, recover, tmp_path, size):
+    other = Log(log)
+    chunks = other.chunks()
+    records = [record for chunk in chunks[1:] for record in chunk.records]
+    parts = [Chunked(records[i : i + size]) for i in range(0, len(records), size)]
+    place = other.items.index(chunks[0]) + 1
+    rest = [item for item in other.items[place:] if not isinstance(item, Chunked)]
+    other.items = [*other.items[:place], *parts, *rest]
+    data = other.write(tmp_path / "whole.mcap").read_bytes()
+    path = recover(broken(data, 4, 9))
+    assert unexplained(path) == 0
+    assert found(path) == FOUND
 
 
 # Anything may be damaged.
