@@ -17,7 +17,9 @@ class SampleClock:
 
     Observations are late, never early, by the delays of the sound card and the scheduler. So each
     window of two seconds counts by its earliest observation, and a line is fitted through these.
-    The time is steered towards each new line, never set to it: time does not jump.
+    Behind a sound server the delays are a hundred times as long, and no line can be fitted: there
+    the earliest observation of all windows counts. The time is steered towards each new line, never
+    set to it: time does not jump.
 
     Parameters
     ----------
@@ -37,6 +39,7 @@ class SampleClock:
         self._late = 0.0
         self._slope = 0.0
         self._fitted_slope = 0.0
+        self._is_exact = True
 
     @property
     def started(self) -> bool:
@@ -48,7 +51,7 @@ class SampleClock:
         """How much faster than nominal the samples come, in parts per million."""
         return -self._fitted_slope * 1e6
 
-    def observe(self, index: int, time: float) -> None:
+    def observe(self, index: int, time: float, *, is_exact: bool = True) -> None:
         """Add an observation: a time by which a sample had been taken.
 
         Parameters
@@ -57,7 +60,10 @@ class SampleClock:
             Number of the sample.
         time : float
             Seconds of CLOCK_MONOTONIC.
+        is_exact : bool
+            Whether it is a time of the sound card, and not that of an arrival.
         """
+        self._is_exact = is_exact
         nominal = index / self._rate
         if self._origin is None:
             self._origin = time - nominal
@@ -92,12 +98,17 @@ class SampleClock:
         self._earliest = None
         self._window_end = nominal + _WINDOW_SECONDS
         now = self._late + self._slope * (nominal - self._anchor)
+        slope, ahead = self._fit(nominal + _WINDOW_SECONDS)
+        self._anchor, self._late = nominal, now
+        self._slope = (ahead - now) / _WINDOW_SECONDS
+        self._fitted_slope = slope
+
+    def _fit(self, nominal: float) -> tuple[float, float]:
+        """Return how fast the observations grow late, and how late they are at a nominal time."""
         at, late = np.array(self._windows).T
+        if not self._is_exact:
+            return 0.0, float(late.min())
         center = at.mean()
         spread = ((at - center) ** 2).sum() + (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
         slope = float(((at - center) * (late - late.mean())).sum() / spread)
-        # Meet the fitted line one window ahead.
-        ahead = late.mean() + slope * (nominal + _WINDOW_SECONDS - center)
-        self._anchor, self._late = nominal, now
-        self._slope = (float(ahead) - now) / _WINDOW_SECONDS
-        self._fitted_slope = slope
+        return slope, float(late.mean() + slope * (nominal - center))

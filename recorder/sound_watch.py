@@ -1,10 +1,12 @@
-"""Sound in which little can be recognised: it is clipped, or the room is as loud as sounds are."""
+"""Sound in which little can be recognised: clipped, stuck, humming, faint, or too loud."""
+
+from collections import deque
 
 import numpy as np
 
 from hearthlog.models.features.floor import decibels
 from hearthlog.schemas.arrays import Bool, Float32, Float64
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 
 _FULL_SCALE = 0.999
 _CLIPPED_SAMPLES = 4  # of a frame; the highest sample of a recording may be full scale
@@ -12,8 +14,22 @@ _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
 _LOUD_FRAMES = 10 * _MINUTE
+_STUCK_FRAMES = round(10.0 / FRAME_SECONDS)
+_DAY_MINUTES = 1440
+_FALL = 1000.0  # 30 dB
+_SECOND = round(1.0 / FRAME_SECONDS)
+_MAINS = (50, 60)  # Hz
+_HARMONICS = np.arange(1, 7)
+_HUM_SHARE = 0.7
+_HUM_DBFS = -45.0
+_HUM_MINUTES = 30
 
 CLIPS = "the microphone clips: turn its volume down"
+STUCK = "the microphone gives one value only: connect it again, or replace it"
+HUMS = "the microphone hums at {} Hz: check its cable and power supply, or what hums beside it"
+FAINT = (
+    "the loudest of a day was 30 dB fainter than before: is the microphone covered or turned away?"
+)
 LOUD = "the room is as loud as most sounds: turn the microphone down, or put it elsewhere"
 
 
@@ -23,6 +39,9 @@ class SoundWatch:
     def __init__(self) -> None:
         self._clipped: Bool = np.empty(0, bool)  # frames of the last minute
         self._loud = 0  # frames since the floor of the room was not loud
+        self._stuck = 0  # frames since the sound was not one value
+        self._level = _DailyLevel()
+        self._hum = _MainsHum()
 
     def add_samples(self, samples: Float32) -> None:
         """Add successive frames.
@@ -34,6 +53,12 @@ class SoundWatch:
         """
         clipped = (np.abs(samples) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
         self._clipped = np.concatenate([self._clipped, clipped])[-_MINUTE:]
+        moving = np.flatnonzero(np.ptp(samples, axis=1) > 0)
+        self._stuck = (
+            len(samples) - 1 - int(moving[-1]) if len(moving) else self._stuck + len(samples)
+        )
+        self._level.add(np.square(samples).mean(axis=1))
+        self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
         """Add the floor of the room at successive frames.
@@ -48,6 +73,75 @@ class SoundWatch:
 
     def problem(self) -> str:
         """Return what is wrong and what to do; empty if nothing is."""
+        if self._stuck >= _STUCK_FRAMES:
+            return STUCK
         if self._clipped.sum() >= _CLIPPED_FRAMES:
             return CLIPS
-        return LOUD if self._loud >= _LOUD_FRAMES else ""
+        if self._loud >= _LOUD_FRAMES:
+            return LOUD
+        if self._hum.frequency:
+            return HUMS.format(self._hum.frequency)
+        return FAINT if self._level.has_fallen else ""
+
+
+class _DailyLevel:
+    """Follows the loudest minute of each day of sound."""
+
+    def __init__(self) -> None:
+        self.has_fallen = False
+        self._powers: Float32 = np.empty(0, np.float32)  # of the frames of this minute
+        self._minutes: list[float] = []  # of this day
+        self._days: deque[float] = deque(maxlen=7)
+
+    def add(self, powers: Float32) -> None:
+        self._powers = np.concatenate([self._powers, powers])
+        if len(self._powers) < _MINUTE:
+            return
+        self._minutes.append(float(self._powers.mean()))
+        self._powers = self._powers[:0]
+        if len(self._minutes) == _DAY_MINUTES:
+            loudest = max(self._minutes)
+            self.has_fallen = bool(self._days) and loudest * _FALL < float(np.median(self._days))
+            if not self.has_fallen:
+                self._days.append(loudest)
+            self._minutes = []
+
+
+class _MainsHum:
+    """Listens to a second of every minute for the mains."""
+
+    def __init__(self) -> None:
+        self.frequency = 0  # Hz; 0 for no hum
+        self._frames = 0
+        self._second: list[Float32] = []
+        self._minutes = 0
+        self._last = 0
+
+    def add(self, samples: Float32) -> None:
+        self._frames += len(samples)
+        if self._frames < _MINUTE:
+            return
+        self._second.append(samples)
+        if sum(map(len, self._second)) < _SECOND:
+            return
+        second = np.concatenate(self._second)[:_SECOND].reshape(-1)
+        self._frames, self._second = 0, []
+        hum = _hum_of(second)
+        self._minutes = self._minutes + 1 if hum and hum == self._last else int(hum > 0)
+        self._last = hum
+        self.frequency = hum if self._minutes >= _HUM_MINUTES else 0
+
+
+def _hum_of(second: Float32) -> int:
+    """Return the frequency of the mains if most of a second's power is there, else 0."""
+    assert len(second) == SAMPLE_RATE == _SECOND * FRAME_SAMPLES
+    if decibels(np.square(second, dtype=np.float64).mean()) < _HUM_DBFS:
+        return 0
+    power = np.square(np.abs(np.fft.rfft(second * np.hanning(len(second)))))
+    power[:20] = 0.0  # what no microphone hears, in bins of 1 Hz
+    around = np.arange(-2, 3)
+    for frequency in _MAINS:
+        bins = (frequency * _HARMONICS[:, np.newaxis] + around).reshape(-1)
+        if power[bins].sum() > _HUM_SHARE * power.sum():
+            return frequency
+    return 0

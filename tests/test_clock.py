@@ -48,6 +48,21 @@ def test_late_observations_do_not_pull_the_clock():
 
 
 @settings(deadline=None, max_examples=30)
+@given(st.floats(-30, 30), st.integers(0, 2**32))
+def test_behind_a_sound_server_stamps_stay_within_20_milliseconds_after_ten_seconds(ppm, seed):
+    """Blocks arrive at once or up to half a second late, some minutes only late."""
+    rng = np.random.default_rng(seed)
+    clock, errors = SampleClock(RATE), []
+    for index in range(0, 600 * RATE, BLOCK):
+        is_late = rng.random() < 0.8 or 100 * RATE < index < 200 * RATE
+        late = rng.uniform(0.1, 0.5) if is_late and index else rng.uniform(0, 0.005)
+        clock.observe(index, float(true_time(index, ppm)) + late, is_exact=False)
+        errors.append(float(clock.time(index) - true_time(index, ppm)))
+    assert np.abs(errors[10 * RATE // BLOCK :]).max() < 0.020
+    assert clock.ppm == 0
+
+
+@settings(deadline=None, max_examples=30)
 @given(st.floats(-300, 300), st.floats(0, 0.02), st.integers(0, 2**32))
 def test_time_never_jumps_nor_runs_backwards(ppm, noise, seed):
     rng = np.random.default_rng(seed)

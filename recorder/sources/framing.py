@@ -151,7 +151,7 @@ class Framer:
             # The loss lies somewhere inside this block: the first good sample is the next one's.
             self._restart(self._expected + self._lost, "the sound card lost samples")
             return []
-        self._clock.observe(block.index + self._lost, taken)
+        self._clock.observe(block.index + self._lost, taken, is_exact=block.has_adc_time)
         return self._cut(block.samples.astype(np.float32) / _INT16_FULL_SCALE)
 
     def _missing_before(self, block: SampleBlock, taken: float) -> int:
