@@ -27,9 +27,7 @@ _HUM_MINUTES = 30
 CLIPS = "the microphone clips: turn its volume down"
 STUCK = "the microphone gives one value only: connect it again, or replace it"
 HUMS = "the microphone hums at {} Hz: check its cable and power supply, or what hums beside it"
-FAINT = (
-    "the loudest of a day was 30 dB fainter than before: is the microphone covered or turned away?"
-)
+FAINT = "a whole day was 30 dB fainter than before: is the microphone covered or turned away?"
 LOUD = "the room is as loud as most sounds: turn the microphone down, or put it elsewhere"
 
 
@@ -53,10 +51,10 @@ class SoundWatch:
         """
         clipped = (np.abs(samples) >= _FULL_SCALE).sum(axis=1) >= _CLIPPED_SAMPLES
         self._clipped = np.concatenate([self._clipped, clipped])[-_MINUTE:]
-        moving = np.flatnonzero(np.ptp(samples, axis=1) > 0)
-        self._stuck = (
-            len(samples) - 1 - int(moving[-1]) if len(moving) else self._stuck + len(samples)
-        )
+        # Zeros are another matter: in a file they are silence, and a microphone's are reported.
+        moving = np.flatnonzero((np.ptp(samples, axis=1) > 0) | (samples[:, 0] == 0.0))
+        last = int(moving[-1]) if len(moving) else -1
+        self._stuck = len(samples) - 1 - last + (self._stuck if last < 0 else 0)
         self._level.add(np.square(samples).mean(axis=1))
         self._hum.add(samples)
 
