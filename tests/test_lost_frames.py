@@ -11,6 +11,7 @@ from logreader import LogReader
 from logs import features, read
 from lossy import LossySource
 from mcap.opcode import Opcode
+from mcap.writer import Writer
 from rewriting import HEAD, Chunked, Log, split
 
 from hearthlog.analyzer.doctor import examine
@@ -19,7 +20,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.recovery import recover_active
+from hearthlog.recorder.recovery import end_of_sound, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
@@ -80,7 +81,7 @@ def sound(tmp_path_factory, day):
 
 def recorded(sound, folder, model, **settings):
     settings = Settings(output=folder, model=model, **settings)
-    return record(settings, settings.microphone[0], Minute(sound), Flag()).logs
+    return record(settings, Minute(sound), Flag()).logs
 
 
 @pytest.fixture(scope="module")
@@ -260,6 +261,22 @@ def test_whole_chunks_that_are_missing_from_an_unfinished_log_leave_a_gap(log, r
     assert found(path) == FOUND
 
 
+@pytest.mark.parametrize("field", ["string frame", "std_msgs/Header[] frame", "uint64 number", "?"])
+def test_features_of_another_definition_are_saved_without_being_understood(tmp_path, field):
+    path = tmp_path / "other.mcap"
+    header = f"{'=' * 80}\nMSG: std_msgs/Header\nstring stamp\nstring frame_id\n"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "another")
+        text = f"std_msgs/Header header\n{field}\n{header}".encode()
+        schema = writer.register_schema(message_types.FEATURES, "ros2msg", text)
+        channel = writer.register_channel("/mic/features", "cdr", schema)
+        for time in range(5):
+            writer.add_message(channel, time, b"\0\1\0\0" + bytes(16), time)
+        writer.finish()
+    assert recover_log(path, tmp_path / "copy.mcap", NAME).messages == 5
+
+
 def test_a_chunk_that_is_there_twice_loses_nothing(log, recover):
     data = log.read_bytes()
     (start, end), (behind, _) = places(data)[6], places(data)[9]
@@ -331,8 +348,9 @@ def test_what_was_lost_at_the_end_is_not_said_again_when_the_recorder_starts(log
     data = log.read_bytes()
     active = tmp_path / (NAME + ".active")
     active.write_bytes(broken(data, 15)[: places(data)[17][0]])  # with the gap behind it
-    (recovered,) = recover_active(tmp_path, "home")
-    assert recovered.end == gaps(tmp_path / NAME)[-1][1]
+    recover_active(tmp_path, "home")
+    until = end_of_sound(tmp_path, "home", "mic", START + 3600 * NANOSECONDS)
+    assert until == gaps(tmp_path / NAME)[-1][1]
     assert found(tmp_path / NAME) == FOUND
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Message
+from mcap.records import Message, Schema
 
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
@@ -15,7 +15,9 @@ from hearthlog.schemas.mcap.definitions import Definitions
 from hearthlog.schemas.mcap.formats import INDEX_ENTRIES, MESSAGE, MESSAGE_FIXED
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.fields import lacking
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
+from hearthlog.schemas.messages.type_definitions import message_type
 from hearthlog.schemas.salvage.whole_records import WholeChunk
 
 FEATURES, LABEL, GAP, INFO = "features", "label", "gap", "info"
@@ -62,15 +64,22 @@ def read_marks(piece: WholeChunk | Message, definitions: Definitions) -> dict[st
         topic = parse_topic(channel.topic)
         if schema is None or topic is None or topic.labelling != LIVE:
             continue
-        if (topic.kind, schema.name) not in _FIELDS:
+        fields = _FIELDS.get((topic.kind, schema.name))
+        if fields is None or not _defines(schema, fields):
             continue
         content = content or _content(piece)  # that of other files is not looked at
         rows = places[:_MOST] if topic.kind in {GAP, INFO} else places[[0, -1]]
         buffer, heads = np.frombuffer(content, np.uint8), gather_heads(content, rows)
         raw = RawMessages(channel, schema, buffer, rows + MESSAGE.size, heads)
-        fields = _FIELDS[topic.kind, schema.name]
         marks.setdefault(topic.microphone, []).extend(_decode(raw, topic.kind, fields, rows))
     return {microphone: sorted(same) for microphone, same in marks.items()}
+
+
+def _defines(schema: Schema, fields: Sequence[str]) -> bool:
+    try:
+        return not lacking(message_type(schema.name, schema.encoding, schema.data), fields)
+    except LogError:
+        return False
 
 
 def _places(piece: WholeChunk | Message) -> Iterator[tuple[int, Int64]]:
