@@ -36,6 +36,7 @@ class CaptureFormat:
     """Where the blocks come from, and how many samples a second there are."""
 
     device: str
+    identity: str  # of the device: what it is asked for by when it is plugged in again
     rate: int
 
 
@@ -84,7 +85,9 @@ def _capture(sounddevice: ModuleType, device: Device, output: Any) -> None:
             blocks.put_nowait((head, bytes(samples)))
 
     stream, rate, channels = _open(sounddevice, device, enqueue)
-    output.write(json.dumps(asdict(CaptureFormat(device.name, rate))).encode() + b"\n")
+    output.write(
+        json.dumps(asdict(CaptureFormat(device.name, device.identity, rate))).encode() + b"\n"
+    )
     stream.start()
     parent = os.getppid()
     while os.getppid() == parent:

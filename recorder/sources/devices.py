@@ -6,8 +6,9 @@ from types import ModuleType
 from typing import Any
 
 from hearthlog.recorder.errors import DeviceError, SourceError
+from hearthlog.recorder.sources.usb import UsbPlace, usb_place
 
-_CARD_NUMBER = re.compile(r" ?\((hw|plughw):\d+,\d+\)$")
+_CARD_NUMBER = re.compile(r" ?\((?:hw|plughw):(\d+),\d+\)$")
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class Device:
     default_rate : float
         In Hz.
     is_default : bool
+    port, serial : str
+        Where it is plugged in, as `UsbPlace` has it.
     """
 
     index: int
@@ -31,6 +34,13 @@ class Device:
     channels: int
     default_rate: float
     is_default: bool
+    port: str = ""
+    serial: str = ""
+
+    @property
+    def identity(self) -> str:
+        """What tells it from all others, now and when it is plugged in again."""
+        return self.port if re.search(r" #\d+$", self.name) and self.port else self.name
 
 
 def load_portaudio() -> ModuleType:
@@ -63,7 +73,7 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
     Returns
     -------
     list of Device
-        In the order of PortAudio; the second one of a name is called `<name> #2`, and so on.
+        In the order of PortAudio; several of one name are called `<name> #1`, `<name> #2`.
     """
     default = sounddevice.default.device[0]
     devices = [
@@ -71,11 +81,12 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
         for info in sounddevice.query_devices()
         if info["max_input_channels"] > 0
     ]
+    names = [device.name for device in devices]
     seen: dict[str, int] = {}
     numbered = []
     for device in devices:
         count = seen[device.name] = seen.get(device.name, 0) + 1
-        name = device.name if count == 1 else f"{device.name} #{count}"
+        name = device.name if names.count(device.name) == 1 else f"{device.name} #{count}"
         numbered.append(replace(device, name=name))
     return numbered
 
@@ -88,8 +99,8 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
     devices : list of Device
         All microphones, as `list_devices` gives them.
     name : str
-        A name or a part of one, in which capitals make no difference; empty for the default
-        microphone.
+        A name or a part of one, in which capitals make no difference; or a port or serial number,
+        as `UsbPlace` has them; empty for the default microphone.
     exact : bool, optional
         Whether only a whole name will do.
 
@@ -103,7 +114,7 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
     if not name:
         defaults = [device for device in devices if device.is_default]
         return (defaults or devices)[0]
-    matching = [device for device in devices if device.name == name]
+    matching = [each for each in devices if name in {each.name, each.port, each.serial}]
     if not matching and not exact:
         matching = [device for device in devices if name.lower() in device.name.lower()]
     if len(matching) == 1:
@@ -114,10 +125,14 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
 
 
 def _device(info: dict[str, Any], *, is_default: bool) -> Device:
+    card = _CARD_NUMBER.search(info["name"])
+    place = usb_place(int(card[1])) if card else UsbPlace()
     return Device(
         index=info["index"],
         name=_CARD_NUMBER.sub("", info["name"]),
         channels=info["max_input_channels"],
         default_rate=info["default_samplerate"],
         is_default=is_default,
+        port=place.port,
+        serial=place.serial,
     )

@@ -48,7 +48,8 @@ class MicrophoneSource:
 
     def __init__(self, device: str, *, waits: bool = True) -> None:
         self.device = device
-        self._heard = False  # whether `device` is the name of a device, and not a part of one
+        self._wanted = device
+        self._heard = False  # from then on `_wanted` is the identity of the device
         self._capture: CaptureProcess | None = None
         self._framer = Framer()
         self._silent_frames = 0
@@ -118,8 +119,9 @@ class MicrophoneSource:
         return "the recorder was stopped"
 
     def _open(self) -> None:
-        self._capture = CaptureProcess(self.device, exact=self._heard)
-        self.device, self._heard = self._capture.format.device, True
+        self._capture = CaptureProcess(self._wanted, exact=self._heard)
+        heard = self._capture.format
+        self.device, self._wanted, self._heard = heard.device, heard.identity, True
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         for pause in itertools.chain(_RETRY_SECONDS, itertools.repeat(_RETRY_SECONDS[-1])):

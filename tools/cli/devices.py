@@ -19,7 +19,9 @@ def devices(*, as_json: Json = False) -> None:
         return
     for device in microphones:
         default = "  (default)" if device.is_default else ""
-        print(f"{device.name}  {device.channels} channels, {device.default_rate:.0f} Hz{default}")
+        place = "".join(f", {each}" for each in (device.port, device.serial) if each)
+        rate = f"{device.default_rate:.0f} Hz"
+        print(f"{device.name}  {device.channels} channels, {rate}{place}{default}")
     if not microphones:
         tell("no microphone found")
         raise typer.Exit(1)
