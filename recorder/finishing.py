@@ -49,7 +49,12 @@ class LogFinisher:
             self._processes.append(subprocess.Popen(command, stdin=subprocess.PIPE))  # noqa: S603
 
     def close(self) -> None:
-        """Wait until all logs have their names, or cannot get them."""
+        """Give all logs their names that can get them.
+
+        Whoever ends the recorder waits: on a busy machine a process of low priority takes minutes.
+        """
+        for process in self._processes:
+            process.kill()
         self._forget(list(self._processes))
         for active in self._left:
             finish_log(active)
