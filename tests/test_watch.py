@@ -108,6 +108,12 @@ class Eye:
 
         return wait_for(enough)
 
+    def newest(self):
+        """The time of the newest data; None if there is none."""
+        state = answer(self._client.get_state)
+        ends = [line.end for each in state.recordings for line in each.timelines] if state else []
+        return max((end for end in ends if end), default=None)
+
     def picture(self):
         png = wait_for(lambda: answer(self._client.take_screenshot))
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
@@ -220,6 +226,25 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
         with looking(server.url) as eye:
             eye.views()
             wait_for(lambda: is_there(eye.picture(), colour("phone_ring"), 1580))
+
+
+def test_lanes_are_sent_at_once_and_plots_every_few_seconds():
+    begin = 1_772_348_400 * SECOND
+
+    def level(second):
+        times = np.array([begin + second * SECOND])
+        return Plot(LEVEL, "mic", "", ("level",), times, np.array([[-40.0]]))
+
+    with LiveServer(free_port(), "127.0.0.1", MINUTES) as server, looking(server.url) as eye:
+        server.show([level(0)])
+        wait_for(lambda: eye.newest() == begin)
+        for second in (1, 2, 3):
+            server.show([level(second)])
+        lane = Changes(np.array([begin + 2 * SECOND]), ["speech"])
+        server.show([StateLane(RECORDER, "mic", lane)])
+        wait_for(lambda: eye.newest() == begin + 2 * SECOND)
+        server.show([level(5)])
+        wait_for(lambda: eye.newest() == begin + 5 * SECOND)
 
 
 def test_a_window_hardly_grows_with_what_it_paints(display, monkeypatch):

@@ -8,7 +8,7 @@ from rerun.experimental import ViewerClient
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
-_MEMORY = "400MB"  # of a viewer that data comes to for days; then it drops the oldest
+_MEMORY = "800MB"  # of a viewer that data comes to for days; then it drops the oldest
 
 
 class _WindowControl:
