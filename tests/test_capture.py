@@ -35,7 +35,7 @@ def recording(microphone, folder, *options):
             yield process
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
-            process.output, process.errors = process.communicate(timeout=20)
+            process.output, process.errors = process.communicate(timeout=60)
         finally:
             process.kill()
 

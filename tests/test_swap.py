@@ -55,7 +55,7 @@ def recording(folder, logs, *arguments, env=None):
         try:
             yield process
             process.send_signal(signal.SIGTERM)
-            process.errors = process.communicate(timeout=20)[1]
+            process.errors = process.communicate(timeout=60)[1]
         finally:
             process.kill()
 
