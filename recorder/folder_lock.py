@@ -32,18 +32,23 @@ def lock_folder(folder: Path, node: str) -> Iterator[None]:
         If another recorder holds it, or the folder cannot be written to.
     """
     lock = folder / f".{node}.lock"
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
         if error.errno not in _PASSING:
-            raise LogError(f"{folder}: cannot be written to ({error.strerror})") from error
+            code = errno.ENOTDIR if error.errno == errno.EEXIST else error.errno
+            raise LogError(f"{folder}: cannot be written ({os.strerror(code or 0)})") from error
         yield
         return
     try:
         _lock(descriptor, folder, node)
         yield
     finally:
+        if is_new and not any(path != lock for path in folder.iterdir()):  # nothing was recorded
+            lock.unlink()
+            folder.rmdir()
         os.close(descriptor)
 
 
@@ -61,4 +66,4 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
     except OSError as error:
         if error.errno not in _PASSING:
-            raise LogError(f"{folder}: cannot be written to ({error.strerror})") from error
+            raise LogError(f"{folder}: cannot be written ({error.strerror})") from error

@@ -67,9 +67,9 @@ class CaptureProcess:
     ------
     DeviceError
         If the device is not there or cannot be opened, in the words of the capture process; or if
-        PortAudio hangs or crashes.
+        PortAudio hangs.
     SourceError
-        If PortAudio is missing or cannot start.
+        If PortAudio is missing, cannot start, or crashes.
     """
 
     def __init__(self, device: str, *, exact: bool = False) -> None:
@@ -133,7 +133,7 @@ class CaptureProcess:
                 raise DeviceError(_HANGS)
             data = self._read()
             if not data:
-                raise DeviceError(_CRASHES)
+                raise SourceError(_CRASHES)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)
