@@ -158,7 +158,8 @@ def main() -> None:
         report = keep_disk(rules, may_thin=may_thin)
     except OSError as error:
         report = DiskReport("", f"{root}: cannot be looked after ({error.strerror or error})", {})
-    json.dump(report, sys.stdout)
+    with suppress(BrokenPipeError):  # the recorder was killed
+        os.write(sys.stdout.fileno(), json.dumps(report).encode())
 
 
 if __name__ == "__main__":
