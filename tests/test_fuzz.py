@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from rewriting import HEAD, Raw, as_raw, joined, parsed, split
 
-from hearthlog.recorder.config import MicrophoneSettings, Settings
+from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.columns import read_columns
@@ -40,9 +40,7 @@ def log(tmp_path_factory, day, model_file):
     samples, rate = soundfile.read(day, frames=30 * 16_000, dtype="int16")
     soundfile.write(folder / "sound.wav", samples, rate)
     source = LossySource(FileSource([folder / "sound.wav"], START), {1: 7})
-    (path,) = record(
-        Settings(output=folder, model=model_file), MicrophoneSettings(), source, Flag()
-    ).logs
+    (path,) = record(Settings(output=folder, model=model_file), source, Flag()).logs
     return path
 
 

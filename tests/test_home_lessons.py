@@ -31,6 +31,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
+from hearthlog.recorder.labelling_models import LabellingModels
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES
@@ -159,7 +160,8 @@ def test_a_class_that_a_review_left_alone_often_is_not_taken_from_other_time(hom
 def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path):
     """The blocks of the floor are counted from the first frame of the recorder."""
     begin, frame = 1_772_348_400 * SECOND, 50_000_000
-    session = RecordingSession(Settings(output=tmp_path), "mic", MICROPHONE, None)
+    models = {"mic": LabellingModels()}
+    session = RecordingSession(Settings(output=tmp_path), {"mic": MICROPHONE}, models)
     rng = np.random.default_rng(1)
     floors = []
     for first, loudness in ((7, 0.001), (900, 0.1)):
@@ -167,8 +169,8 @@ def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path
         if first > 7:
             lost = first - 807
             start = begin + 807 * frame
-            session.add(Gap(start, start + lost * frame, "overrun", lost))
-        session.add(Frames(first, samples, begin + np.arange(first, first + 800) * frame))
+            session.add("mic", Gap(start, start + lost * frame, "overrun", lost))
+        session.add("mic", Frames(first, samples, begin + np.arange(first, first + 800) * frame))
         powers = DEFAULT.band_powers(DEFAULT.extractor()(samples))
         tracked = FloorTracker()(powers, first).powers
         floors += [np.zeros((len(powers) - len(tracked), DEFAULT.bands)), tracked]

@@ -35,7 +35,7 @@ from hearthlog.analyzer.review.session.session import ReviewItem, Session
 from hearthlog.analyzer.review.session.sound import sound_of
 from hearthlog.analyzer.review.timeline.model import SoundClip
 from hearthlog.analyzer.review.timeline.read_timeline import read_timeline
-from hearthlog.recorder.config import MicrophoneSettings, Settings
+from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -736,9 +736,7 @@ def test_a_file_that_exists_is_left_alone(recorded_home, capfd, tmp_path):
 
 
 def test_a_queue_of_logs_without_labels_is_refused(tmp_path, capfd, day):
-    record(
-        Settings(output=tmp_path / "logs"), MicrophoneSettings(), FileSource([day], START), Flag()
-    )
+    record(Settings(output=tmp_path / "logs"), FileSource([day], START), Flag())
     done = run(capfd, "review", tmp_path / "logs", "--web", "--queue", "novel")
     assert done.returncode == 1
     assert "no labelling 'live'" in done.stderr or "no segments" in done.stderr

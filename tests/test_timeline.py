@@ -51,7 +51,7 @@ from hearthlog.analyzer.review.viewer.file import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import in_words
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.recorder.config import MicrophoneSettings, Settings
+from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
@@ -277,9 +277,7 @@ def test_a_log_named_by_itself_comes_with_its_layers_and_no_others(folder):
 
 
 def test_a_log_without_a_model_shows_its_features(tmp_path, day):
-    logs = record(
-        Settings(output=tmp_path), MicrophoneSettings(), FileSource([day], START), Flag()
-    ).logs
+    logs = record(Settings(output=tmp_path), FileSource([day], START), Flag()).logs
     microphone = read_timeline(logs).microphones["mic"]
     assert microphone.labellings == []
     assert np.isfinite(microphone.level).all()
