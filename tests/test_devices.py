@@ -1,8 +1,11 @@
 """A microphone is found by its name, or where two have one name, by where it is plugged in."""
 
+import threading
+
 import pytest
 
 from hearthlog.recorder.errors import DeviceError
+from hearthlog.recorder.sources import microphone
 from hearthlog.recorder.sources.devices import Device, find_device, list_devices
 from hearthlog.recorder.sources.usb import UsbPlace, usb_place
 
@@ -102,3 +105,11 @@ def test_only_the_whole_name_will_do_where_it_must_be_the_same_device():
     assert find_device(devices, "labmic").name == "labmic2"
     with pytest.raises(DeviceError, match="no microphone is called 'labmic'"):
         find_device(devices, "labmic", exact=True)
+
+
+def test_a_card_that_is_plugged_in_ends_the_wait_for_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(microphone, "_CARDS", tmp_path)
+    plug = threading.Timer(0.5, (tmp_path / "pcmC1D0c").touch)
+    plug.start()
+    assert microphone._cards_change(threading.Event(), 60.0)
+    assert not microphone._cards_change(threading.Event(), 0.1)

@@ -1,9 +1,9 @@
 """A microphone that runs for years: its capture process, watched and started again."""
 
-import itertools
 import math
 import time
 from collections.abc import Generator, Iterator
+from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
@@ -21,6 +21,7 @@ _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
 _SILENT_FRAMES = 200  # ten seconds
 _STEP_SECONDS = 0.25
+_CARDS = Path("/dev/snd")
 
 
 class MicrophoneSource:
@@ -124,7 +125,8 @@ class MicrophoneSource:
         self.device, self._wanted, self._heard = heard.device, heard.identity, True
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
-        for pause in itertools.chain(_RETRY_SECONDS, itertools.repeat(_RETRY_SECONDS[-1])):
+        pauses = iter(_RETRY_SECONDS)
+        while not stop.is_set():
             try:
                 self._open()
             except SourceError as error:
@@ -132,8 +134,8 @@ class MicrophoneSource:
             else:
                 return
             yield from self._report(self._now())
-            if stop.wait(pause):
-                return
+            if _cards_change(stop, next(pauses, _RETRY_SECONDS[-1])):
+                pauses = iter(_RETRY_SECONDS)  # what was plugged in may take a moment
 
     def _watch(self, event: Frames | Gap) -> None:
         if isinstance(event, Gap):
@@ -169,6 +171,23 @@ class MicrophoneSource:
                 "clock_ppm": f"{self._framer.ppm:.1f}",
             }
             yield SourceHealth(stamp, level, summary, values)
+
+
+def _cards_change(stop: Flag, seconds: float) -> bool:
+    """Wait, but no longer than until a sound card comes or goes; return whether one does."""
+    cards, end = _sound_cards(), time.monotonic() + seconds
+    while time.monotonic() < end and not stop.wait(min(_LOOK_SECONDS, seconds)):
+        if _sound_cards() != cards:
+            return True
+    return False
+
+
+def _sound_cards() -> int:
+    """Return what changes with the sound cards that Linux has; 0 elsewhere."""
+    try:
+        return _CARDS.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _wall_offset() -> int:
