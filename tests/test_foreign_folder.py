@@ -51,8 +51,15 @@ def test_listing_the_microphones_executes_nothing_of_the_folder(trapped):
 
 def test_listening_executes_nothing_of_the_folder(trapped, labmic, tmp_path):
     # Without a microphone of this name the capture process says which there are.
-    result = run(trapped, "record", "--device", "none", "-o", tmp_path / "logs", env=labmic.env)
-    assert result.stderr == ("hearthlog: no microphone is called 'none'; there are 'labmic'\n")
+    command = [*AS_INSTALLED, "record", "--device", "none", "-o", str(tmp_path / "logs")]
+    env = {**os.environ, **labmic.env}
+    with subprocess.Popen(command, cwd=trapped, env=env, stderr=subprocess.PIPE) as process:
+        line = process.stderr.readline()
+        process.terminate()
+    expected = (
+        b"hearthlog: mic: no microphone is called 'none'; there are 'labmic'; waiting for it\n"
+    )
+    assert line == expected
 
 
 def test_recording_and_relabelling_execute_nothing_of_the_folder(
