@@ -4,7 +4,7 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hearthlog.schemas.errors import LogError
@@ -17,8 +17,8 @@ _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 def lock_folder(folder: Path, node: str) -> Iterator[None]:
     """Hold the lock of a node in a folder of logs, which is made if it is not there.
 
-    The lock is the file `.<node>.lock`, in which the process writes its number. It stays there, but
-    is nobody's once the process has ended.
+    The lock is the file `.<node>.lock`, in which the process writes its number. It stays there with
+    the logs, but is nobody's once the process has ended.
 
     Parameters
     ----------
@@ -46,10 +46,16 @@ def lock_folder(folder: Path, node: str) -> Iterator[None]:
         _lock(descriptor, folder, node)
         yield
     finally:
-        if is_new and not any(path != lock for path in folder.iterdir()):  # nothing was recorded
+        os.close(descriptor)
+        if is_new:
+            _remove_unused(folder, lock)
+
+
+def _remove_unused(folder: Path, lock: Path) -> None:
+    with suppress(OSError):  # the folder is gone, or its disk
+        if list(folder.iterdir()) == [lock]:  # nothing was recorded
             lock.unlink()
             folder.rmdir()
-        os.close(descriptor)
 
 
 def _lock(descriptor: int, folder: Path, node: str) -> None:

@@ -205,4 +205,5 @@ def _size(item: _Held) -> int:
 
 def _mount_of(folder: Path) -> Path:
     """Return the mount point of the disk of a folder that may not exist yet."""
-    return next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_mount())
+    folder = folder.resolve()
+    return next(path for path in (folder, *folder.parents) if path.is_mount())

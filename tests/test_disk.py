@@ -20,6 +20,7 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder import live_log
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.folder_lock import lock_folder
 from hearthlog.recorder.labelling_models import LabellingModels
 from hearthlog.recorder.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
@@ -210,3 +211,14 @@ def test_a_second_recorder_of_a_folder_is_refused_with_the_number_of_the_first(
     assert f"is recorded by 'home' already (process {process.pid})" in second.stderr
     assert process.returncode == 0, process.errors
     assert {path.name[:5] for path in logs.rglob("*.mcap")} == {"home_", "other"}
+
+
+def test_a_folder_that_is_gone_at_the_end_is_no_failure(tmp_path):
+    with lock_folder(tmp_path / "logs", "home"):
+        shutil.rmtree(tmp_path / "logs")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_the_disk_behind_a_link_is_the_one_that_must_be_mounted(small_disk, tmp_path):
+    (tmp_path / "link").symlink_to(small_disk)
+    assert live_log._mount_of(tmp_path / "link" / "logs") == small_disk
