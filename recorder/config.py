@@ -26,7 +26,7 @@ from hearthlog.recorder.disk.retention import Limits
 from hearthlog.recorder.disk.sizes import Size
 from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.statistics import LOGGED_EVERY
+from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.recorder.timezone import check_time_zone, machine_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import check_node_name

@@ -5,10 +5,10 @@ from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource
-from hearthlog.recorder.labelling_models import Change, LabellingModels
-from hearthlog.recorder.log_description import LogDescription, describe_log
-from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.stream_messages import EncodedMessage, stream_info
+from hearthlog.recorder.labelling.labelling_models import Change, LabellingModels
+from hearthlog.recorder.log.description import LogDescription, describe_log
+from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 

@@ -10,7 +10,6 @@ from threading import Event as Flag
 
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
-from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.clips.clip_recorder import ClipRecorder
 from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.disk.keeper import DiskKeeper
@@ -24,20 +23,21 @@ from hearthlog.recorder.events import (
     SourceHealth,
     event_time,
 )
-from hearthlog.recorder.finishing import LogFinisher
-from hearthlog.recorder.folder_lock import lock_folder
 from hearthlog.recorder.journal import HealthJournal, say
-from hearthlog.recorder.labelling_models import LabellingModels
-from hearthlog.recorder.live_log import LiveLog
-from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.log_description import LogDescription, join_descriptions
+from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
+from hearthlog.recorder.log.description import LogDescription, join_descriptions
+from hearthlog.recorder.log.finishing import LogFinisher
+from hearthlog.recorder.log.folder_lock import lock_folder
+from hearthlog.recorder.log.live_log import LiveLog
+from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.microphone_stream import MicrophoneStream
-from hearthlog.recorder.model_watch import ModelWatch, ReloadRequests
-from hearthlog.recorder.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 _NOT_RUNNING = "the recorder was not running"

@@ -25,10 +25,10 @@ from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_mar
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote, target
-from hearthlog.recorder.candidate_watch import CandidateWatch
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.labelling_models import LabellingModels
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -152,7 +152,7 @@ class CountingWatch(CandidateWatch):
 
 
 def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.candidate_watch.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.labelling.candidate_watch.LOOK_SECONDS", 0.01)
     promote(folder, "two", "candidate")
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())
     candidates = CountingWatch(folder, DEFAULT)

@@ -38,7 +38,7 @@ from hearthlog.recorder.clips.clip_retention import ClipRetention
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.model_watch import ReloadRequests
+from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.recording import record, record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio

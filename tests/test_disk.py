@@ -17,12 +17,12 @@ from logs import features, read
 from test_capture import recording, sound, wait_for_frames
 
 from hearthlog.analyzer.doctor import examine
-from hearthlog.recorder import live_log
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
-from hearthlog.recorder.folder_lock import lock_folder
-from hearthlog.recorder.labelling_models import LabellingModels
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch
+from hearthlog.recorder.log import live_log
+from hearthlog.recorder.log.folder_lock import lock_folder
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.writer import LogWriter

@@ -44,7 +44,7 @@ from hearthlog.models.modelfile.judgement import (
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.models.modelfile.registry import promote, rollback, target
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.files import find_logs
@@ -307,7 +307,7 @@ def refusals(watch, count=1):
 
 
 def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
-    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("hearthlog.recorder.labelling.model_watch.LOOK_SECONDS", 0.05)
     folder = place / "models"
     model = keep_deaf()
     watch = ModelWatch(folder / "champion.safetensors", SimpleQueue())

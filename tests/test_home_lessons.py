@@ -31,7 +31,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES

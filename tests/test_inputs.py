@@ -11,7 +11,7 @@ from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.auros21.inputs import bands_of, dct_weights
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.home33 import HOME33
-from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.recorder.stream.statistics import RollingStatistics
 
 pytestmark = pytest.mark.fast
 

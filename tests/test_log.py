@@ -12,11 +12,11 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.log_description import LogDescription, describe_log
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.log.description import LogDescription, describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.stream_messages import stream_info
+from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

@@ -18,10 +18,10 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.recovery import end_of_sound, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter

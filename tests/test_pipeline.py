@@ -7,11 +7,11 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder import rosout
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.stream_messages import opening_messages
+from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.messages import opening_messages
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import (
     DIAGNOSTICS,

@@ -18,9 +18,9 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.pipeline import Pipeline
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.messages.message_types import LABEL, decode, nanoseconds

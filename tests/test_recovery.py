@@ -12,8 +12,8 @@ from logreader import LogReader
 from logs import features
 
 from hearthlog.recorder.config import load_settings
+from hearthlog.recorder.log.recovery import end_of_sound, recover_active
 from hearthlog.recorder.recording import record_files
-from hearthlog.recorder.recovery import end_of_sound, recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import active_path

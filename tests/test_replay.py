@@ -34,11 +34,11 @@ from hearthlog.models.modelfile.card import model_card
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.recovery import recover_active
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs

@@ -11,7 +11,7 @@ import pytest
 from hearthlog.models.classifiers.description import SIMULATED, Amount, Collection
 from hearthlog.models.modelfile.judgement import insist
 from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.tools.home.simulate import write_training_set
 
 LINE = (

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hearthlog.recorder import sound_watch
-from hearthlog.recorder.sound_watch import FAINT, HUMS, STUCK, SoundWatch
+from hearthlog.recorder.stream import sound_watch
+from hearthlog.recorder.stream.sound_watch import FAINT, HUMS, STUCK, SoundWatch
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 pytestmark = pytest.mark.fast

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hearthlog.models.features.auros21.extractor import FeatureExtractor
 from hearthlog.models.features.auros21.inputs import WINDOW_FRAMES
-from hearthlog.recorder.statistics import RollingStatistics
+from hearthlog.recorder.stream.statistics import RollingStatistics
 
 pytestmark = pytest.mark.fast
 

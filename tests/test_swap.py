@@ -26,11 +26,11 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.labelling_models import LabellingModels
-from hearthlog.recorder.model_watch import ModelWatch
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
@@ -234,7 +234,7 @@ def test_a_file_that_is_written_over_in_its_place_is_taken_too(folder):
 
 
 def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("hearthlog.recorder.labelling.model_watch.LOOK_SECONDS", 0.01)
     path = folder / "one.safetensors"
     watch = ModelWatch(path, SimpleQueue())
     (folder / "copy").write_bytes(path.read_bytes())
@@ -246,7 +246,7 @@ def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
 
 
 def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
-    monkeypatch.setattr("hearthlog.recorder.model_watch.LOOK_SECONDS", 3600)
+    monkeypatch.setattr("hearthlog.recorder.labelling.model_watch.LOOK_SECONDS", 3600)
     asked = SimpleQueue()
     watch = ModelWatch(folder / "champion.safetensors", asked)
     promote(folder, "two")

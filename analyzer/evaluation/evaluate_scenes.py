@@ -35,8 +35,8 @@ from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.labelling_models import LabellingModels
-from hearthlog.recorder.model_watch import ModelWatch
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.arrays import Bytes, Int64
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.mcap.raw_messages import RawMessages

@@ -8,8 +8,8 @@ from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.modelfile.card import CARD, DESCRIPTION, model_attachments
-from hearthlog.recorder.log_description import LogDescription
-from hearthlog.recorder.stream_messages import stream_info
+from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.messages.topics import CANDIDATE, topics_of
 

@@ -15,11 +15,11 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
-from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.log_description import LogDescription
-from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.statistics import LOGGED_EVERY
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.recorder.stream.statistics import LOGGED_EVERY
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.topics import CANDIDATE, topic
 from hearthlog.schemas.times import NANOSECONDS

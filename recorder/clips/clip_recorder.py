@@ -10,7 +10,7 @@ from hearthlog.recorder.clips.clip_retention import ClipRetention
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, event_time
-from hearthlog.recorder.pipeline import Pipeline
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 

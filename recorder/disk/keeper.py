@@ -8,13 +8,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from hearthlog.recorder import rosout
 from hearthlog.recorder.disk.keeping import DiskReport, KeepingRules, keep_disk
 from hearthlog.recorder.disk.retention import Limits, disk_of
 from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.events import OK, WARNING
 from hearthlog.recorder.modules import module_command
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.recorder.clock import SampleClock
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.frame_cutter import FrameCutter
+from hearthlog.recorder.sources.sample_clock import SampleClock
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.times import NANOSECONDS

@@ -19,7 +19,7 @@ from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.recorder.config import Settings
-    from hearthlog.recorder.model_watch import ReloadRequests
+    from hearthlog.recorder.labelling.model_watch import ReloadRequests
     from hearthlog.recorder.recording import RecordingSummary
 
 
@@ -159,7 +159,7 @@ def _say(recording: "RecordingSummary") -> None:
 
 def _look_at_hangup(stop: Flag) -> "ReloadRequests":
     """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
-    from hearthlog.recorder.model_watch import ReloadRequests
+    from hearthlog.recorder.labelling.model_watch import ReloadRequests
 
     reload_requests = ReloadRequests()
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it

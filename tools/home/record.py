@@ -11,10 +11,10 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, SourceHealth
-from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.log_description import describe_log
-from hearthlog.recorder.pipeline import Pipeline
-from hearthlog.recorder.stream_messages import EncodedMessage, stream_info
+from hearthlog.recorder.log.description import describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Int16
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.progress import Progress, ignore_progress

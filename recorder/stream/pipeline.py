@@ -11,12 +11,12 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.recorder import rosout
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
-from hearthlog.recorder.label_stream import LabelStream
-from hearthlog.recorder.sound_watch import SoundWatch
-from hearthlog.recorder.statistics import LOGGED_EVERY, RollingStatistics
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.label_stream import LabelStream
+from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream.sound_watch import SoundWatch
+from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.recorder import rosout
+from hearthlog.recorder.stream import rosout
 from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, header, message, nanoseconds

@@ -11,7 +11,12 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import CANDIDATE
 from hearthlog.recorder.journal import say
-from hearthlog.recorder.model_watch import LOOK_SECONDS, Loaded, file_identity, load_checked
+from hearthlog.recorder.labelling.model_watch import (
+    LOOK_SECONDS,
+    Loaded,
+    file_identity,
+    load_checked,
+)
 
 
 class CandidateWatch:

@@ -10,10 +10,10 @@ from itertools import groupby
 from pathlib import Path
 
 from hearthlog.recorder.events import OK, WARNING, Notice
-from hearthlog.recorder.log import RollingLog
-from hearthlog.recorder.log_description import LogDescription
-from hearthlog.recorder.recovery import recover_active
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.recovery import recover_active
+from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
 

@@ -8,8 +8,8 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, Labeller, segment_columns
 from hearthlog.models.labels.segments import Segment
-from hearthlog.recorder import rosout
-from hearthlog.recorder.stream_messages import EncodedMessage
+from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.recorder.candidate_watch import CandidateWatch
-from hearthlog.recorder.model_watch import Loaded, ModelWatch
+from hearthlog.recorder.labelling.candidate_watch import CandidateWatch
+from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE
 
 

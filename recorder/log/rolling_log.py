@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hearthlog.recorder.events import Notice
-from hearthlog.recorder.finishing import LogFinisher
-from hearthlog.recorder.log_description import LogDescription
-from hearthlog.recorder.stream_messages import EncodedMessage, opening_messages
+from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.finishing import LogFinisher
+from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import free_log_path, log_path
 from hearthlog.schemas.logs.writer import LogWriter

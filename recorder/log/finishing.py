@@ -12,14 +12,14 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
+from hearthlog.recorder.log.recovery import complete_log
 from hearthlog.recorder.modules import module_command
-from hearthlog.recorder.recovery import complete_log
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import SUFFIX, stem
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.storage.new_files import sync_folder
 
-_COMMAND = module_command("hearthlog.recorder.finishing")
+_COMMAND = module_command("hearthlog.recorder.log.finishing")
 _NICENESS = 19
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # it ends within seconds
 

@@ -1,0 +1,1 @@
+"""The models that label: loaded, watched, and replaced while sound is recorded."""
