@@ -19,6 +19,7 @@ from hearthlog.analyzer.training.confirmed import (
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_data import (
     HOME,
+    HOME_WEIGHT,
     MOST_OF_MARK,
     home_sequences,
     lesson_recordings,
@@ -90,6 +91,15 @@ def test_what_a_review_left_alone_is_to_stay_as_it_was_labelled(home, model_file
         (label,) = {said for a, b, said in segments(home) if a <= middle < b}
         assert one.label == label
         assert end + SECOND // 2 <= marked[0] or begin - SECOND // 2 >= marked[1]
+
+
+def test_what_a_review_left_alone_weighs_as_much_as_the_sounds_of_others(home, model_file):
+    model = load_model(model_file)
+    write(home, [next(one for one in segments(home) if one[2] != "silence")], [whole(home)])
+    lessons = home_lessons([home], model).segments
+    confirmed = lessons.collection == lessons.collection_names.index(CONFIRMED)
+    assert set(lessons.weight[confirmed]) == {1.0}
+    assert set(lessons.weight[~confirmed]) == {HOME_WEIGHT}
 
 
 def test_what_a_model_is_less_than_half_sure_of_confirms_nothing(home, model_file):

@@ -150,7 +150,7 @@ def _scores(method: Method, classes: int, split: _Split, *arrays: Any) -> Float6
         passed = np.flatnonzero((labelled == true)[: marked[-1]]) if len(marked) else marked
         home = split.pool[np.concatenate([marked, _few_of_each(passed, true)])]
         weight = examples.weight.copy()
-        weight[home] = HOME_WEIGHT
+        weight[split.pool[marked]] = HOME_WEIGHT
         learned = base
         if len(home):
             learned = again.fit(joined._replace(weight=weight), home)

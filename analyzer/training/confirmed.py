@@ -28,6 +28,7 @@ from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
 from hearthlog.schemas.times import NANOSECONDS
 
 MOST_CONFIRMED = 60  # segments of a class
+_WEIGHT = 1.0  # of a segment: with that of marks, windows of half a sound become silence
 SURE = 0.5
 FEWEST = 20  # of a class
 _ASIDE = NANOSECONDS // 2  # of marks
@@ -193,10 +194,8 @@ def _cut(sound: HomeSound, target: Indices, classes: Sequence[str]) -> Candidate
         for number in np.unique(own)
     ]
     rows = np.sort(np.concatenate([np.empty(0, np.intp), *tried]))
-    recordings = [
-        recording_of(sound, classes[own[row]], frames[row])._replace(collection=CONFIRMED)
-        for row in rows.tolist()
-    ]
+    cut = [recording_of(sound, classes[own[row]], frames[row]) for row in rows.tolist()]
+    recordings = [one._replace(collection=CONFIRMED, weight=_WEIGHT) for one in cut]
     return Candidates(recordings, own[rows])
 
 

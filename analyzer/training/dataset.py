@@ -229,8 +229,8 @@ def cut_recordings(
     """Cut recordings into segments of one window, half a second apart.
 
     Segments of silence are all kept, others if they are above -60 dBFS and at most 12 dB below the
-    mean level of their recording. Of each class and source group at most 24 segments, times their
-    weight, are kept, evenly spaced.
+    mean level of their recording. Of each class, source group and collection at most 24 segments,
+    times their weight, are kept, evenly spaced.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def cut_recordings(
         rows.append(np.tile([classes.index(name), group, collection], (len(starts), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
     weight = np.concatenate(weights)
-    kept = _thinned(target * len(groups) + group_of, weight)
+    kept = _thinned((target * len(groups) + group_of) * len(collections) + collection_of, weight)
     windows, floors = _cut([chosen[place] for place in kept.tolist()], features)
     return Dataset(
         windows=windows[0],
