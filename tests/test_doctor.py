@@ -1158,18 +1158,31 @@ def test_a_log_that_is_missing_is_missed(folder):
     assert found(folder) - {("warning", GAP)} == {("warning", "missing-log")}
 
 
-def test_a_clock_that_is_set_back_begins_another_log_that_may_overlap(tmp_path):
+def clock_set(folder, *steps):
+    """Record ten seconds before and behind each step of the clock."""
     info = stream_info("mic", "test", DEFAULT, None)
-    about = describe_log(Settings(output=tmp_path), info, DEFAULT, None)
+    about = describe_log(Settings(output=folder), info, DEFAULT, None)
     log, pipeline = RollingLog(about, 3600, 1.0, 5.0), Pipeline("mic", DEFAULT)
     values = np.random.default_rng(0).random((200, DEFAULT.width)).astype(np.float32)
-    stamps = START + np.arange(200) * FRAME_NANOSECONDS
+    stamps, first = START + np.arange(200) * FRAME_NANOSECONDS, 0
     log.write(pipeline.push_features(values, 0, stamps))
-    end, back = int(stamps[-1]) + FRAME_NANOSECONDS, START + NANOSECONDS
-    log.write(pipeline.push(Gap(end, back, "the clock was set by -9.000 s", 1)))
-    log.write(pipeline.push_features(values, 201, stamps + NANOSECONDS))
+    for step in steps:
+        end, first = int(stamps[-1]) + FRAME_NANOSECONDS, first + 201
+        stamps = end + step * NANOSECONDS + np.arange(200) * FRAME_NANOSECONDS
+        log.write(pipeline.push(Gap(end, int(stamps[0]), f"the clock was set by {step} s", 1)))
+        log.write(pipeline.push_features(values, first, stamps))
     log.finish()
-    assert len(find_logs(tmp_path)) == 2
+    return folder
+
+
+def test_a_clock_that_is_set_back_begins_another_log_that_may_overlap(tmp_path):
+    assert len(find_logs(clock_set(tmp_path, -9))) == 2
+    assert found(tmp_path) == {("warning", GAP)}
+
+
+def test_logs_of_an_evening_for_which_the_clock_was_wrong_by_days_follow_each_other(tmp_path):
+    ahead = 60 * 86_400
+    assert len(find_logs(clock_set(tmp_path, 3600, ahead, -ahead, 3600))) == 5
     assert found(tmp_path) == {("warning", GAP)}
 
 

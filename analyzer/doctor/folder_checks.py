@@ -110,11 +110,10 @@ def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
 
 
 def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
-    """Tell whether frames go on with where others end: the clock may have been set back between."""
+    """Tell whether frames go on with where others end: the clock may have been set between."""
     assert frames.first is not None
-    number, time = frames.first[0] - frames.lost_before, frames.first[1]
-    if _begins_back(frames) and frames.gap_before is not None:
-        time = frames.gap_before[0]
+    number = frames.first[0] - frames.lost_before
+    time = frames.first[1] if frames.gap_before is None else frames.gap_before[0]
     ends = (other.last for other in others if other.last is not None)
     return any(last[0] + 1 == number and abs(last[1] - time) < NANOSECONDS for last in ends)
 
