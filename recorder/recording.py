@@ -29,7 +29,7 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
 from hearthlog.recorder.log.description import LogDescription, join_descriptions
 from hearthlog.recorder.log.finishing import LogFinisher
-from hearthlog.recorder.log.folder_lock import lock_folder
+from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
@@ -84,7 +84,7 @@ def record_files(
         If another recorder of this name uses the folder. If the log cannot be written, in which
         case what was written stays, for the next start to complete.
     """
-    with lock_folder(settings.output, settings.node):
+    with FolderLock(settings.output, settings.node):
         recovered = recover_active(settings.output, settings.node)
         summary = record(settings, source, stop, reload_requests)
     summary.recovered = recovered
@@ -115,7 +115,7 @@ def record_microphones(
         As `record_files`.
     """
     with ExitStack() as stack:
-        stack.enter_context(lock_folder(settings.output, settings.node))
+        lock = stack.enter_context(FolderLock(settings.output, settings.node))
         # They capture, and their pipes hold, while older logs are completed.
         sources = {
             each.name: stack.enter_context(closing(MicrophoneSource(each.device)))
@@ -127,7 +127,7 @@ def record_microphones(
             name: _Resumed(source, end_of_sound(settings.output, settings.node, name, now))
             for name, source in sources.items()
         }
-        summary = _record(settings, resumed, stop, reload_requests)
+        summary = _record(settings, resumed, stop, reload_requests, lock)
     summary.recovered = recovered
     return summary
 
@@ -186,10 +186,11 @@ def _record(
     sources: Mapping[str, SoundSource],
     stop: Flag,
     reload_requests: ReloadRequests | None,
+    lock: FolderLock | None = None,
 ) -> RecordingSummary:
     with ExitStack() as stack:
         models = _open_models(settings, list(sources), reload_requests, stack)
-        session = RecordingSession(settings, sources, models)
+        session = RecordingSession(settings, sources, models, lock)
         try:
             for microphone, event in merged_events(sources, stop):
                 session.add(microphone, event)
@@ -230,6 +231,8 @@ class RecordingSession:
         By the name of the microphone; of audio files no log may be there already.
     models : mapping of str to LabellingModels
         By the name of the microphone; several may have the same.
+    lock : FolderLock or None
+        Of the folder of the logs.
 
     Attributes
     ----------
@@ -249,6 +252,7 @@ class RecordingSession:
         settings: Settings,
         sources: Mapping[str, SoundSource],
         models: Mapping[str, LabellingModels],
+        lock: FolderLock | None = None,
     ) -> None:
         self._streams = {
             name: MicrophoneStream(settings, name, source, models[name])
@@ -268,7 +272,7 @@ class RecordingSession:
             file_bytes=settings.max_bag_size,
             finisher=self._finisher,
         )
-        self._log = LiveLog(log, settings.output, settings.node) if is_live else log
+        self._log = LiveLog(log, settings.output, settings.node, lock) if is_live else log
         pipelines = [stream.pipeline for stream in self._streams.values()]
         self._clips = ClipRecorder(settings, pipelines, self._log.file_at)
         self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None

@@ -22,7 +22,7 @@ from hearthlog.recorder.events import Frames
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.log import live_log
-from hearthlog.recorder.log.folder_lock import lock_folder
+from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.recording import RecordingSession
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.writer import LogWriter
@@ -213,8 +213,19 @@ def test_a_second_recorder_of_a_folder_is_refused_with_the_number_of_the_first(
     assert {path.name[:5] for path in logs.rglob("*.mcap")} == {"home_", "other"}
 
 
+def test_a_folder_that_was_moved_away_and_made_again_is_locked_again(labmic, hearthlog, tmp_path):
+    logs = tmp_path / "logs"
+    with recording(labmic, logs) as process:
+        wait_for_frames(logs, 20)
+        logs.rename(tmp_path / "away")
+        wait_for(process, "can be written again")
+        second = hearthlog("record", "--device", labmic.device, "-o", logs, env=labmic.env)
+    assert second.returncode == 1
+    assert f"is recorded by 'home' already (process {process.pid})" in second.stderr
+
+
 def test_a_folder_that_is_gone_at_the_end_is_no_failure(tmp_path):
-    with lock_folder(tmp_path / "logs", "home"):
+    with FolderLock(tmp_path / "logs", "home"):
         shutil.rmtree(tmp_path / "logs")
     assert not (tmp_path / "logs").exists()
 

@@ -3,9 +3,10 @@
 import errno
 import fcntl
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from hearthlog.schemas.errors import LogError
 
@@ -13,12 +14,12 @@ from hearthlog.schemas.errors import LogError
 _PASSING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO}
 
 
-@contextmanager
-def lock_folder(folder: Path, node: str) -> Iterator[None]:
-    """Hold the lock of a node in a folder of logs, which is made if it is not there.
+class FolderLock:
+    """The lock of a node in a folder of logs, which is made if it is not there.
 
-    The lock is the file `.<node>.lock`, in which the process writes its number. It stays there with
-    the logs, but is nobody's once the process has ended.
+    It is the file `.<node>.lock`, in which the process writes its number. It stays there with the
+    logs, but is nobody's once the process has ended. Where the disk takes no file now, nothing is
+    locked.
 
     Parameters
     ----------
@@ -29,33 +30,78 @@ def lock_folder(folder: Path, node: str) -> Iterator[None]:
     Raises
     ------
     LogError
-        If another recorder holds it, or the folder cannot be written to.
+        As a context manager at its start: if another recorder holds it, or the folder cannot be
+        written to.
     """
-    lock = folder / f".{node}.lock"
-    is_new = not folder.exists()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        if error.errno not in _PASSING:
+
+    def __init__(self, folder: Path, node: str) -> None:
+        self._folder = folder
+        self._node = node
+        self._path = folder / f".{node}.lock"
+        self._descriptor: int | None = None
+        self._is_new = False
+
+    def __enter__(self) -> Self:
+        self._is_new = not self._folder.exists()
+        self._hold()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._release()
+        if self._is_new:
+            self._remove_unused()
+
+    def renew(self) -> None:
+        """Hold the lock again if its folder has been deleted, moved away or mounted since.
+
+        Raises
+        ------
+        LogError
+            If another recorder holds it now, or the folder cannot be written to.
+        """
+        if self._descriptor is None or not self._is_here(self._descriptor):
+            self._release()
+            self._hold()
+
+    def _is_here(self, descriptor: int) -> bool:
+        try:
+            return os.path.samestat(self._path.stat(), os.fstat(descriptor))
+        except OSError:
+            return False
+
+    def _hold(self) -> None:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self._path, flags, 0o600)
+        except OSError as error:
+            if error.errno in _PASSING:
+                return
             code = errno.ENOTDIR if error.errno == errno.EEXIST else error.errno
-            raise LogError(f"{folder}: cannot be written ({os.strerror(code or 0)})") from error
-        yield
-        return
-    try:
-        _lock(descriptor, folder, node)
-        yield
-    finally:
-        os.close(descriptor)
-        if is_new:
-            _remove_unused(folder, lock)
+            what = os.strerror(code or 0)
+            raise LogError(f"{self._folder}: cannot be written ({what})") from error
+        try:
+            _lock(descriptor, self._folder, self._node)
+        except LogError:
+            os.close(descriptor)
+            raise
+        self._descriptor = descriptor
 
+    def _release(self) -> None:
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
 
-def _remove_unused(folder: Path, lock: Path) -> None:
-    with suppress(OSError):  # the folder is gone, or its disk
-        if list(folder.iterdir()) == [lock]:  # nothing was recorded
-            lock.unlink()
-            folder.rmdir()
+    def _remove_unused(self) -> None:
+        with suppress(OSError):  # the folder is gone, or its disk
+            if list(self._folder.iterdir()) == [self._path]:  # nothing was recorded
+                self._path.unlink()
+                self._folder.rmdir()
 
 
 def _lock(descriptor: int, folder: Path, node: str) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -35,12 +36,17 @@ class LiveLog:
         Its folder.
     node : str
         Name of the recorder.
+    lock : FolderLock or None
+        Of the folder.
     """
 
-    def __init__(self, log: RollingLog, root: Path, node: str) -> None:
+    def __init__(
+        self, log: RollingLog, root: Path, node: str, lock: FolderLock | None = None
+    ) -> None:
         self._log = log
         self._root = root
         self._node = node
+        self._lock = lock
         self._mount = _mount_of(root)
         self._held: deque[_Held] = deque()  # not yet known to be on the disk
         self._held_bytes = 0
@@ -143,6 +149,8 @@ class LiveLog:
         try:
             if self._failing:
                 self._check_disk()
+                if self._lock is not None:
+                    self._lock.renew()
                 self._log.begin_after_failure()
                 self._pour(self._held)
                 self._log.sync()
