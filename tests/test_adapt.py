@@ -16,21 +16,18 @@ from hearthlog.analyzer.evaluation.adaptation_curve import CORRECTED, adaptation
 from hearthlog.analyzer.evaluation.evaluate_method import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.evaluate_model import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.relabel.home_sound import read_home_sound
 from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.dataset import Recording, build_dataset, cut_recordings
+from hearthlog.analyzer.training.dataset import Recording, cut_recordings
 from hearthlog.analyzer.training.home_data import (
     HOME_WEIGHT,
     home_recordings,
-    home_sequences,
     lesson_recordings,
 )
-from hearthlog.analyzer.training.home_transitions import adapt_transitions
-from hearthlog.analyzer.training.manifest import read_manifest
 from hearthlog.analyzer.training.method import prepare, softmax
 from hearthlog.analyzer.training.scenario import BUILTIN, Scenario, scenario_of
 from hearthlog.analyzer.training.svm_method import BANDS, ROOM
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, SvmMachine, home_votes
 from hearthlog.models.errors import ModelError
@@ -313,39 +310,23 @@ def test_a_mark_by_another_name_is_learned_as_its_class(recorded):
         layer = write_marks(log, marks)
         try:
             data = cut_recordings(home_recordings(recorded), BUILTIN["general"])
-            (follows,) = home_sequences(recorded, data.classes)
         finally:
             layer.unlink()
-        learned.append((data.digest, data.amounts, follows.tolist()))
+        learned.append((data.digest, data.amounts))
     assert learned[0] == learned[1]
     assert [name for name, one in learned[0][1].items() if one.seconds] == ["crying", "yelling"]
 
 
-def test_marks_without_time_between_them_say_what_follows_what(recorded):
-    log = find_logs(recorded)[0]
-    stamps = read_columns([log], ["/mic/features"])["/mic/features"]["header.stamp"]
-    marks = [
-        Mark("mic", int(stamps[100]), int(stamps[140]), "speech"),
-        Mark("mic", int(stamps[140]), int(stamps[150]), "coughing"),
-        Mark("mic", int(stamps[300]), int(stamps[400]), "speech"),
-    ]
-    layer = write_marks(log, marks)
-    try:
-        (found,) = home_sequences(recorded, ["coughing", "speech"])
-    finally:
-        layer.unlink()
-    assert found.tolist() == [1] * 40 + [0] * 10
-
-
-def test_a_home_teaches_how_long_its_sounds_go_on(world):
+def test_transitions_that_an_earlier_version_learned_from_a_home_are_forgotten(world):
     base, few, _ = world
-    sequence = np.repeat([0, 1, 0], [1000, 10, 1000])
-    kept = adapt_model(base, few)
-    learned = adapt_transitions(kept, [sequence], [])
-    assert learned.transitions[0, 0] > kept.transitions[0, 0]
-    assert learned.transitions[1, 0] > kept.transitions[1, 0]
-    np.testing.assert_allclose(learned.transitions[2], kept.transitions[2], rtol=1e-12)
-    np.testing.assert_array_equal(kept.transitions, base.transitions)
+    training = base.description.training_data.model_copy(update={"home_frames": 1000})
+    description = base.description.model_copy(update={"training_data": training})
+    learned = np.full_like(base.transitions, 1.0 / len(base.classes))
+    adapted = adapt_model(
+        dataclasses.replace(base, description=description, transitions=learned), few
+    )
+    np.testing.assert_array_equal(adapted.transitions, default_transitions(base.classes))
+    assert not adapted.description.training_data.home_frames
 
 
 def test_a_second_across_a_gap_is_not_learned_from(recorded):
@@ -388,71 +369,6 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     speech = home.amounts["speech"]
     assert speech.seconds == pytest.approx(6.0, abs=0.1)
     assert learned["speech"]["segments"] == speech.segments + kept.get("speech", 0)
-
-
-@pytest.fixture(scope="module")
-def smoothed(training_set, tmp_path_factory):
-    """A model that smooths, learned from simulated sound."""
-    output = tmp_path_factory.mktemp("smoothed") / "smoothed.safetensors"
-    scenario = BUILTIN["general"]
-    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, ignore_progress)
-    save_model(train_model(data, scenario, ignore_progress), output)
-    return output
-
-
-def test_the_last_weeks_are_labelled_as_a_recorder_does_and_long_silence_is_cut(
-    day, smoothed, tmp_path
-):
-    model = load_model(smoothed)
-    settings = Settings(output=tmp_path, model=smoothed)
-    record(settings, FileSource([day], 1_772_348_400 * 10**9), Event())
-    (columns,) = read_columns(find_logs(tmp_path), ["/mic/label"]).values()
-    sound, losses = read_home_sound([tmp_path], model)
-    assert losses == []
-    (kept,) = sound
-    labelled = columns["probabilities"]
-    silent = labelled.argmax(axis=1) == model.classes.index("silence")
-    runs = np.split(np.arange(len(silent)), np.flatnonzero(np.diff(silent)) + 1)
-    middles = [run[100:-100] for run in runs if silent[run[0]]]  # of those between two sounds
-    assert max(len(middle) for middle in middles) > 20
-    assert len(labelled) - len(kept) >= sum(map(len, middles))
-    rows = {row.tobytes() for row in labelled}
-    assert all(row.tobytes() in rows for row in kept)
-    np.testing.assert_array_equal(kept[~(kept.argmax(axis=1) == 0)], labelled[~silent])
-
-
-def test_of_two_weeks_only_what_can_be_read_is_learned_from(smoothed, day, tmp_path):
-    model = load_model(smoothed)
-    for number, date in enumerate(("2026-01-01", "2026-03-01", "2026-03-02")):
-        output = tmp_path / "logs"
-        start = int(np.datetime64(date, "ns").astype(int))
-        settings = Settings(output=output, model=None)
-        record(settings, FileSource([day], start), Event())
-        assert len(find_logs(output)) == number + 1
-    _, second, last = find_logs(tmp_path / "logs")
-    assert len(read_home_sound([tmp_path / "logs"], model).sound) == 2
-    data = bytearray(last.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    last.write_bytes(data)
-    sound, (loss,) = read_home_sound([tmp_path / "logs"], model)
-    assert str(last) in loss
-    expected, _ = read_home_sound([second], model)
-    np.testing.assert_array_equal(sound[-1], expected[0])
-
-
-def test_a_home_without_a_mark_teaches_what_follows_what(hearthlog, smoothed, recorded, tmp_path):
-    output = tmp_path / "home.safetensors"
-    done = hearthlog("train", "--base", smoothed, "--home", recorded, "-o", output)
-    assert done.returncode == 0, done.stderr
-    assert "nothing is marked: only what follows what is learned" in done.stderr
-    base, home = load_model(smoothed), load_model(output)
-    for name, array in base.arrays.items():
-        np.testing.assert_array_equal(array, home.arrays[name])
-    assert (home.transitions != base.transitions).any()
-    training = home.description.training_data
-    assert training.home_frames > 1000
-    assert training.base_sha256 == base.sha256
-    assert "minutes of a home without marks" in model_card(home)
 
 
 def test_augmented_sound_is_what_the_other_microphone_would_give():

@@ -21,7 +21,6 @@ from hearthlog.analyzer.training.home_data import (
     HOME,
     HOME_WEIGHT,
     MOST_OF_MARK,
-    home_sequences,
     lesson_recordings,
 )
 from hearthlog.analyzer.training.home_lessons import home_lessons
@@ -127,7 +126,6 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     halves = (longest[0], middle, "speech"), (middle, longest[1], "music")
     write(home, halves, [drawn, whole(home)])
     assert not list(lesson_recordings(home))
-    assert not home_sequences(home, model.classes)
     for found in (
         confirmed_segments(sound(home), model.classes),
         labelled_segments(sound(home), model.classes, model.classes),

@@ -6,7 +6,6 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
-from hmmlearn import hmm
 from logreader import LogReader
 from lossy import LossySource
 from rewriting import Log
@@ -15,11 +14,10 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.analyzer.replay.replay import replay as replay_logs
-from hearthlog.analyzer.training.hidden_markov import learn_transitions, viterbi
+from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.transitions import (
     FRAME_SECONDS,
     LAG_SECONDS,
-    count_transitions,
     default_transitions,
 )
 from hearthlog.models.classifiers.classifier import Classifier
@@ -176,54 +174,6 @@ def test_sounds_go_on_for_as_long_as_expected_and_end_in_silence():
 def test_without_a_class_of_silence_all_other_classes_are_as_likely_to_follow():
     transitions = default_transitions(["music", "kettle", "speech"])
     assert transitions[0, 1] == transitions[0, 2] == pytest.approx(0.05 / 20.0 / 2)
-
-
-def test_transitions_are_learned_from_sequences_and_what_was_never_seen_is_as_expected():
-    classes = ["kettle", "drill", "saw"]
-    sequence = np.tile(np.repeat([0, 1], 100), 50)
-    counts = count_transitions([sequence, sequence[:0], sequence[:1]], classes)
-    transitions = learn_transitions([], counts, 1.0)
-    np.testing.assert_allclose(transitions.sum(axis=1), 1.0)
-    np.testing.assert_allclose(transitions[0, 1], 0.01, rtol=0.1)
-    assert 0 < transitions[0, 2] < 0.001
-    np.testing.assert_allclose(transitions[2], default_transitions(classes)[2])
-
-
-def noisy_sound(seed, frames=6000):
-    """States that follow each other by known transitions, and what a poor classifier says."""
-    rng = np.random.default_rng(seed)
-    truth = np.array([[0.96, 0.04, 0.0], [0.02, 0.93, 0.05], [0.0, 0.1, 0.9]])
-    states = [0]
-    for draw in rng.random(frames - 1):
-        states.append(int(np.searchsorted(truth[states[-1]].cumsum(), draw)))
-    emissions = np.full((3, 3), 0.2) + 0.4 * np.eye(3)
-    symbols = [rng.choice(3, p=emissions[state]) for state in states]
-    return truth, emissions, np.array(symbols), np.array(states)
-
-
-def test_transitions_are_learned_from_sound_that_nobody_labelled():
-    truth, emissions, symbols, _ = noisy_sound(0)
-    counts = count_transitions([], ["kettle", "drill", "saw"])
-    sound = (emissions / emissions.sum(axis=0)).T[symbols].astype(np.float32)
-    expected = learn_transitions([], counts, 1.0)
-    learned = learn_transitions([sound[:2000], sound[:0], sound[2000:]], counts, 4.0)
-    np.testing.assert_allclose(learned.sum(axis=1), 1.0)
-    assert np.abs(learned - truth).max() < 0.5 * np.abs(expected - truth).max()
-
-
-def test_transitions_are_those_that_hmmlearn_learns_where_the_emissions_are_known(caplog):
-    _, emissions, symbols, _ = noisy_sound(1)
-    counts = count_transitions([], ["silence", "coughing", "speech"])
-    peer = hmm.CategoricalHMM(3, transmat_prior=1.0 + counts, params="t", init_params="", n_iter=10)
-    peer.startprob_, peer.emissionprob_ = np.full(3, 1 / 3), emissions
-    peer.transmat_ = counts / counts.sum(axis=1, keepdims=True)
-    peer.monitor_.tol = -np.inf
-    peer.fit(symbols[:, np.newaxis], [2000, 4000])
-    sound = (emissions / emissions.sum(axis=0)).T[symbols]
-    caplog.clear()
-    learned = learn_transitions([sound[:2000], sound[2000:]], counts, 4.0)
-    np.testing.assert_allclose(learned, peer.transmat_, rtol=0.02, atol=1e-4)
-    assert not caplog.records
 
 
 def test_a_single_cough_survives_and_a_flicker_does_not():

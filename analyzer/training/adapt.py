@@ -95,6 +95,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
             "home": home.amounts,
             "home_confirmed": _confirmed(home),
             "home_spans": merged_spans(home.spans),
+            "home_frames": 0,
             "base_sha256": base.sha256,
         }
     )
@@ -105,7 +106,8 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         "smoothing": smoothing.model_copy(update={"weight": weight}),
     }
     transitions = base.transitions
-    if len(transitions) and home.classes != base.classes:
+    was_learned = base.description.training_data.home_frames > 0  # by an earlier version
+    if len(transitions) and (was_learned or home.classes != base.classes):
         transitions = default_transitions(home.classes)
     return Model(
         description.model_copy(update=update),

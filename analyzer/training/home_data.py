@@ -1,23 +1,22 @@
 """A home's own sound to learn from: marked spans of its logs, and enrolled sounds."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.marked_sound import HomeSound, read_reviewed_sound
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, is_quiet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.schemas.arrays import Indices, Int64
+from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.times import NANOSECONDS
 
 HOME_WEIGHT = 3.0  # of a segment of the home; others have 1
@@ -158,53 +157,6 @@ def _teaching(marks: Iterable[Mark], reviewed: Iterable[ReviewedSpan]) -> list[M
             for span in drawn
         )
     ]
-
-
-def home_sequences(folder: Path, classes: Sequence[str]) -> list[Int64]:
-    """Read the sequences of classes in a home from marks that follow each other without a gap.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of logs, with review layers beside them.
-    classes : sequence of str
-        Their names; the index of a name is its number in the sequences.
-
-    Returns
-    -------
-    list of np.ndarray [shape=(n,)], int64
-        Numbers of the classes of successive frames; marks on their own are left out.
-
-    Raises
-    ------
-    LogError
-        If there is no log, or if a layer is damaged.
-    """
-    numbers = {name: number for number, name in enumerate(classes)}
-    sequences: list[Int64] = []
-    for log in find_logs(folder, enrolled=True):
-        runs: list[list[Mark]] = []
-        marks = _teaching(read_marks(log), read_reviewed(log))
-        names = translation({mark.label for mark in marks}, classes)
-        for mark in sorted(mark._replace(label=names[mark.label]) for mark in marks):
-            last = runs[-1][-1] if runs else None
-            follows = (
-                last is not None
-                and mark.microphone == last.microphone
-                and mark.start - last.end < FRAME_NANOSECONDS
-                and mark.label in numbers
-            )
-            if follows and last is not None and last.label in numbers:
-                runs[-1].append(mark)
-            else:
-                runs.append([mark])
-        sequences += [_frames_of(run, numbers) for run in runs if len(run) > 1]
-    return sequences
-
-
-def _frames_of(run: Sequence[Mark], numbers: Mapping[str, int]) -> Int64:
-    frames = [max((mark.end - mark.start) // FRAME_NANOSECONDS, 1) for mark in run]
-    return np.repeat(np.array([numbers[mark.label] for mark in run], np.int64), frames)
 
 
 def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:

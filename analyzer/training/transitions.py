@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hearthlog.models.classes import SILENCE, class_name, find_class
-from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 LAG_SECONDS = 2.0  # gives the path of the whole sound in 90 minutes of real clips; 1 s does not
@@ -57,27 +57,3 @@ def expected_durations(classes: Sequence[str]) -> Float64:
     """
     rows = map(find_class, classes)
     return np.array([_SECONDS if row is None else row.seconds for row in rows])
-
-
-def count_transitions(sequences: Sequence[Int64], classes: Sequence[str]) -> Float64:
-    """Count the transitions in labelled sequences, and add those expected of a visit to each class.
-
-    Parameters
-    ----------
-    sequences : sequence of np.ndarray [shape=(n,)], int64
-        Indices of the classes of successive frames.
-    classes : sequence of str
-        Names of the C classes.
-
-    Returns
-    -------
-    np.ndarray [shape=(C, C)], float64
-        Number of frames of the row's class that are followed by one of the column's class.
-    """
-    count = len(classes)
-    frames = np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
-    counts = default_transitions(classes) * frames[:, np.newaxis]
-    for sequence in sequences:
-        pairs = sequence[:-1] * count + sequence[1:]
-        counts += np.bincount(pairs, minlength=count * count).reshape(count, count)
-    return counts

@@ -60,7 +60,7 @@ class TrainingData(_Record):
     home_confirmed : dict of str to int
         Segments among these that a reviewer has left as they were labelled; the others are marked.
     home_frames : int
-        Frames of the home without marks, from which transitions are.
+        Frames of the home from which a model of an earlier version learned transitions.
     home_spans : list of [start, end]
         Time of the home whose sound was learned from, in nanoseconds of UTC, in order; by whatever
         microphone, and with what is less than a minute between.

@@ -19,11 +19,8 @@ from hearthlog.analyzer.logs.coverage import find_coverage
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.labellings import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
-from hearthlog.analyzer.relabel.home_sound import read_home_sound
 from hearthlog.analyzer.training.adapt import adapt_model
-from hearthlog.analyzer.training.home_data import home_sequences
 from hearthlog.analyzer.training.home_lessons import home_lessons
-from hearthlog.analyzer.training.home_transitions import adapt_transitions
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import load_model
@@ -152,9 +149,7 @@ def _learned(base: Model, logs: Sequence[RecentLog], marks: Sequence[Mark]) -> M
             name = marks[0].microphone
             looked_at = ReviewedSpan(name, logs[0].start, marks[-1].end)
             write_review(find_coverage(folder)[name], marks, looked_at)
-        model = adapt_model(base, home_lessons([folder], base).segments)
-        sequences = home_sequences(folder, model.classes)
-        return adapt_transitions(model, sequences, read_home_sound([folder], model).sound)
+        return adapt_model(base, home_lessons([folder], base).segments)
 
 
 def line_of(outcome: Outcome) -> str:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,7 +22,7 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.scores import print_counts, print_skipped
 from hearthlog.tools.cli.table import print_table
-from hearthlog.tools.cli.text import first_of, tell, wrong_use
+from hearthlog.tools.cli.text import tell, wrong_use
 from hearthlog.tools.cli.verdict import print_verdict, refusal
 
 if TYPE_CHECKING:
@@ -200,7 +199,7 @@ def _learned(
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         model = train_model(segments, chosen, report, method, smoothing)
-    return (_with_home_transitions(model, home) if home else model), segments
+    return model, segments
 
 
 def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
@@ -209,40 +208,18 @@ def _adapted(base: Path, home: list[Path]) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.training.home_lessons import home_lessons
     from hearthlog.models.modelfile.modelfile import load_model
 
-    model = adapted = load_model(base)
+    model = load_model(base)
     segments, notes, nothing = home_lessons(home, model)
     for note in notes:
         tell(note)
-    what = f"learning from {len(segments)} segments of the home besides"
-    if len(segments):
-        with share_done(what, announce=True):
-            adapted = adapt_model(model, segments)
-    adapted = _with_home_transitions(adapted, home)
-    if adapted is model:
+    if not len(segments):
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
         why = "; ".join(reasons) or nothing
         raise DataError(f"the home has no segments of a class of the model ({why})")
-    if nothing:
-        tell(f"{nothing}: only what follows what is learned, not how the home sounds")
+    what = f"learning from {len(segments)} segments of the home besides"
+    with share_done(what, announce=True):
+        adapted = adapt_model(model, segments)
     return adapted, segments
-
-
-def _with_home_transitions(model: "Model", home: list[Path]) -> "Model":
-    from hearthlog.analyzer.relabel.home_sound import read_home_sound
-    from hearthlog.analyzer.training.home_data import home_sequences
-    from hearthlog.analyzer.training.home_transitions import adapt_transitions
-
-    if not len(model.transitions):
-        return model
-    if find_spec("hmmlearn") is None:
-        tell("hmmlearn is not installed: transitions are not learned from the home")
-        return model
-    with share_done("learning what follows what in the home", announce=True) as report:
-        sequences = [run for folder in home for run in home_sequences(folder, model.classes)]
-        sound, losses = read_home_sound(home, model, report)
-        for line in first_of("not learned from", losses, hint=""):
-            tell(line)
-        return adapt_transitions(model, sequences, sound)
 
 
 def _home_recordings(
