@@ -10,6 +10,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    field_serializer,
     field_validator,
 )
 from pydantic.fields import FieldInfo
@@ -21,6 +22,7 @@ from pydantic_settings import (
 )
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
+from hearthlog.recorder.addresses import public_name
 from hearthlog.recorder.disk.keeping import KeepingRules
 from hearthlog.recorder.disk.retention import Limits
 from hearthlog.recorder.disk.sizes import Size
@@ -55,8 +57,12 @@ class MicrophoneSettings(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: Annotated[str, _checked(check_microphone_name)] = "mic"
-    device: str = ""  # as `hearthlog devices` lists it; empty: the default one
+    device: str = ""  # as `hearthlog devices` lists it, or an address; empty: the default one
     model: Path | None = None  # instead of the recorder's
+
+    @field_serializer("device", when_used="json")
+    def _name_device(self, device: str) -> str:
+        return public_name(device)  # logs have no passwords
 
 
 class _Environment(EnvSettingsSource):
@@ -206,7 +212,7 @@ def _check_microphones(microphones: list[MicrophoneSettings]) -> None:
         values = [getattr(each, key) for each in microphones]
         twice = next((value for value in values if values.count(value) > 1), None)
         if twice is not None:
-            what = f"{key} {twice!r}" if twice else "the default device"
+            what = f"{key} {public_name(twice)!r}" if twice else "the default device"
             raise ConfigurationError(
                 f"configuration: two microphones have {what}; say which is which"
             )

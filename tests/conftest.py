@@ -13,6 +13,7 @@ from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
 from spliced import record_logs
 from stores import bucket, in_memory, s3_account
+from streams import camera, live_server
 
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import read_manifest
@@ -34,9 +35,11 @@ from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
     "bucket",
+    "camera",
     "in_memory",
     "labmic",
     "labmic_plugin",
+    "live_server",
     "pulse_daemon",
     "pulse_microphone",
     "s3_account",

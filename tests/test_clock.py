@@ -74,6 +74,17 @@ def test_time_never_jumps_nor_runs_backwards(ppm, noise, seed):
     assert np.abs(steps - 0.05).max() < 0.05 * (noise + 1e-3)
 
 
+def test_frames_stay_in_order_where_the_first_sound_came_seconds_late():
+    clock, times = SampleClock(RATE), []
+    for index in range(0, 60 * RATE, BLOCK):
+        late = 3.0 if index < 4 * RATE else 0.0
+        clock.observe(index, float(true_time(index)) + late, is_exact=False)
+        times.append(clock.time(np.arange(index, index + BLOCK, FRAME_SAMPLES, dtype=float)))
+    times = np.concatenate(times)
+    assert np.diff(times).min() > 0.04
+    assert times[-1] == pytest.approx(float(true_time(60 * RATE - FRAME_SAMPLES)), abs=1e-3)
+
+
 def block(index, taken_at, count=BLOCK, *, overflowed=False, position=None):
     samples = (np.arange(index, index + count) % 30_000).astype(np.int16)
     return SampleBlock(

@@ -8,14 +8,15 @@ from threading import Event as Flag
 
 import numpy as np
 
+from hearthlog.recorder.addresses import check_address, is_address, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealth
+from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import CaptureProcess
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
-_STALE_SECONDS = 3.0
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)
 _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
@@ -32,23 +33,25 @@ class MicrophoneSource:
     Parameters
     ----------
     device : str
-        As `hearthlog devices` lists it, or empty for the default one.
+        As `hearthlog devices` lists it, empty for the default one, or an address in the network.
     waits : bool, optional
         Whether a device that is not there at the start is waited for, as it is later.
 
     Attributes
     ----------
     device : str
-        Name of the device that is heard, or was last; before that, as given.
+        Name of the device that is heard, or was last; before that, as given. Without the user and
+        the password of an address.
 
     Raises
     ------
     SourceError
-        If no microphone can be captured on this machine, or this one not, unless it is waited for.
+        If no microphone can be captured on this machine, or this one not, unless it is waited for;
+        if an address cannot be one of sound.
     """
 
     def __init__(self, device: str, *, waits: bool = True) -> None:
-        self.device = device
+        self.device = public_name(device)
         self._wanted = device
         self._heard = False  # from then on `_wanted` is the identity of the device
         self._capture: CaptureProcess | None = None
@@ -56,12 +59,11 @@ class MicrophoneSource:
         self._silent_frames = 0
         self._frames_lost = 0
         self._health = (OK, "starting")
-        try:
-            self._open()
-        except DeviceError as error:
-            if not waits:
-                raise
-            self._health = (ERROR, f"{error}; waiting for it")
+        if is_address(device):
+            check_address(device)
+            check_ffmpeg()
+        if not (waits and is_address(device)):  # the recorder does not wait for a network
+            self._try_at_the_start(waits=waits)
         self._last_health = self._health
         self._reported = -math.inf
         self._wall_offset = _wall_offset()
@@ -102,25 +104,34 @@ class MicrophoneSource:
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
         self._framer.begin(capture.format.rate, self._wall_offset, reason)
-        last_block = time.monotonic() + _FIRST_BLOCK_SECONDS - _STALE_SECONDS
+        stale = capture.stale_seconds
+        last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
             blocks = capture.blocks(_LOOK_SECONDS)
             if blocks is None:
-                return "the capture process ended"
+                return capture.reason()
             for block in blocks:
                 last_block = block.arrival
                 for event in self._framer.add(block):
                     self._watch(event)
                     yield event
-            if time.monotonic() - last_block > _STALE_SECONDS and not blocks:
+            if time.monotonic() - last_block > stale and not blocks:
                 return "the microphone went silent"
             self._watch_clock()
             if blocks:  # its frames' time: now would be ahead of them
                 yield from self._report(self._framer.last_stamp)
         return "the recorder was stopped"
 
-    def _open(self) -> None:
-        self._capture = CaptureProcess(self._wanted, exact=self._heard)
+    def _try_at_the_start(self, *, waits: bool) -> None:
+        try:
+            self._open(Flag())
+        except DeviceError as error:
+            if not waits:
+                raise
+            self._health = (ERROR, f"{error}; waiting for it")
+
+    def _open(self, stop: Flag) -> None:
+        self._capture = CaptureProcess(self._wanted, exact=self._heard, stop=stop)
         heard = self._capture.format
         self.device, self._wanted, self._heard = heard.device, heard.identity, True
 
@@ -128,8 +139,10 @@ class MicrophoneSource:
         pauses = iter(_RETRY_SECONDS)
         while not stop.is_set():
             try:
-                self._open()
+                self._open(stop)
             except SourceError as error:
+                if stop.is_set():
+                    return
                 self._health = (ERROR, f"{error}; waiting for it")
             else:
                 return

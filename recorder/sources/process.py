@@ -6,9 +6,11 @@ import os
 import select
 import subprocess
 import time
+from threading import Event as Flag
 
 import numpy as np
 
+from hearthlog.recorder.addresses import is_address
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
@@ -16,10 +18,14 @@ from hearthlog.recorder.sources.devices import Device
 from hearthlog.recorder.sources.framing import SampleBlock
 
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
+_NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.network_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
+_NETWORK_HANGS = "the capture process does not answer"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: how far the recorder may be behind
-_START_SECONDS = 10.0
+_START_SECONDS, _NETWORK_START_SECONDS = 10.0, 30.0
+_STALE_SECONDS, _NETWORK_STALE_SECONDS = 3.0, 20.0  # in the network it ends by itself before
+_LOOK_SECONDS = 0.25
 _INPUT_OVERFLOW = 2  # paInputOverflow
 
 
@@ -55,37 +61,38 @@ class CaptureProcess:
     Parameters
     ----------
     device : str
-        As `hearthlog devices` lists it, or empty for the default one.
+        As `hearthlog devices` lists it, empty for the default one, or an address in the network.
     exact : bool, optional
         Whether no other device will do whose name contains this one.
+    stop : threading.Event, optional
+        Ends the wait for its first answer when it is set.
 
     Attributes
     ----------
     format : CaptureFormat
+    stale_seconds : float
+        When it has sent no block for so long, it will send none.
 
     Raises
     ------
     DeviceError
-        If the device is not there or cannot be opened, in the words of the capture process; or if
-        PortAudio hangs.
+        If the device is not there or cannot be opened, in the words of the capture process; if
+        PortAudio hangs; or if it was stopped.
     SourceError
         If PortAudio is missing, cannot start, or crashes.
     """
 
-    def __init__(self, device: str, *, exact: bool = False) -> None:
-        self._process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, device, *(["exact"] if exact else [])],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
-            bufsize=0,
-        )
+    def __init__(self, device: str, *, exact: bool = False, stop: Flag | None = None) -> None:
+        self._in_network = is_address(device)
+        self.stale_seconds = _NETWORK_STALE_SECONDS if self._in_network else _STALE_SECONDS
+        self._process = _start_in_network(device) if self._in_network else _start(device, exact)
         assert self._process.stdout is not None
         self._pipe = self._process.stdout.fileno()
         fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         os.set_blocking(self._pipe, False)
         self._held = b""
         try:
-            self.format = self._read_format()
+            self.format = self._read_format(stop or Flag())
         except SourceError:
             self.kill()
             raise
@@ -119,21 +126,34 @@ class CaptureProcess:
             self._held = self._held[end:]
         return blocks
 
+    def reason(self) -> str:
+        """Say why the process has ended."""
+        if self._process.stderr is None:
+            return "the capture process ended"
+        said = self._process.stderr.read().decode(errors="replace").split("\n")
+        return next((line for line in reversed(said) if line), "the capture process ended")
+
     def kill(self) -> None:
         """End the process, even if it hangs."""
         self._process.kill()
         self._process.wait()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        for pipe in (self._process.stdout, self._process.stderr):
+            if pipe is not None:
+                pipe.close()
 
-    def _read_format(self) -> CaptureFormat:
-        deadline = time.monotonic() + _START_SECONDS
+    def _read_format(self, stop: Flag) -> CaptureFormat:
+        seconds = _NETWORK_START_SECONDS if self._in_network else _START_SECONDS
+        deadline = time.monotonic() + seconds
         while b"\n" not in self._held:
-            if not self._wait(deadline - time.monotonic()):
-                raise DeviceError(_HANGS)
+            if not self._wait(_LOOK_SECONDS):
+                if stop.is_set():
+                    raise DeviceError("the recorder was stopped")
+                if time.monotonic() > deadline:
+                    raise DeviceError(_NETWORK_HANGS if self._in_network else _HANGS)
+                continue
             data = self._read()
             if not data:
-                raise SourceError(_CRASHES)
+                raise DeviceError(self.reason()) if self._in_network else SourceError(_CRASHES)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)
@@ -146,6 +166,26 @@ class CaptureProcess:
 
     def _read(self) -> bytes:
         return os.read(self._pipe, _PIPE_BYTES)
+
+
+def _start(device: str, exact: bool) -> "subprocess.Popen[bytes]":  # noqa: FBT001
+    return subprocess.Popen(  # noqa: S603  our own module
+        [*_CAPTURE, device, *(["exact"] if exact else [])],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
+        bufsize=0,
+    )
+
+
+def _start_in_network(address: str) -> "subprocess.Popen[bytes]":
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(  # noqa: S603  our own module
+        _NETWORK_CAPTURE, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
+    )
+    assert process.stdin is not None
+    process.stdin.write(address.encode())
+    process.stdin.close()
+    return process
 
 
 def _block(head: tuple[int, int, int, float, float], data: bytes) -> SampleBlock:

@@ -9,6 +9,7 @@ from hearthlog.schemas.arrays import Float64
 _WINDOW_SECONDS = 2.0
 _WINDOWS = 150  # five minutes: long enough for 1 ppm, short enough to follow the temperature
 _PRIOR_PPM = 50.0  # expected error of a sound card's crystal, before it has been measured
+_STEEPEST = 0.1  # seconds of steering a second: frames stay in order, whatever arrives
 _PRIOR_NOISE = 100e-6  # seconds: expected lateness of the earliest observation of a window
 
 
@@ -98,10 +99,10 @@ class SampleClock:
         self._earliest = None
         self._window_end = nominal + _WINDOW_SECONDS
         now = self._late + self._slope * (nominal - self._anchor)
-        slope, ahead = self._fit(nominal + _WINDOW_SECONDS)
+        self._fitted_slope, ahead = self._fit(nominal + _WINDOW_SECONDS)
         self._anchor, self._late = nominal, now
-        self._slope = (ahead - now) / _WINDOW_SECONDS
-        self._fitted_slope = slope
+        slope = (ahead - now) / _WINDOW_SECONDS
+        self._slope = min(max(slope, -_STEEPEST), _STEEPEST)
 
     def _fit(self, nominal: float) -> tuple[float, float]:
         """Return how fast the observations grow late, and how late they are at a nominal time."""

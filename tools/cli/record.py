@@ -41,7 +41,10 @@ def record(
         ),
     ] = None,
     device: Annotated[
-        str | None, typer.Option(help="Microphone, as `hearthlog devices` lists it.")
+        str | None,
+        typer.Option(
+            help="Microphone, as `hearthlog devices` lists it, or rtsp:// or http:// address."
+        ),
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the microphone in the log.", show_default="mic")

@@ -1,0 +1,132 @@
+"""The capture process of a microphone in the network: what ffmpeg hears goes to standard output.
+
+It writes what the one of a microphone at this machine writes, with arrival times only; why it ends
+is the last line of standard error. The address comes on standard input, for arguments can be read
+by all users of the machine.
+"""
+
+import fcntl
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any
+
+from hearthlog.recorder.addresses import public_name
+from hearthlog.recorder.errors import DeviceError
+from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, CaptureFormat
+from hearthlog.recorder.sources.ffmpeg import explain, start_ffmpeg
+from hearthlog.recorder.sources.pace import Pace
+from hearthlog.schemas.frames import SAMPLE_RATE
+
+_PATIENCE_SECONDS = 15.0  # longer than ffmpeg's: a server may send something, but no sound
+_SETTLE_SECONDS = 3.0  # in which a server has sent what it kept for its listeners
+_PIPE_BYTES = 1 << 18  # 8 s of sound
+_SAMPLE_BYTES = 2
+_SAID_BYTES = 4000
+
+
+def main() -> None:
+    """Capture from the address on standard input, until killed or without a parent."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
+    address = sys.stdin.read()
+    try:
+        _capture(_Sound(address), address, os.fdopen(1, "wb", buffering=0))
+    except DeviceError as error:
+        sys.exit(str(error))
+    except BrokenPipeError:
+        pass
+
+
+class _Sound:
+    """What ffmpeg gives, every 0.6 s: each wake-up costs more than the samples it brings."""
+
+    def __init__(self, address: str) -> None:
+        self.began = self.arrival = time.monotonic()
+        self._address = address
+        self._process = start_ffmpeg(address)
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        self._pipe, self._errors = self._process.stdout.fileno(), self._process.stderr.fileno()
+        fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        for pipe in (self._pipe, self._errors):
+            os.set_blocking(pipe, False)
+        self._said = b""
+        self._has_sounded = False
+        self._parent = os.getppid()
+
+    def read(self) -> bytes:
+        """Wait for samples and return them; raise DeviceError if no more will come.
+
+        Until the next call, `arrival` is when they came, in seconds of CLOCK_MONOTONIC.
+        """
+        while True:
+            time.sleep(BLOCK_SECONDS)
+            if os.getppid() != self._parent:
+                sys.exit()
+            self._listen()
+            with suppress(BlockingIOError):
+                samples = os.read(self._pipe, _PIPE_BYTES)
+                if not samples:
+                    raise DeviceError(self._reason())
+                self.arrival, self._has_sounded = time.monotonic(), True
+                return samples
+            if time.monotonic() - self.arrival > _PATIENCE_SECONDS:
+                name = public_name(self._address)
+                raise DeviceError(f"{name} has sent no sound for {_PATIENCE_SECONDS:.0f} s")
+
+    def _listen(self) -> None:
+        with suppress(BlockingIOError):
+            self._said = (self._said + os.read(self._errors, _PIPE_BYTES))[-_SAID_BYTES:]
+
+    def _reason(self) -> str:
+        if self._has_sounded:
+            return f"{public_name(self._address)} has stopped sending"
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=1.0)
+        self._listen()
+        return explain(self._address, self._said.decode(errors="replace"))
+
+
+def _capture(sound: _Sound, address: str, output: Any) -> None:
+    pace = Pace(sound.began)
+    samples, arrival = _first_live(sound, pace)
+    name = public_name(address)
+    answer = CaptureFormat(name, address, SAMPLE_RATE)
+    output.write(json.dumps(asdict(answer)).encode() + b"\n")
+    index = 0
+    while True:
+        count = len(samples) // _SAMPLE_BYTES
+        output.write(BLOCK.pack(index, count, 0, math.inf, arrival))
+        output.write(samples)
+        index += count
+        samples = sound.read()
+        arrival = sound.arrival
+        pace.add(len(samples) // _SAMPLE_BYTES, arrival)
+        trouble = pace.trouble()
+        if trouble:
+            raise DeviceError(f"{name} {trouble}")
+
+
+def _first_live(sound: _Sound, pace: Pace) -> tuple[bytes, float]:
+    """Return the first samples that are not older than the call, and when the last was taken."""
+    held = b""
+    settled = math.inf
+    while sound.arrival < settled:
+        samples = sound.read()
+        settled = min(settled, sound.arrival + _SETTLE_SECONDS)
+        pace.add(len(samples) // _SAMPLE_BYTES, sound.arrival)
+        most = math.ceil((sound.arrival - sound.began) * SAMPLE_RATE)
+        held = (held + samples)[-most * _SAMPLE_BYTES :]
+    older, now = pace.settle()
+    return held[len(held) - (pace.count - older) * _SAMPLE_BYTES :], now
+
+
+if __name__ == "__main__":
+    main()
