@@ -33,8 +33,9 @@ class LiveServer:
     speed : float
         How much faster than it sounds the sound is sent.
     condition : str
-        "": sends sound; "stalls": sends no more; "ends": closes the connection; "html", "playlist":
-        answers with such; "locked": wants `listener` with password `pass@word`.
+        "": sends sound; "stalls": sends no more; "ends": closes the connection; "silent": does not
+        answer; "html", "playlist": answers with such; "locked": wants `listener` with password
+        `pass@word`.
     """
 
     def __init__(self, data: np.ndarray, secret: Path | None = None):
@@ -70,6 +71,8 @@ class LiveServer:
     def _answer(self, to: BaseHTTPRequestHandler):
         # "bGlz…" is listener:pass@word
         known = to.headers.get("Authorization") == "Basic bGlzdGVuZXI6cGFzc0B3b3Jk"
+        while self.condition == "silent":
+            time.sleep(0.1)
         if self.condition == "locked" and not known:
             to.send_response(401)
             to.send_header("WWW-Authenticate", 'Basic realm="microphone"')
