@@ -79,15 +79,19 @@ class LiveServer:
             to.end_headers()
             return
         to.send_response(200)
+        page = {
+            "html": "<!DOCTYPE html><html><body>Welcome</body></html>",
+            "playlist": f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nfile://{self.secret}\n"
+            "#EXT-X-ENDLIST\n",
+        }.get(self.condition)
+        if page is not None:
+            to.send_header("Content-Length", str(len(page)))
+            to.end_headers()
+            to.wfile.write(page.encode())
+            return
         to.end_headers()
-        if self.condition == "html":
-            to.wfile.write(b"<!DOCTYPE html><html><body>Welcome</body></html>")
-        elif self.condition == "playlist":
-            to.wfile.write(b"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\n")
-            to.wfile.write(f"{self.secret.as_uri()}\n#EXT-X-ENDLIST\n".encode())
-        else:
-            to.wfile.write(_WAV + b"data\xff\xff\xff\xff")
-            self._send_sound(to.wfile)
+        to.wfile.write(_WAV + b"data\xff\xff\xff\xff")
+        self._send_sound(to.wfile)
 
     def _send_sound(self, to):
         called = time.monotonic()
