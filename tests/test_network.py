@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
 
+CAPTURE = "hearthlog.recorder.sources.network_capture"
 USER = "listener:pass%40word@"
 
 
@@ -153,7 +155,7 @@ def test_a_camera_that_freezes_is_heard_again(camera, tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_server_is_said(live_server, tmp_path, condition, reason):
-    live_server.secret = tmp_path / "secret.wav"
+    live_server.secret = tmp_path / "secret.mp3"
     soundfile.write(live_server.secret, noise(5), RATE)
     live_server.speed, live_server.condition = (
         (3.0, "") if condition == "fast" else (1.0, condition)
@@ -214,11 +216,12 @@ def test_ffmpeg_ends_with_what_it_was_started_for_and_its_address_is_no_argument
 
 
 def children(recorder):
-    """What runs below a recorder, but for what looks after its disk, which may end just now."""
-    capture = next(
-        one for one in recorder.children() if "network_capture" in " ".join(one.cmdline())
-    )
-    return [capture, *capture.children()]
+    """The capture process and ffmpeg, without what looks after the disk and may end just now."""
+    found = []
+    for one in recorder.children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            found += [one] if {"-nostdin", CAPTURE} & set(one.cmdline()) else []
+    return found
 
 
 @pytest.mark.parametrize(
