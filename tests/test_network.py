@@ -4,8 +4,9 @@ import os
 import signal
 import socket
 import subprocess
+import threading
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,8 +23,9 @@ from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder.addresses import check_address, public_name
 from hearthlog.recorder.config import MicrophoneSettings
 from hearthlog.recorder.errors import DeviceError, SourceError
+from hearthlog.recorder.events import SourceHealth
+from hearthlog.recorder.sources.microphone import MicrophoneSource
 from hearthlog.recorder.sources.pace import Pace
-from hearthlog.recorder.sources.process import CaptureProcess
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds
@@ -166,14 +168,12 @@ def test_what_is_wrong_with_a_server_is_said(live_server, tmp_path, condition, r
 def why(address):
     """Return why a source is not heard, or is no more."""
     try:
-        capture = CaptureProcess(address)
+        with closing(MicrophoneSource(address, waits=False)) as source:
+            for event in source.events(threading.Event()):
+                if isinstance(event, SourceHealth) and event.level:
+                    return event.summary
     except DeviceError as error:
         return str(error)
-    while capture.blocks(1.0) is not None:
-        pass
-    said = capture.reason()
-    capture.kill()
-    return said
 
 
 def test_what_is_wrong_with_a_camera_is_said(camera):
@@ -183,7 +183,7 @@ def test_what_is_wrong_with_a_camera_is_said(camera):
     assert why(f"rtsp://{locked}").startswith(f"rtsp://{locked} wants a user name and a password")
     refused = why(f"rtsp://listener:wrong@{locked}")
     assert refused == f"rtsp://{locked} refuses the user name or the password"
-    CaptureProcess(f"rtsp://{USER}{locked}").kill()
+    MicrophoneSource(f"rtsp://{USER}{locked}", waits=False).close()
 
 
 def test_a_host_that_is_not_there_is_told_from_one_that_refuses():

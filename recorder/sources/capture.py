@@ -33,11 +33,12 @@ _QUEUE_BLOCKS = 300  # a minute, beyond what the pipe holds
 
 @dataclass(frozen=True)
 class CaptureFormat:
-    """Where the blocks come from, and how many samples a second there are."""
+    """Where the blocks come from, how many samples a second there are, and how steadily."""
 
     device: str
     identity: str  # of the device: what it is asked for by when it is plugged in again
     rate: int
+    stale_seconds: float = 3.0  # without a block, after which none will come
 
 
 def main() -> None:

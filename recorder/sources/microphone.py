@@ -13,7 +13,7 @@ from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
-from hearthlog.recorder.sources.process import CaptureProcess
+from hearthlog.recorder.sources.process import CaptureProcess, NetworkProcess
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
@@ -54,7 +54,7 @@ class MicrophoneSource:
         self.device = public_name(device)
         self._wanted = device
         self._heard = False  # from then on `_wanted` is the identity of the device
-        self._capture: CaptureProcess | None = None
+        self._capture: CaptureProcess | NetworkProcess | None = None
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
@@ -100,16 +100,19 @@ class MicrophoneSource:
             self._capture = None
 
     def _capture_run(
-        self, capture: CaptureProcess, reason: str, stop: Flag
+        self, capture: CaptureProcess | NetworkProcess, reason: str, stop: Flag
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
         self._framer.begin(capture.format.rate, self._wall_offset, reason)
-        stale = capture.stale_seconds
+        stale = capture.format.stale_seconds
         last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
-            blocks = capture.blocks(_LOOK_SECONDS)
+            try:
+                blocks = capture.blocks(_LOOK_SECONDS)
+            except DeviceError as error:
+                return str(error)
             if blocks is None:
-                return capture.reason()
+                return "the capture process ended"
             for block in blocks:
                 last_block = block.arrival
                 for event in self._framer.add(block):
@@ -131,7 +134,10 @@ class MicrophoneSource:
             self._health = (ERROR, f"{error}; waiting for it")
 
     def _open(self, stop: Flag) -> None:
-        self._capture = CaptureProcess(self._wanted, exact=self._heard, stop=stop)
+        if is_address(self._wanted):
+            self._capture = NetworkProcess(self._wanted, stop)
+        else:
+            self._capture = CaptureProcess(self._wanted, exact=self._heard)
         heard = self._capture.format
         self.device, self._wanted, self._heard = heard.device, heard.identity, True
 

@@ -24,6 +24,7 @@ from hearthlog.recorder.sources.ffmpeg import explain, start_ffmpeg
 from hearthlog.recorder.sources.pace import Pace
 from hearthlog.schemas.frames import SAMPLE_RATE
 
+_STALE_SECONDS = 20.0  # of silence: this process ends by itself before
 _PATIENCE_SECONDS = 15.0  # longer than ffmpeg's: a server may send something, but no sound
 _SETTLE_SECONDS = 3.0  # in which a server has sent what it kept for its listeners
 _PIPE_BYTES = 1 << 18  # 8 s of sound
@@ -98,7 +99,7 @@ def _capture(sound: _Sound, address: str, output: Any) -> None:
     pace = Pace(sound.began)
     samples, arrival = _first_live(sound, pace)
     name = public_name(address)
-    answer = CaptureFormat(name, address, SAMPLE_RATE)
+    answer = CaptureFormat(name, address, SAMPLE_RATE, _STALE_SECONDS)
     output.write(json.dumps(asdict(answer)).encode() + b"\n")
     index = 0
     while True:

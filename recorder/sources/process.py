@@ -10,7 +10,6 @@ from threading import Event as Flag
 
 import numpy as np
 
-from hearthlog.recorder.addresses import is_address
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
@@ -20,11 +19,10 @@ from hearthlog.recorder.sources.framing import SampleBlock
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
 _NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.network_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
-_NETWORK_HANGS = "the capture process does not answer"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: how far the recorder may be behind
-_START_SECONDS, _NETWORK_START_SECONDS = 10.0, 30.0
-_STALE_SECONDS, _NETWORK_STALE_SECONDS = 3.0, 20.0  # in the network it ends by itself before
+_START_SECONDS = 10.0
+_NETWORK_START_SECONDS = 30.0  # it ends by itself before
 _LOOK_SECONDS = 0.25
 _INPUT_OVERFLOW = 2  # paInputOverflow
 
@@ -55,44 +53,21 @@ def query_devices() -> list[Device]:
     return [Device(**device) for device in devices]
 
 
-class CaptureProcess:
-    """One run of the capture process.
+class _Process:
+    """One run of a capture process, up to its first answer."""
 
-    Parameters
-    ----------
-    device : str
-        As `hearthlog devices` lists it, empty for the default one, or an address in the network.
-    exact : bool, optional
-        Whether no other device will do whose name contains this one.
-    stop : threading.Event, optional
-        Ends the wait for its first answer when it is set.
+    _hangs: str
+    _crashes: str
 
-    Attributes
-    ----------
-    format : CaptureFormat
-    stale_seconds : float
-        When it has sent no block for so long, it will send none.
-
-    Raises
-    ------
-    DeviceError
-        If the device is not there or cannot be opened, in the words of the capture process; if
-        PortAudio hangs; or if it was stopped.
-    SourceError
-        If PortAudio is missing, cannot start, or crashes.
-    """
-
-    def __init__(self, device: str, *, exact: bool = False, stop: Flag | None = None) -> None:
-        self._in_network = is_address(device)
-        self.stale_seconds = _NETWORK_STALE_SECONDS if self._in_network else _STALE_SECONDS
-        self._process = _start_in_network(device) if self._in_network else _start(device, exact)
-        assert self._process.stdout is not None
-        self._pipe = self._process.stdout.fileno()
+    def __init__(self, process: "subprocess.Popen[bytes]", seconds: float, stop: Flag) -> None:
+        self._process = process
+        assert process.stdout is not None
+        self._pipe = process.stdout.fileno()
         fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         os.set_blocking(self._pipe, False)
         self._held = b""
         try:
-            self.format = self._read_format(stop or Flag())
+            self.format = self._read_format(seconds, stop)
         except SourceError:
             self.kill()
             raise
@@ -109,11 +84,17 @@ class CaptureProcess:
         -------
         list of SampleBlock or None
             In the order of their samples, empty if none has come; None if the process has ended.
+
+        Raises
+        ------
+        DeviceError
+            If it has ended, and said why.
         """
         if not self._wait(timeout):
             return []
         data = self._read()
         if not data:
+            self._ended()
             return None
         self._held += data
         blocks = []
@@ -126,13 +107,6 @@ class CaptureProcess:
             self._held = self._held[end:]
         return blocks
 
-    def reason(self) -> str:
-        """Say why the process has ended."""
-        if self._process.stderr is None:
-            return "the capture process ended"
-        said = self._process.stderr.read().decode(errors="replace").split("\n")
-        return next((line for line in reversed(said) if line), "the capture process ended")
-
     def kill(self) -> None:
         """End the process, even if it hangs."""
         self._process.kill()
@@ -141,19 +115,22 @@ class CaptureProcess:
             if pipe is not None:
                 pipe.close()
 
-    def _read_format(self, stop: Flag) -> CaptureFormat:
-        seconds = _NETWORK_START_SECONDS if self._in_network else _START_SECONDS
+    def _ended(self) -> None:
+        """Raise DeviceError if it has said why it ended."""
+
+    def _read_format(self, seconds: float, stop: Flag) -> CaptureFormat:
         deadline = time.monotonic() + seconds
         while b"\n" not in self._held:
             if not self._wait(_LOOK_SECONDS):
                 if stop.is_set():
                     raise DeviceError("the recorder was stopped")
                 if time.monotonic() > deadline:
-                    raise DeviceError(_NETWORK_HANGS if self._in_network else _HANGS)
+                    raise DeviceError(self._hangs)
                 continue
             data = self._read()
             if not data:
-                raise DeviceError(self.reason()) if self._in_network else SourceError(_CRASHES)
+                self._ended()
+                raise SourceError(self._crashes)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)
@@ -168,24 +145,78 @@ class CaptureProcess:
         return os.read(self._pipe, _PIPE_BYTES)
 
 
-def _start(device: str, exact: bool) -> "subprocess.Popen[bytes]":  # noqa: FBT001
-    return subprocess.Popen(  # noqa: S603  our own module
-        [*_CAPTURE, device, *(["exact"] if exact else [])],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
-        bufsize=0,
-    )
+class CaptureProcess(_Process):
+    """One run of the capture process of a microphone at this machine.
+
+    Parameters
+    ----------
+    device : str
+        As `hearthlog devices` lists it, or empty for the default one.
+    exact : bool, optional
+        Whether no other device will do whose name contains this one.
+
+    Attributes
+    ----------
+    format : CaptureFormat
+
+    Raises
+    ------
+    DeviceError
+        If the device is not there or cannot be opened, in the words of the capture process; or if
+        PortAudio hangs.
+    SourceError
+        If PortAudio is missing, cannot start, or crashes.
+    """
+
+    _hangs, _crashes = _HANGS, _CRASHES
+
+    def __init__(self, device: str, *, exact: bool = False) -> None:
+        process = subprocess.Popen(  # noqa: S603  our own module
+            [*_CAPTURE, device, *(["exact"] if exact else [])],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
+            bufsize=0,
+        )
+        super().__init__(process, _START_SECONDS, Flag())
 
 
-def _start_in_network(address: str) -> "subprocess.Popen[bytes]":
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(  # noqa: S603  our own module
-        _NETWORK_CAPTURE, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
-    )
-    assert process.stdin is not None
-    process.stdin.write(address.encode())
-    process.stdin.close()
-    return process
+class NetworkProcess(_Process):
+    """One run of the capture process of a microphone in the network.
+
+    Parameters
+    ----------
+    address : str
+        As `check_address` takes it.
+    stop : threading.Event
+        Ends the wait for its first answer when it is set.
+
+    Attributes
+    ----------
+    format : CaptureFormat
+
+    Raises
+    ------
+    DeviceError
+        If it is not heard, in the words of the capture process; or if it was stopped.
+    """
+
+    _hangs = _crashes = "the capture process does not answer"
+
+    def __init__(self, address: str, stop: Flag) -> None:
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(  # noqa: S603  our own module
+            _NETWORK_CAPTURE, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
+        )
+        assert process.stdin is not None
+        process.stdin.write(address.encode())
+        process.stdin.close()
+        super().__init__(process, _NETWORK_START_SECONDS, stop)
+
+    def _ended(self) -> None:
+        assert self._process.stderr is not None
+        said = self._process.stderr.read().decode(errors="replace").splitlines()
+        if said:
+            raise DeviceError(said[-1])
 
 
 def _block(head: tuple[int, int, int, float, float], data: bytes) -> SampleBlock:
