@@ -17,7 +17,7 @@ from hearthlog.tools.month.shared_state import SharedState
 
 DEVICE = "simulated microphone"
 _BLOCK = int(SAMPLE_RATE * BLOCK_SECONDS)
-_QUIET_BLOCK = 5 * _BLOCK  # where nothing happens: most of the work is by the block
+_QUIET_BLOCK = 10 * _BLOCK  # where nothing happens: most of the work is by the block
 _PPM = 30.0  # by which its crystal is slow
 _LATE_SECONDS = 0.0002  # on average, of the times that the sound card tells
 _DELAY_SECONDS = 0.004  # from the last sample of a block to its arrival

@@ -49,11 +49,12 @@ class Month:
         self._lasting: Fault | None = None
         self._clock_error = 0  # before the fault that lasts
         self._limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+        self._watcher = os.getppid()
 
     def active(self) -> Fault | None:
         """Bring about what is due; return the fault that lasts, or None."""
         state = self._state
-        if state.now >= self._end:
+        if state.now >= self._end or os.getppid() != self._watcher:
             self._stop.set()
         if self._lasting is not None and state.now >= self._lasting.end:
             self._finish(self._lasting)
@@ -70,6 +71,8 @@ class Month:
 
     def is_quiet(self) -> bool:
         """Tell whether nothing has happened, or will happen, for a while."""
+        if self._state.request:
+            return False
         now, number = self._state.now, self._state.next_fault
         since = now - self._faults[number - 1].end if number else now
         until = self._faults[number].start - now if number < len(self._faults) else _WHILE

@@ -10,6 +10,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, stem
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
@@ -124,6 +125,7 @@ class Watcher:
             runs.append(self._run())
             if runs[-1].end.startswith("by itself"):
                 self._problems.append(f"the recorder ended {runs[-1].end}")
+                recover_active(self._folder.logs, NODE)
                 break
         self._list_logs()
         with self._pool:
