@@ -10,6 +10,7 @@ import numpy as np
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import OK, Event, Frames, SourceHealth
 from hearthlog.recorder.sources.decoding import audio_seconds, read_audio
+from hearthlog.recorder.sources.wall_clock import check_times
 from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.progress import Progress, ignore_progress
@@ -42,7 +43,7 @@ class FileSource:
     ------
     SourceError
         If one of the files is missing, is not audio, holds none, or has a sample rate that cannot
-        be recorded.
+        be recorded; if a log cannot have their times.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class FileSource:
         progress: Progress = ignore_progress,
     ) -> None:
         self._seconds = sum(audio_seconds(path) for path in paths)
+        check_times(start, start + int(self._seconds * NANOSECONDS))
         self.device = _name(paths)
         self._paths = paths
         self._start = start

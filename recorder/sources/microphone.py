@@ -14,6 +14,7 @@ from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealt
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import CaptureProcess, NetworkProcess
+from hearthlog.recorder.sources.wall_clock import WallClock
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
@@ -66,7 +67,8 @@ class MicrophoneSource:
             self._try_at_the_start(waits=waits)
         self._last_health = self._health
         self._reported = -math.inf
-        self._wall_offset = _wall_offset()
+        self._clock = WallClock()
+        self._wall_offset = self._clock.offset()
 
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield frames, gaps and health until `stop` is set, even if the microphone is lost.
@@ -165,11 +167,13 @@ class MicrophoneSource:
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
         if self._silent_frames >= _SILENT_FRAMES:
             self._health = (ERROR, "the microphone gives digital silence: is it muted or dead?")
+        elif self._clock.trouble:
+            self._health = (ERROR, self._clock.trouble)
         else:
             self._health = (OK, "listening")
 
     def _watch_clock(self) -> None:
-        offset = _wall_offset()
+        offset = self._clock.offset()
         step = (offset - self._wall_offset) / NANOSECONDS
         if abs(step) > _STEP_SECONDS:
             self._wall_offset = offset
@@ -207,9 +211,3 @@ def _sound_cards() -> int:
         return _CARDS.stat().st_mtime_ns
     except OSError:
         return 0
-
-
-def _wall_offset() -> int:
-    """Return CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds."""
-    before = time.monotonic_ns()
-    return time.time_ns() - (before + time.monotonic_ns()) // 2
