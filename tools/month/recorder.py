@@ -71,9 +71,9 @@ class Month:
 
     def is_quiet(self) -> bool:
         """Tell whether nothing has happened, or will happen, for a while."""
+        now, number = self._state.now, self._state.next_fault
         if self._state.request:
             return False
-        now, number = self._state.now, self._state.next_fault
         since = now - self._faults[number - 1].end if number else now
         until = self._faults[number].start - now if number < len(self._faults) else _WHILE
         return min(since, until, self._end - now) >= _WHILE

@@ -22,6 +22,7 @@ from hearthlog.tools.month.folders import NODE, MonthFolder
 from hearthlog.tools.month.shared_state import SharedState, shared_state
 
 _RECORDER = module_command("hearthlog.tools.month.recorder")
+_STOPPED = {0, 3}  # 3: something was not heard
 _LOOK_SECONDS = 0.004
 _LIST_SECONDS = 0.3
 _SAMPLE = 1800 * NANOSECONDS
@@ -146,35 +147,39 @@ class Watcher:
                 [*_RECORDER, *self._arguments], stdout=subprocess.DEVNULL, stderr=errors
             )
         run = Run(process.pid)
-        fault = None
-        while process.poll() is None:
-            if state.request and fault is None:
-                fault = self._faults[state.request - 1]
-                if fault.kind == "second recorder":
-                    self._start_second()
-                    fault, state.request = None, 0
-                else:
-                    run.end = fault.kind
-                    self._end(process, fault)
-                    break
-            self._look(process, run)
-            time.sleep(_LOOK_SECONDS)
-        run.sound = state.last_sound - state.first_sound
-        if fault is None and process.returncode not in {0, 3}:
+        fault = self._watch_over(process, run)
+        if fault is not None:
+            run.end = fault.kind
+            self._end(process, fault)
+        elif process.returncode not in _STOPPED:
             run.end = f"by itself, with status {process.returncode}"
-        if fault is not None and fault.kind == "power cut":
+        run.sound = state.last_sound - state.first_sound
+        if run.end == "power cut":
             self._lose_what_is_not_synced()
-            state.boot = state.now + fault.length - _BOOT
         if fault is not None:
             state.now += fault.length
+            state.boot = state.now - _BOOT if fault.kind == "power cut" else state.boot
         self._note_begun(process.pid)
         self._list_logs()
         return run
 
+    def _watch_over(self, process: subprocess.Popen[bytes], run: Run) -> Fault | None:
+        """Look after the recorder until it ends, or until a fault is to end it: return that."""
+        while process.poll() is None:
+            if self._state.request:
+                fault = self._faults[self._state.request - 1]
+                if fault.kind != "second recorder":
+                    return fault
+                self._start_second()
+                self._state.request = 0
+            self._look(process, run)
+            time.sleep(_LOOK_SECONDS)
+        return None
+
     def _end(self, process: subprocess.Popen[bytes], fault: Fault) -> None:
         if fault.kind == "restarted":
             process.terminate()
-            if process.wait() not in {0, 3}:
+            if process.wait() not in _STOPPED:
                 self._problems.append(f"stopped, it ended with status {process.returncode}")
             return
         time.sleep(self._random.random() * _MOMENT_SECONDS)
