@@ -58,9 +58,10 @@ class MicrophoneSettings(BaseModel):
 
     name: Annotated[str, _checked(check_microphone_name)] = "mic"
     device: str = ""  # as `hearthlog devices` lists it, or an address; empty: the default one
+    fallback: str = ""  # a device that is heard while that one is not there; empty: none
     model: Path | None = None  # instead of the recorder's
 
-    @field_serializer("device", when_used="json")
+    @field_serializer("device", "fallback", when_used="json")
     def _name_device(self, device: str) -> str:
         return public_name(device)  # logs have no passwords
 
@@ -208,8 +209,9 @@ def load_settings(
 
 
 def _check_microphones(microphones: list[MicrophoneSettings]) -> None:
-    for key in ("name", "device"):
-        values = [getattr(each, key) for each in microphones]
+    fallbacks = [each.fallback for each in microphones if each.fallback]
+    for key, others in (("name", []), ("device", fallbacks)):
+        values = [*(getattr(each, key) for each in microphones), *others]
         twice = next((value for value in values if values.count(value) > 1), None)
         if twice is not None:
             what = f"{key} {public_name(twice)!r}" if twice else "the default device"

@@ -4,7 +4,7 @@ import sys
 import time
 from contextlib import suppress
 
-from hearthlog.recorder.events import ERROR, SourceHealth
+from hearthlog.recorder.events import OK, SourceHealth
 
 _AGAIN_SECONDS = 600.0
 
@@ -22,7 +22,7 @@ def say(text: str) -> None:
 
 
 class HealthJournal:
-    """Says that a microphone is not heard, from time to time again, and when it is."""
+    """Says what is wrong with a microphone, from time to time again, and when nothing is."""
 
     def __init__(self) -> None:
         self._trouble: dict[str, str] = {}
@@ -38,7 +38,7 @@ class HealthJournal:
         health : SourceHealth
         """
         before = self._trouble.get(microphone, "")
-        trouble = self._trouble[microphone] = health.summary if health.level == ERROR else ""
+        trouble = self._trouble[microphone] = health.summary if health.level != OK else ""
         now = time.monotonic()
         is_old = now - self._said_at.get(microphone, 0.0) >= _AGAIN_SECONDS
         if trouble != before or (trouble and is_old):

@@ -118,7 +118,9 @@ def record_microphones(
         lock = stack.enter_context(FolderLock(settings.output, settings.node))
         # They capture, and their pipes hold, while older logs are completed.
         sources = {
-            each.name: stack.enter_context(closing(MicrophoneSource(each.device)))
+            each.name: stack.enter_context(
+                closing(MicrophoneSource(each.device, fallback=each.fallback))
+            )
             for each in settings.microphone
         }
         recovered = recover_active(settings.output, settings.node)

@@ -175,6 +175,17 @@ def test_setting_the_wall_clock_is_a_gap_of_the_step_in_which_hardly_a_frame_is_
     assert int(frames.stamps[0]) == gap.end
 
 
+def test_sound_that_another_device_heard_already_is_not_heard_twice():
+    made = framer()
+    made.add(block(0, float(true_time(0))))
+    made.begin(RATE, OFFSET, "labmic is there again")
+    assert made.add(block(0, float(true_time(-BLOCK)))) == []
+    gap, frames = made.add(block(BLOCK, float(true_time(0)), 2 * BLOCK))
+    assert gap.end - gap.start == pytest.approx(0, abs=1e3)
+    assert len(frames.samples) == 10
+    assert int(frames.stamps[0]) == gap.end
+
+
 @pytest.mark.parametrize("size", [1, 799, 800, 801, 5000])
 def test_samples_in_pieces_of_any_size_are_cut_into_the_same_frames(size):
     samples = np.arange(12_345, dtype=np.float32)

@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from hearthlog.recorder.errors import DeviceError
-from hearthlog.recorder.sources import microphone
+from hearthlog.recorder.sources import sound_cards
 from hearthlog.recorder.sources.devices import Device, find_device, list_devices
 from hearthlog.recorder.sources.usb import UsbPlace, usb_place
 
@@ -108,8 +108,8 @@ def test_only_the_whole_name_will_do_where_it_must_be_the_same_device():
 
 
 def test_a_card_that_is_plugged_in_ends_the_wait_for_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(microphone, "_CARDS", tmp_path)
+    monkeypatch.setattr(sound_cards, "_CARDS", tmp_path)
     plug = threading.Timer(0.5, (tmp_path / "pcmC1D0c").touch)
     plug.start()
-    assert microphone._cards_change(threading.Event(), 60.0)
-    assert not microphone._cards_change(threading.Event(), 0.1)
+    assert sound_cards.cards_change(threading.Event(), 60.0)
+    assert not sound_cards.cards_change(threading.Event(), 0.1)

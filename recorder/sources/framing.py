@@ -177,6 +177,11 @@ class Framer:
             return []
         times = self._times(count)
         self._framed += count * FRAME_SAMPLES
+        if self._reason and self._end is not None:  # it began while another one was heard
+            heard = int(np.searchsorted(times, self._end))
+            times, frames, count = times[heard:], frames[heard:], count - heard
+            if count == 0:
+                return []
         gap = self._gap_before(int(times[0]))
         stamps = times + self._wall_offset
         complete = Frames(self._next_frame, frames, stamps)

@@ -3,17 +3,18 @@
 import math
 import time
 from collections.abc import Generator, Iterator
-from pathlib import Path
 from threading import Event as Flag
 
 import numpy as np
 
 from hearthlog.recorder.addresses import check_address, is_address, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
-from hearthlog.recorder.events import ERROR, OK, Event, Frames, Gap, SourceHealth
+from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
-from hearthlog.recorder.sources.process import CaptureProcess, NetworkProcess
+from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess
+from hearthlog.recorder.sources.return_watch import ReturnWatch
+from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -23,18 +24,20 @@ _HEALTH_SECONDS = 10.0
 _LOOK_SECONDS = 0.25
 _SILENT_FRAMES = 200  # ten seconds
 _STEP_SECONDS = 0.25
-_CARDS = Path("/dev/snd")
+_FALLBACK_SECONDS = 10.0  # of patience with the device, before another one is heard
 
 
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
-    The device that is heard first is the only one that is ever heard.
+    The device that is heard first is the only one that is ever heard, but for its fallback.
 
     Parameters
     ----------
     device : str
         As `hearthlog devices` lists it, empty for the default one, or an address in the network.
+    fallback : str, optional
+        Another device, which is heard as long as this one is not there; by default none.
     waits : bool, optional
         Whether a device that is not there at the start is waited for, as it is later.
 
@@ -51,18 +54,17 @@ class MicrophoneSource:
         if an address cannot be one of sound.
     """
 
-    def __init__(self, device: str, *, waits: bool = True) -> None:
-        self.device = public_name(device)
-        self._wanted = device
-        self._heard = False  # from then on `_wanted` is the identity of the device
-        self._capture: CaptureProcess | NetworkProcess | None = None
+    def __init__(self, device: str, *, fallback: str = "", waits: bool = True) -> None:
+        self._own = _Device(device)
+        self._fallback = _Device(fallback) if fallback else None
+        self._return: ReturnWatch | None = None  # as long as the fallback is heard
+        self._lost_at = -math.inf  # when the device was lost
+        self.device = self._own.name
+        self._capture: Capture | None = None
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
         self._health = (OK, "starting")
-        if is_address(device):
-            check_address(device)
-            check_ffmpeg()
         if not (waits and is_address(device)):  # the recorder does not wait for a network
             self._try_at_the_start(waits=waits)
         self._last_health = self._health
@@ -87,22 +89,36 @@ class MicrophoneSource:
         while not stop.is_set():
             if self._capture is None:
                 yield from self._wait_for_device(stop)
-            if self._capture is not None:
-                reason = yield from self._capture_run(self._capture, reason, stop)
-                self.close()
-                if stop.is_set():
-                    return
-                self._health = (ERROR, reason)
-                yield from self._report(self._now())
+            if self._capture is None:
+                return
+            if self._return is not None:
+                reason = f"{reason}; {self.device} is heard in its place"
+            reason = yield from self._capture_run(self._capture, reason, stop)
+            returned = self._return.take() if self._return is not None else None
+            self.close()
+            if stop.is_set():
+                if returned is not None:
+                    returned.kill()
+                return
+            if returned is not None:
+                self._hear(self._own, returned)
+                reason = f"{self.device} is there again"
+                continue
+            self._lost_at = time.monotonic()
+            self._health = (ERROR, reason)
+            yield from self._report(self._now())
 
     def close(self) -> None:
         """End the capture process."""
         if self._capture is not None:
             self._capture.kill()
             self._capture = None
+        if self._return is not None:
+            self._return.close()
+            self._return = None
 
     def _capture_run(
-        self, capture: CaptureProcess | NetworkProcess, reason: str, stop: Flag
+        self, capture: Capture, reason: str, stop: Flag
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
         self._framer.begin(capture.format.rate, self._wall_offset, reason)
@@ -125,38 +141,56 @@ class MicrophoneSource:
             self._watch_clock()
             if blocks:  # its frames' time: now would be ahead of them
                 yield from self._report(self._framer.last_stamp)
+            if self._return is not None and self._return.is_there:
+                return "its device is there again"
         return "the recorder was stopped"
 
     def _try_at_the_start(self, *, waits: bool) -> None:
         try:
-            self._open(Flag())
+            self._hear(self._own, self._open(self._own, Flag()))
         except DeviceError as error:
             if not waits:
                 raise
             self._health = (ERROR, f"{error}; waiting for it")
 
-    def _open(self, stop: Flag) -> None:
-        if is_address(self._wanted):
-            self._capture = NetworkProcess(self._wanted, stop)
-        else:
-            self._capture = CaptureProcess(self._wanted, exact=self._heard)
-        heard = self._capture.format
-        self.device, self._wanted, self._heard = heard.device, heard.identity, True
+    def _open(self, device: "_Device", stop: Flag) -> Capture:
+        if is_address(device.wanted):
+            return NetworkProcess(device.wanted, stop)
+        return CaptureProcess(device.wanted, exact=device.was_heard)
+
+    def _hear(self, device: "_Device", capture: Capture) -> None:
+        self._capture = capture
+        device.is_heard(capture)
+        self.device = device.name
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         pauses = iter(_RETRY_SECONDS)
         while not stop.is_set():
             try:
-                self._open(stop)
+                self._hear(self._own, self._open(self._own, stop))
             except SourceError as error:
                 if stop.is_set():
                     return
                 self._health = (ERROR, f"{error}; waiting for it")
             else:
                 return
+            if self._falls_back(stop):
+                return
             yield from self._report(self._now())
-            if _cards_change(stop, next(pauses, _RETRY_SECONDS[-1])):
+            if cards_change(stop, next(pauses, _RETRY_SECONDS[-1])):
                 pauses = iter(_RETRY_SECONDS)  # what was plugged in may take a moment
+
+    def _falls_back(self, stop: Flag) -> bool:
+        """Hear the fallback, if there is one, and it is time; return whether it is heard."""
+        if self._fallback is None or time.monotonic() - self._lost_at < _FALLBACK_SECONDS:
+            return False
+        try:
+            self._hear(self._fallback, self._open(self._fallback, stop))
+        except SourceError as error:
+            self._health = (ERROR, f"{self._health[1]}; nor is its fallback heard: {error}")
+            return False
+        self._return = ReturnWatch(lambda stop: self._open(self._own, stop))
+        return True
 
     def _watch(self, event: Frames | Gap) -> None:
         if isinstance(event, Gap):
@@ -169,6 +203,9 @@ class MicrophoneSource:
             self._health = (ERROR, "the microphone gives digital silence: is it muted or dead?")
         elif self._clock.trouble:
             self._health = (ERROR, self._clock.trouble)
+        elif self._return is not None:
+            own = self._own.name or "the default microphone"
+            self._health = (WARNING, f"{own} is not there; {self.device} is heard in its place")
         else:
             self._health = (OK, "listening")
 
@@ -196,18 +233,17 @@ class MicrophoneSource:
             yield SourceHealth(stamp, level, summary, values)
 
 
-def _cards_change(stop: Flag, seconds: float) -> bool:
-    """Wait, but no longer than until a sound card comes or goes; return whether one does."""
-    cards, end = _sound_cards(), time.monotonic() + seconds
-    while time.monotonic() < end and not stop.wait(min(_LOOK_SECONDS, seconds)):
-        if _sound_cards() != cards:
-            return True
-    return False
+class _Device:
+    """A device that is to be heard: by its name, and once it was heard, by what it is."""
 
+    def __init__(self, device: str) -> None:
+        if is_address(device):
+            check_address(device)
+            check_ffmpeg()
+        self.name = public_name(device)
+        self.wanted = device
+        self.was_heard = False
 
-def _sound_cards() -> int:
-    """Return what changes with the sound cards that Linux has; 0 elsewhere."""
-    try:
-        return _CARDS.stat().st_mtime_ns
-    except OSError:
-        return 0
+    def is_heard(self, capture: Capture) -> None:
+        heard = capture.format
+        self.name, self.wanted, self.was_heard = heard.device, heard.identity, True

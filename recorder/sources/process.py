@@ -219,6 +219,9 @@ class NetworkProcess(_Process):
             raise DeviceError(said[-1])
 
 
+Capture = CaptureProcess | NetworkProcess
+
+
 def _block(head: tuple[int, int, int, float, float], data: bytes) -> SampleBlock:
     index, _, flags, adc_time, arrival = head
     overflowed = bool(flags & _INPUT_OVERFLOW)
