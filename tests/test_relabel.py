@@ -563,3 +563,12 @@ def test_after_the_scheduler_went_away_a_run_completes_what_is_left(model, logs,
         layer.unlink()
     assert not relabelled(model, logs).failed
     assert written(logs) == layers
+
+
+def test_a_starter_model_relabels_by_its_name(hearthlog, household, tmp_path):
+    sound = next(household.rglob("*.flac"))
+    logs = tmp_path / "logs"
+    hearthlog("record", sound, "--model", "bathroom", "-o", logs, "--start", "2026-03-01T07:00")
+    result = hearthlog("relabel", logs, "--model", "general")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("1 layer of")

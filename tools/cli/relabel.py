@@ -18,7 +18,11 @@ def relabel(
     logs: Logs,
     *,
     model: Annotated[
-        Path, typer.Option(help="Model file, where workers find it too.", parser=log_location)
+        Path,
+        typer.Option(
+            help="Model file, where workers find it too, or general or bathroom.",
+            parser=log_location,
+        ),
     ],
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes; as many as there are cores by default.")
@@ -39,12 +43,13 @@ def relabel(
     from hearthlog.tools.cli.progress import share_done
 
     loaded = load_model(model)
+    where = model.resolve() if model.exists() else model  # the name of a starter model
     count = workers or os.cpu_count() or 1
     with (
         open_workers(count, scheduler) as pool,
         share_done("labelling logs", announce=True) as report,
     ):
-        result = run(logs, loaded, model.resolve(), pool, report)
+        result = run(logs, loaded, where, pool, report)
     if as_json:
         print(json.dumps(_as_json(result, loaded.name, loaded.sha256), indent=2))
     else:
