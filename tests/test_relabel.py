@@ -1,5 +1,7 @@
 """Logs labelled anew: as the recorder would have, whole, in parts, and after whatever happens."""
 
+import heapq
+import json
 import os
 import re
 import shutil
@@ -7,6 +9,7 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 from threading import Event as Flag
 
@@ -18,6 +21,8 @@ from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
 from logs import features, labelled_frames
 from lossy import LossySource
+from mcap.records import Metadata
+from rewriting import Log
 from spliced import run, small_disk
 from stores import put
 
@@ -29,7 +34,9 @@ from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.recording import record
+from hearthlog.recorder.events import event_time
+from hearthlog.recorder.labelling.labelling_models import LabellingModels
+from hearthlog.recorder.recording import RecordingSession, record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
@@ -444,6 +451,112 @@ def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, 
         ["anna/20/3/1"],
         ["berta/2026/03/01"],
     ]
+
+
+def record_together(folder, sources, **settings):
+    """Record microphones into one log, in the order of time, whichever thread is quicker."""
+    settings = Settings(
+        output=folder,
+        max_bag_duration=60,
+        microphone=[{"name": name, "device": name} for name in sources],
+        **settings,
+    )
+    session = RecordingSession(settings, sources, dict.fromkeys(sources, LabellingModels()))
+    streams = [zip(repeat(name), each.events(Flag())) for name, each in sources.items()]
+    for name, event in heapq.merge(*streams, key=lambda one: event_time(one[1])):
+        session.add(name, event)
+    session.finish()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two_rooms(tmp_path_factory, day):
+    """What two microphones heard: in one log, and each in logs of its own."""
+    folder = tmp_path_factory.mktemp("rooms")
+    noise = np.random.default_rng(5).standard_normal(5 * 60 * SAMPLE_RATE) / 3000
+    soundfile.write(folder / "night.wav", noise, SAMPLE_RATE)
+
+    def sources():
+        return {
+            "kitchen": LossySource(FileSource([day], START), {5: 7, 90: 150}),
+            "bath": FileSource([folder / "night.wav"], START + 7 * NANOSECONDS),
+        }
+
+    record_together(folder / "both", sources())
+    for name, source in sources().items():
+        record_together(folder / name, {name: source})
+    return folder
+
+
+@pytest.fixture
+def rooms(two_rooms, tmp_path):
+    return Path(shutil.copytree(two_rooms, tmp_path / "rooms"))
+
+
+def test_each_microphone_of_a_log_is_labelled_as_if_it_were_alone(model, rooms):
+    assert not relabelled(model, rooms / "both", workers=2).failed
+    together = read_columns(find_logs(rooms / "both"))
+    name = load_model(model).name
+    for microphone in ("kitchen", "bath"):
+        relabelled(model, rooms / microphone)
+        alone = read_columns(find_logs(rooms / microphone))
+        for kind in ("label", "segment"):
+            topic = f"/{microphone}/relabel/{name}/{kind}"
+            assert len(alone[topic]) > (20 if microphone == "kitchen" else 0)
+            assert rows(together[topic]) == rows(alone[topic])
+
+
+def test_logs_of_two_microphones_one_by_one_in_any_order_give_the_same_bytes(model, rooms):
+    one_by_one = Path(shutil.copytree(rooms / "both", rooms / "again"))
+    relabelled(model, rooms / "both", workers=2)
+    for log in reversed(recorded_logs(one_by_one)):
+        relabelled(model, log)
+    assert written(one_by_one) == written(rooms / "both")
+    again = relabelled(model, one_by_one)
+    assert (again.layers, len(again.current)) == ([], len(recorded_logs(one_by_one)))
+
+
+def test_layers_of_two_microphones_are_sound(model, rooms):
+    relabelled(model, rooms / "both")
+    kinds = {kind for findings in examine(rooms / "both") for kind in findings.counts}
+    assert kinds <= {("warning", "gap")}
+
+
+def test_a_layer_that_names_no_microphone_of_its_open_segments_is_current(model, rooms):
+    """As layers were before a log could be of several microphones."""
+    relabelled(model, rooms / "bath")
+    rewritten = 0
+    for layer in (path for path in find_logs(rooms / "bath") if is_layer(path)):
+        found = Log(layer)
+        record = next(
+            r for r in found.records() if isinstance(r, Metadata) and "began" in r.metadata
+        )
+        for key in ("began", "ended"):
+            if text := record.metadata[key]:
+                record.metadata[key] = json.dumps(json.loads(text)["bath"])
+                rewritten += 1
+        layer.unlink()
+        found.write(layer)
+    assert rewritten > 4
+    again = relabelled(model, rooms / "bath")
+    assert (again.failed, again.layers) == ({}, [])
+    assert len(again.current) == len(recorded_logs(rooms / "bath"))
+
+
+def test_a_microphone_of_other_features_is_left_out_and_named(model, day, tmp_path, capfd):
+    source = {name: FileSource([day], START) for name in ("kitchen", "bath")}
+    logs = record_together(tmp_path / "logs", {"bath": source["bath"]})
+    other = record_together(
+        tmp_path / "other", {"kitchen": source["kitchen"]}, feature_set="auros21"
+    )
+    for log, second in zip(recorded_logs(logs), recorded_logs(other), strict=True):
+        run(capfd, "merge", log, second, "-o", tmp_path / "merged.mcap")
+        (tmp_path / "merged.mcap").replace(log)
+    done = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
+    assert done.returncode == 0
+    assert "is for other features: kitchen (features of auros21)\n" in done.stderr
+    topics = {topic for path in find_logs(logs) if is_layer(path) for topic in read_columns([path])}
+    assert {topic.split("/")[1] for topic in topics} == {"bath"}
 
 
 def test_logs_without_features_are_named(model, tmp_path, recording, capfd):

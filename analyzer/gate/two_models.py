@@ -7,7 +7,7 @@ import numpy as np
 
 from hearthlog.analyzer.gate.recent_time import Part
 from hearthlog.analyzer.logs.spans import Spans, rows_at
-from hearthlog.analyzer.relabel.reading import info_for_model
+from hearthlog.analyzer.relabel.reading import infos_for_model
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classes import translation
@@ -15,6 +15,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
 
 _FLOOR_WARM_UP = 150 * NANOSECONDS
@@ -98,7 +99,9 @@ class TwoModels:
         LogError
             If the log cannot be read, or has no features of the set of the models.
         """
-        info, _ = info_for_model(part.log, self._model, part.log)
+        (info, *others), _ = infos_for_model(part.log, self._model, part.log)
+        if others:
+            raise LogError(f"{part.log}: is of several microphones; models are compared on one")
         start, end = part.start - _FLOOR_WARM_UP, part.end + _BEHIND
         sound = [
             event

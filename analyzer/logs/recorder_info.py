@@ -80,13 +80,13 @@ class RecorderInfo:
 
 
 def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
-    """Read what a log says of its recorder.
+    """Read what a log of one microphone says of its recorder.
 
     Parameters
     ----------
     path : Path
     kind : str
-        A key of `TYPES`, `features` or `audio`: the topic by which the microphone is known.
+        As `read_recorder_infos` takes it.
 
     Returns
     -------
@@ -98,23 +98,56 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
     LogError
         If it is damaged, of more than one microphone, or says what cannot be.
     """
+    infos = read_recorder_infos(path, kind)
+    if len(infos) > 1:
+        names = ", ".join(info.microphone for info in infos)
+        raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
+    return infos[0] if infos else None
+
+
+def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
+    """Read what a log says of its recorder, for each of its microphones.
+
+    Parameters
+    ----------
+    path : Path
+    kind : str
+        A key of `TYPES`, `features` or `audio`: the topic by which microphones are known.
+
+    Returns
+    -------
+    list of RecorderInfo
+        In the order of the names of the microphones; empty if the log has no such topic, as layers
+        have not.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, or says what cannot be.
+    """
     with LogFile(path) as file:
         if not file.channels:
             read_chunks(file, file.chunks[:1])  # a log without an index says it there
-        microphones = _microphones(file, kind)
+        microphones = sorted(_microphones(file, kind))
         if not microphones:
-            return None
-        if len(microphones) > 1:
-            names = ", ".join(sorted(microphones))
-            raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
+            return []
         attachments = attachments_of(file)
         # What was merged is of the last of its recorders.
         record = next(reversed(read_provenance(file)), {})
-        complete = file.complete
-        (microphone,) = microphones
-        info = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
-        frame = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
-    info = {**record, **info}
+        return [_info_of(file, name, kind, record, attachments) for name in microphones]
+
+
+def _info_of(
+    file: LogFile,
+    microphone: str,
+    kind: str,
+    record: Mapping[str, str],
+    attachments: Sequence[Attachment],
+) -> RecorderInfo:
+    path = file.path
+    own = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
+    frame = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
+    info = {**record, **own}
     digest = info.get("model_sha256", "")
     first = None
     if frame and kind == "features":
@@ -126,7 +159,7 @@ def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
         raise LogError(f"{path}: {error}") from error
     return RecorderInfo(
         path=path,
-        complete=complete,
+        complete=file.complete,
         node=node,
         microphone=microphone,
         device=info.get("device", ""),

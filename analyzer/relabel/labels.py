@@ -1,7 +1,7 @@
 """The task of a worker: the labels and segments of one log."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +15,7 @@ from hearthlog.analyzer.relabel.jobs import Job
 from hearthlog.analyzer.relabel.layer import (
     LayerInputs,
     LayerMetadata,
+    OpenRuns,
     delete_parts,
     layer_record,
     layer_topics,
@@ -24,7 +25,7 @@ from hearthlog.analyzer.relabel.layer import (
 from hearthlog.analyzer.relabel.reading import (
     UnreadableError,
     goes_on_in,
-    info_for_model,
+    infos_for_model,
     read_sound,
     recover_copy,
     warm_up,
@@ -45,27 +46,21 @@ from hearthlog.schemas.logs.provenance import METADATA
 from hearthlog.schemas.storage.new_files import new_file, replaced_file
 
 
-class UnfinishedLayer(NamedTuple):
-    """The labels of a log, and its segments as far as they are known without other layers.
+class LabelledSound(NamedTuple):
+    """The segments of a microphone in a log, as far as they are known without other layers.
 
     `lacks_start` tells whether a segment is open when the log begins whose earlier frames, counted
     in the layer before, are still to be added; `open_at_start` is None until then.
     """
 
-    part: Path  # the unfinished file, with the labels
-    writer: LogStreamWriter  # that has written it
-    inputs: LayerInputs
     microphone: str
-    node: str
-    provenance: Mapping[str, str]  # the `hearthlog` record of the log
     segments: list[Segment]
     open_at_start: Run | None
     open_at_end: Run | None
     lacks_start: bool
     frames: int  # that are labelled
-    loss: str  # what could not be read of the log
 
-    def with_start(self, open_at_start: Run | None) -> "UnfinishedLayer":
+    def with_start(self, open_at_start: Run | None) -> "LabelledSound":
         """Add the open segment with which the layer before ends, if it is still lacking.
 
         Parameters
@@ -75,7 +70,7 @@ class UnfinishedLayer(NamedTuple):
 
         Returns
         -------
-        UnfinishedLayer
+        LabelledSound
             This one, if it does not lack its start; else a new one, which does not.
         """
         if not self.lacks_start:
@@ -91,6 +86,44 @@ class UnfinishedLayer(NamedTuple):
             open_at_end=open_at_end,
             lacks_start=False,
         )
+
+
+class UnfinishedLayer(NamedTuple):
+    """The labels of a log, and the segments of each of its microphones."""
+
+    part: Path  # the unfinished file, with the labels
+    writer: LogStreamWriter  # that has written it
+    inputs: LayerInputs
+    node: str
+    provenance: Mapping[str, str]  # the `hearthlog` record of the log
+    sounds: Sequence[LabelledSound]
+    left_out: Mapping[str, str]  # feature sets of microphones that the model is not for
+    loss: str  # what could not be read of the log
+
+    @property
+    def lacks_starts(self) -> bool:
+        """Whether the earlier frames of an open segment are still to be added."""
+        return any(sound.lacks_start for sound in self.sounds)
+
+    @property
+    def open_at_start(self) -> OpenRuns:
+        """The segments that are open when the log begins."""
+        return {s.microphone: s.open_at_start for s in self.sounds if s.open_at_start is not None}
+
+    @property
+    def open_at_end(self) -> OpenRuns:
+        """The segments that are open when the log ends."""
+        return {s.microphone: s.open_at_end for s in self.sounds if s.open_at_end is not None}
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that are labelled."""
+        return sum(sound.frames for sound in self.sounds)
+
+    def with_starts(self, open_at_start: OpenRuns) -> "UnfinishedLayer":
+        """Add the open segments with which the layer before ends, where they are lacking."""
+        sounds = [sound.with_start(open_at_start.get(sound.microphone)) for sound in self.sounds]
+        return self._replace(sounds=sounds)
 
 
 def label_log(job: Job) -> UnfinishedLayer:
@@ -134,7 +167,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     ----------
     job : Job
     labelled : UnfinishedLayer
-        That does not lack its start any more. Its file `part` is deleted.
+        That lacks no starts any more. Its file `part` is deleted.
 
     Raises
     ------
@@ -152,9 +185,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
         "feature_set": model.description.feature_set,
         "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
     }
-    _, topic = layer_topics(labelled.microphone, model.name, classifier.classes)
-    times: Int64 = np.array([segment.decided_at for segment in labelled.segments], np.int64)
-    columns = segment_columns(labelled.segments, classifier.classes, labelled.microphone)
+    batches = [_segments_of(sound, model, classifier) for sound in labelled.sounds]
     put = replaced_file if job.replaces else new_file
     try:
         with put(job.layer) as temporary, temporary.open("xb") as out:
@@ -162,7 +193,9 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
                 shutil.copyfileobj(stream, out, 1 << 20)
             writer = labelled.writer
             writer.continue_on(out)
-            writer.write_columns([TopicBatch(topic.name, times, columns)])
+            for batch in batches:
+                writer.write_columns([batch])
+                writer.flush()
             record = layer_record(metadata, job.log.name, labelled.node, more)
             writer.add_metadata(METADATA, record)
             writer.finish(job.layer.name)
@@ -173,6 +206,13 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     delete_parts(job.layer)
 
 
+def _segments_of(sound: LabelledSound, model: Model, classifier: Classifier) -> TopicBatch:
+    _, topic = layer_topics(sound.microphone, model.name, classifier.classes)
+    times: Int64 = np.array([segment.decided_at for segment in sound.segments], np.int64)
+    columns = segment_columns(sound.segments, classifier.classes, sound.microphone)
+    return TopicBatch(topic.name, times, columns)
+
+
 @lru_cache(2)
 def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
     model = load_model(path)
@@ -181,54 +221,77 @@ def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
     return model, Classifier(model)
 
 
+class _Begun(NamedTuple):
+    """A microphone of a log, before its first frame."""
+
+    info: RecorderInfo
+    labeller: StreamLabeller
+    open_at_start: Run | None
+    lacks_start: bool
+
+
 def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> UnfinishedLayer:
     """Label a log, or the copy that was saved of it."""
-    info, _ = info_for_model(log, model, job.log)
+    infos, left_out = infos_for_model(log, model, job.log)
+    begun = [_begin(job, info, classifier) for info in infos]
+    part = part_path(job.layer)
+    writer, frames = _write_labels(part, job, begun, model)
+    following = [_goes_on(job, each) for each in begun]
+    ends = zip(begun, frames, following, strict=True)
+    sounds = [_end(each, count, goes_on=bool(goes_on)) for each, count, goes_on in ends]
+    before = stem(job.earlier[0]) if job.earlier else ""
+    behind = "" if job.next_log is None or None in following else stem(job.next_log)
+    return UnfinishedLayer(
+        part=part,
+        writer=writer,
+        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),
+        node=infos[0].node,
+        provenance=infos[0].metadata,
+        sounds=sounds,
+        left_out=left_out,
+        loss="" if infos[0].complete else "it is cut off",
+    )
+
+
+def _begin(job: Job, info: RecorderInfo, classifier: Classifier) -> _Begun:
     labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
     open_at_start = labeller.open_run
     lacks_start = job.continues_layer and open_at_start is not None
     if lacks_start:
         labeller.discard_open()
         open_at_start = None
-    part = part_path(job.layer)
-    writer, frames = _write_labels(part, job, info, model, labeller)
-    goes_on = None if job.next_log is None else goes_on_in(labeller, info, job.next_log)
+    return _Begun(info, labeller, open_at_start, lacks_start)
+
+
+def _goes_on(job: Job, begun: _Begun) -> bool | None:
+    return None if job.next_log is None else goes_on_in(begun.labeller, begun.info, job.next_log)
+
+
+def _end(begun: _Begun, frames: int, *, goes_on: bool) -> LabelledSound:
     if not goes_on:
-        labeller.close()
-    before = stem(job.earlier[0]) if job.earlier else ""
-    behind = "" if job.next_log is None or goes_on is None else stem(job.next_log)
-    return UnfinishedLayer(
-        part=part,
-        writer=writer,
-        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),
-        microphone=info.microphone,
-        node=info.node,
-        provenance=info.metadata,
-        segments=labeller.segments,
-        open_at_start=open_at_start,
-        open_at_end=labeller.open_run,
-        lacks_start=lacks_start,
+        begun.labeller.close()
+    return LabelledSound(
+        microphone=begun.info.microphone,
+        segments=begun.labeller.segments,
+        open_at_start=begun.open_at_start,
+        open_at_end=begun.labeller.open_run,
+        lacks_start=begun.lacks_start,
         frames=frames,
-        loss="" if info.complete else "it is cut off",
     )
 
 
 def _write_labels(
-    part: Path, job: Job, info: RecorderInfo, model: Model, labeller: StreamLabeller
-) -> tuple[LogStreamWriter, int]:
-    """Write the labels of a log to a new file; return also how many there are."""
-    topics = layer_topics(info.microphone, model.name, model.classes)
-    frames = 0
+    part: Path, job: Job, begun: Sequence[_Begun], model: Model
+) -> tuple[LogStreamWriter, list[int]]:
+    """Write the labels of a log to a new file; return also how many each microphone has."""
+    topics = [layer_topics(each.info.microphone, model.name, model.classes) for each in begun]
     try:
         with part.open("xb") as out:
-            writer = LogStreamWriter(out, topics)
-            for event in read_sound(info, 0):
-                labels = labeller.push(event)
-                if labels is not None:
-                    columns = labels.columns(info.microphone)
-                    writer.write_columns([TopicBatch(topics[0].name, labels.known_at, columns)])
-                    frames += len(labels.stamps)
-            writer.flush()
+            writer = LogStreamWriter(out, [topic for pair in topics for topic in pair])
+            frames = [
+                _write_sound(writer, labels.name, each)
+                for each, (labels, _) in zip(begun, topics, strict=True)
+            ]
     except BaseException as error:
         with suppress(OSError):
             part.unlink()
@@ -236,3 +299,16 @@ def _write_labels(
             raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
         raise
     return writer, frames
+
+
+def _write_sound(writer: LogStreamWriter, topic: str, begun: _Begun) -> int:
+    """Write the labels of one microphone, in chunks of their own, and count them."""
+    frames = 0
+    for event in read_sound(begun.info, 0):
+        labels = begun.labeller.push(event)
+        if labels is not None:
+            columns = labels.columns(begun.info.microphone)
+            writer.write_columns([TopicBatch(topic, labels.known_at, columns)])
+            frames += len(labels.stamps)
+    writer.flush()
+    return frames

@@ -3,7 +3,7 @@
 import glob
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +15,7 @@ from hearthlog.schemas.logs.provenance import provenance, read_provenance
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import Topic, label_topics, relabelling
 
+OpenRuns = Mapping[str, Run]  # open segments, by the names of their microphones
 _RUN = ("label", "start", "frames", "confidence")
 
 
@@ -36,8 +37,8 @@ class LayerMetadata(NamedTuple):
     """What the `hearthlog` record of a layer says."""
 
     inputs: LayerInputs
-    open_at_start: Run | None  # the segment that was open when the log began
-    open_at_end: Run | None
+    open_at_start: OpenRuns  # the segments that were open when the log began
+    open_at_end: OpenRuns
     loss: str  # what could not be read of the log
 
 
@@ -77,10 +78,11 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     try:
         with LogFile(layer) as file:
             record = {key: text for each in read_provenance(file) for key, text in each.items()}
+            microphones = {_microphone(channel.topic) for channel in file.channels.values()}
         return LayerMetadata(
             LayerInputs(*(record[name] for name in LayerInputs._fields)),
-            _read_run(record["began"]),
-            _read_run(record["ended"]),
+            _read_runs(record["began"], microphones),
+            _read_runs(record["ended"], microphones),
             record["lost"],
         )
     except (KeyError, ValueError, TypeError, ArithmeticError, RecursionError, LogError) as error:
@@ -135,8 +137,8 @@ def layer_record(
         log=log,
         **more,
         **metadata.inputs._asdict(),
-        began=_run_text(metadata.open_at_start),
-        ended=_run_text(metadata.open_at_end),
+        began=_runs_text(metadata.open_at_start),
+        ended=_runs_text(metadata.open_at_end),
         lost=metadata.loss,
         made=_now(),
     )
@@ -149,12 +151,23 @@ def _now() -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
 
 
-def _run_text(run: Run | None) -> str:
-    return "" if run is None else json.dumps(run._asdict())
+def _microphone(topic: str) -> str:
+    return topic.split("/")[1]
 
 
-def _read_run(text: str) -> Run | None:
+def _runs_text(runs: OpenRuns) -> str:
+    """Write open segments as JSON; empty if there are none."""
+    return json.dumps({name: run._asdict() for name, run in runs.items()}) if runs else ""
+
+
+def _read_runs(text: str, microphones: Collection[str]) -> OpenRuns:
+    """Read open segments; of older layers, which have one microphone, they have no name."""
     if not text:
-        return None
+        return {}
     fields = json.loads(text)
-    return Run(*(int(fields[name]) for name in _RUN))
+    if not isinstance(fields, dict) or not fields:
+        raise ValueError
+    if set(fields) == set(_RUN):
+        (microphone,) = microphones
+        fields = {microphone: fields}
+    return {name: Run(*(int(run[key]) for key in _RUN)) for name, run in fields.items()}

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, read_recorder_info
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, read_recorder_infos
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
@@ -37,22 +37,10 @@ class UnreadableError(LogError):
         return UnreadableError, (self.log, str(self))
 
 
-def recorder_info(path: Path) -> RecorderInfo | None:
-    """Read what a log says of its recorder; None if it has no features.
-
-    Raises
-    ------
-    UnreadableError
-        If it is damaged, of more than one microphone, or says what cannot be.
-    """
-    try:
-        return read_recorder_info(path, "features")
-    except LogError as error:
-        raise UnreadableError(path, error) from error
-
-
-def info_for_model(path: Path, model: Model, log: Path) -> tuple[RecorderInfo, tuple[int, int]]:
-    """Read what a log says of its recorder, and compare the feature set with that of a model.
+def infos_for_model(
+    path: Path, model: Model, log: Path
+) -> tuple[list[RecorderInfo], dict[str, str]]:
+    """Find the microphones of a log whose features a model is for.
 
     Parameters
     ----------
@@ -64,20 +52,30 @@ def info_for_model(path: Path, model: Model, log: Path) -> tuple[RecorderInfo, t
 
     Returns
     -------
-    info : RecorderInfo
-    first_frame : (int, int)
-        Number and start of its first frame, in nanoseconds of UTC.
+    infos : list of RecorderInfo
+        At least one, in the order of the names of the microphones.
+    left_out : dict of str to str
+        The feature sets of the other microphones.
 
     Raises
     ------
     LogError
-        If it has no features, or those of another set; an `UnreadableError` if it is damaged.
+        If none has features of the model's set; an `UnreadableError` if the log is damaged.
     """
-    info = recorder_info(path)
-    if info is None or info.first_frame is None:
+    infos = [info for info in _read_infos(path) if info.first_frame is not None]
+    if not infos:
         raise LogError(f"{log}: has no features; there is nothing to label")
-    check_model(replace(info, path=log), model)
-    return info, info.first_frame
+    suited, left_out, errors = [], {}, []
+    for info in infos:
+        try:
+            check_model(replace(info, path=log), model)
+            suited.append(info)
+        except LogError as error:
+            left_out[info.microphone] = info.feature_set
+            errors.append(error)
+    if not suited:
+        raise errors[0]
+    return suited, left_out
 
 
 def read_sound(info: RecorderInfo, start: int) -> Iterator[Features | Gap]:
@@ -212,7 +210,7 @@ def _label_readable(
     from_start = True
     for log in logs:
         path = copies.get(log, log)
-        other = None if path is None else recorder_info(path)
+        other = None if path is None else _of_microphone(_read_infos(path), info.microphone)
         if other is None or other.first_frame is None or not _same_sound(other, info):
             break
         chosen.appendleft(other)
@@ -235,7 +233,7 @@ def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> 
     labeller : StreamLabeller
         That has labelled the log to its end.
     info : RecorderInfo
-        Of the log.
+        Of the log, and of the microphone that is labelled.
     next_log : Path
 
     Returns
@@ -245,10 +243,21 @@ def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> 
     """
     other = None
     with suppress(LogError):
-        other = read_recorder_info(next_log, "features")
+        other = _of_microphone(read_recorder_infos(next_log, "features"), info.microphone)
     if other is None or other.first_frame is None:
         return None if is_active(next_log) else False
     return _same_sound(other, info) and labeller.is_followed_by(other.first_frame)
+
+
+def _read_infos(path: Path) -> list[RecorderInfo]:
+    try:
+        return read_recorder_infos(path, "features")
+    except LogError as error:
+        raise UnreadableError(path, error) from error
+
+
+def _of_microphone(infos: Sequence[RecorderInfo], name: str) -> RecorderInfo | None:
+    return next((info for info in infos if info.microphone == name), None)
 
 
 def _same_sound(first: RecorderInfo, second: RecorderInfo) -> bool:

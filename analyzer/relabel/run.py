@@ -14,11 +14,11 @@ from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
 from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_log
 from hearthlog.analyzer.relabel.layer import (
     LayerMetadata,
+    OpenRuns,
     read_layer_metadata,
 )
 from hearthlog.analyzer.workers import Workers
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.labels.segments import Run
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import is_active, relabel_path
@@ -37,6 +37,8 @@ class Relabelled:
     active: list[Path] = field(default_factory=list)  # logs that are still being written
     lost: dict[Path, str] = field(default_factory=dict)  # what could not be read of relabelled logs
     failed: dict[Path, str] = field(default_factory=dict)  # why logs were not relabelled
+    # feature sets of microphones that the model is not for, by name
+    left_out: dict[str, str] = field(default_factory=dict)
 
     @property
     def logs(self) -> int:
@@ -108,16 +110,16 @@ class _ChainQueue:
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
         self.tasks: deque[_Task] = deque()
-        self.open_run: Run | None = None  # at the end of the last layer
+        self.open_runs: OpenRuns = {}  # at the end of the last layer
         self._last: int | None = None  # place of the last log whose layer is complete or current
 
     def follows_layer(self, task: _Task) -> bool:
-        """Tell whether `open_run` is what is open when the log of a task begins."""
+        """Tell whether `open_runs` are what is open when the log of a task begins."""
         return self._last is not None and self._last == task.place - 1
 
-    def pop(self, open_at_end: Run | None) -> None:
-        """Remove the first task, whose layer ends with this open segment."""
-        self._last, self.open_run = self.tasks.popleft().place, open_at_end
+    def pop(self, open_at_end: OpenRuns) -> None:
+        """Remove the first task, whose layer ends with these open segments."""
+        self._last, self.open_runs = self.tasks.popleft().place, open_at_end
 
 
 class _Relabelling:
@@ -234,13 +236,13 @@ class _Relabelling:
             task = queue.tasks[0]
             follows = queue.follows_layer(task)
             if task.labelled is not None:
-                if follows or not task.labelled.lacks_start:
-                    self._complete(queue, task, task.labelled.with_start(queue.open_run))
+                if follows or not task.labelled.lacks_starts:
+                    self._complete(queue, task, task.labelled.with_starts(queue.open_runs))
                 else:
                     self._label_alone(queue, task, task.labelled)
             else:
                 assert task.metadata is not None  # it is current
-                if follows and task.metadata.open_at_start != queue.open_run:
+                if follows and task.metadata.open_at_start != queue.open_runs:
                     self._submit(queue, task)
                 else:
                     self.result.current.append(task.job.layer)
@@ -269,5 +271,6 @@ class _Relabelling:
         self._parts.discard(task.labelled.part)
         self.result.layers.append(task.job.layer)
         self.result.frames += task.labelled.frames
+        self.result.left_out |= task.labelled.left_out
         if task.labelled.loss:
             self.result.lost[task.job.log] = task.labelled.loss

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.relabel.reading import info_for_model, read_sound
+from hearthlog.analyzer.relabel.reading import infos_for_model, read_sound
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
@@ -34,7 +34,7 @@ def label_logs(models: Sequence[Model], logs: Sequence[Path]) -> Iterator[Labell
     """
     labellers = [StreamLabeller(Classifier(model)) for model in models]
     for log in logs:
-        for event in read_sound(info_for_model(log, models[0], log)[0], 0):
+        for event in read_sound(infos_for_model(log, models[0], log)[0][0], 0):
             for labeller in labellers:
                 labeller.push(event)
     for labeller, model in zip(labellers, models, strict=True):

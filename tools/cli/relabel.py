@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.text import listed
 from hearthlog.tools.cli.options import Json, Logs, Scheduler, log_location
 from hearthlog.tools.cli.text import first_of, number, tell
 
@@ -66,6 +67,9 @@ def _print(result: "Relabelled", model: str) -> None:
         print(f"{number(len(result.current), 'layer')} there already")
     if result.active:
         print(f"{number(len(result.active), 'log')} still being written")
+    if result.left_out:
+        named = [f"{name} (features of {kind})" for name, kind in sorted(result.left_out.items())]
+        tell(f"left out, as {model} is for other features: {listed(named, 'and')}")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):
@@ -82,4 +86,5 @@ def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]
         "active": [str(log) for log in result.active],
         "lost": {str(log): why for log, why in result.lost.items()},
         "failed": {str(log): why for log, why in result.failed.items()},
+        "left_out": result.left_out,
     }
