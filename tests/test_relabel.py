@@ -1,6 +1,5 @@
 """Logs labelled anew: as the recorder would have, whole, in parts, and after whatever happens."""
 
-import heapq
 import json
 import os
 import re
@@ -9,7 +8,6 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
-from itertools import repeat
 from pathlib import Path
 from threading import Event as Flag
 
@@ -25,6 +23,7 @@ from mcap.records import Metadata
 from rewriting import Log
 from spliced import run, small_disk
 from stores import put
+from together import record_together
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.analyzer.logs.layers import find_chains
@@ -34,9 +33,7 @@ from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import event_time
-from hearthlog.recorder.labelling.labelling_models import LabellingModels
-from hearthlog.recorder.recording import RecordingSession, record
+from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
@@ -451,22 +448,6 @@ def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, 
         ["anna/20/3/1"],
         ["berta/2026/03/01"],
     ]
-
-
-def record_together(folder, sources, **settings):
-    """Record microphones into one log, in the order of time, whichever thread is quicker."""
-    settings = Settings(
-        output=folder,
-        max_bag_duration=60,
-        microphone=[{"name": name, "device": name} for name in sources],
-        **settings,
-    )
-    session = RecordingSession(settings, sources, dict.fromkeys(sources, LabellingModels()))
-    streams = [zip(repeat(name), each.events(Flag())) for name, each in sources.items()]
-    for name, event in heapq.merge(*streams, key=lambda one: event_time(one[1])):
-        session.add(name, event)
-    session.finish()
-    return folder
 
 
 @pytest.fixture(scope="module")

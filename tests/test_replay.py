@@ -20,6 +20,9 @@ from conftest import HEARTHLOG, spread_files
 from logreader import LogReader
 from logs import features, labelled_frames, read
 from lossy import LossySource
+from mcap.records import Metadata
+from rewriting import Log
+from together import record_together
 
 from hearthlog.analyzer.replay.log_set import LogSet
 from hearthlog.analyzer.replay.options import ReplayOptions
@@ -123,6 +126,67 @@ def test_with_its_model_a_recording_comes_out_again_message_for_message(
     assert result.compared.labels == result.labels == len(read(folder, "label"))
     assert result.compared.segments == result.segments == len(read(folder, "segment"))
     assert (result.frames, result.gaps, result.missing) == (7200, 2, [])
+
+
+def test_so_does_each_microphone_of_a_log_with_its_own_model(
+    day, model_file, other_model, tmp_path, hearthlog
+):
+    sources = {
+        "kitchen": LossySource(FileSource([day], START), LOST),
+        "bath": FileSource([day], START + 7 * SECOND),
+    }
+    models = {"kitchen": model_file, "bath": other_model}
+    recorded = record_together(tmp_path / "logs", sources, models)
+    refused = hearthlog("replay", recorded)
+    assert refused.returncode == 1
+    (line,) = refused.stderr.splitlines()
+    assert "(home/bath, home/kitchen); replay one at a time, with --microphone" in line
+    for name, model in models.items():
+        done = hearthlog(
+            "replay", recorded, "--microphone", name, "--model", model, "-o", tmp_path / name
+        )
+        assert done.returncode == 0
+        again, whole = by_topic(tmp_path / name), by_topic(recorded)
+        for kind in ("features", "statistics", "label", "segment"):
+            assert again[f"/{name}/{kind}"]
+            assert again[f"/{name}/{kind}"] == whole[f"/{name}/{kind}"]
+        (other,) = set(models) - {name}
+        assert not any(topic.startswith(f"/{other}/") for topic in again)
+        about = LogReader(find_logs(tmp_path / name)[0])
+        assert about.metadata["hearthlog"]["model_sha256"] == load_model(model).sha256
+        assert set(about.attachments) == {"configuration.json", "model_card.md", "model.json"}
+
+
+def test_a_microphone_goes_on_where_the_model_of_another_one_changes(day, model_file, tmp_path):
+    """Whose the `hearthlog` record names, as that of the first microphone."""
+    sources = {name: FileSource([day], START) for name in ("kitchen", "bath")}
+    logs = record_together(tmp_path / "logs", sources, dict.fromkeys(sources, model_file))
+    for log in find_logs(logs)[1:]:
+        found = Log(log)
+        record = next(
+            r for r in found.records() if isinstance(r, Metadata) and "node" in r.metadata
+        )
+        record.metadata |= {"model": "another", "model_sha256": "0" * 64}
+        log.unlink()
+        found.write(log)
+    wanted = ReplayOptions(model=lambda _: load_model(model_file))
+    result = replay_logs(LogSet(find_logs(logs), "features", "bath"), wanted, Flag())
+    assert result.compared.identical
+
+
+def by_topic(folder):
+    found = {}
+    for log in content(folder).values():
+        for topic, *rest in log:
+            found.setdefault(topic, []).append(rest)
+    return found
+
+
+def test_a_microphone_that_is_not_there_is_one_line_that_names_the_others(folder, hearthlog):
+    result = hearthlog("replay", folder, "--microphone", "attic")
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert "no microphone is called 'attic' there; choose mic" in line
 
 
 def test_so_does_real_sound(household, model_file, tmp_path):

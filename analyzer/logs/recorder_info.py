@@ -72,7 +72,7 @@ class RecorderInfo:
     model: str
     model_sha256: str
     configuration: Configuration
-    metadata: Mapping[str, str]  # the `hearthlog` record
+    metadata: Mapping[str, str]  # the `hearthlog` record, with the model of this microphone
     attachments: Sequence[Attachment]
     # number and time of the first frame of its features; None if they are not wanted, or it has
     # none
@@ -167,7 +167,7 @@ def _info_of(
         model=info.get("model", ""),
         model_sha256=digest if _DIGEST.fullmatch(digest) else "",
         configuration=_configuration(path, attachments),
-        metadata=record,
+        metadata={key: own.get(key, text) for key, text in record.items()},
         attachments=attachments,
         first_frame=first,
     )

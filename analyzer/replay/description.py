@@ -13,6 +13,9 @@ from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.schemas.logs.provenance import provenance
 from hearthlog.schemas.messages.topics import CANDIDATE, topics_of
 
+# How attachments begin that are about the models of microphones.
+_MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
+
 
 def describe(
     recorded: RecorderInfo,
@@ -40,7 +43,7 @@ def describe(
         model = replace(model, name=recorded.model)  # whatever its file is called here
     classes = None if model is None else list(model.classes)
     info = stream_info(recorded.microphone, recorded.device, features, model)
-    attachments = [item for item in recorded.attachments if item.name not in {CARD, DESCRIPTION}]
+    attachments = [item for item in recorded.attachments if not item.name.startswith(_MODELS)]
     if model is not None:
         attachments += model_attachments(model)
     return LogDescription(

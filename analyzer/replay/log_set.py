@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_info
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_infos
 from hearthlog.analyzer.replay.options import ReplayOptions
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.merged_reading import time_spans
+from hearthlog.schemas.text import listed
 from hearthlog.schemas.times import NANOSECONDS
 
 _NEVER = (1 << 63) - 1
@@ -21,6 +22,8 @@ class LogSet:
         Layers and empty logs among them are left out.
     kind : str
         `features` or `audio`, as in `ReplayOptions`.
+    microphone : str or None
+        Name of the microphone; None if there is one only.
 
     Attributes
     ----------
@@ -33,14 +36,15 @@ class LogSet:
         If they hold no message, or one is damaged.
     """
 
-    def __init__(self, paths: Sequence[Path], kind: str) -> None:
+    def __init__(self, paths: Sequence[Path], kind: str, microphone: str | None = None) -> None:
         spans = time_spans(paths)
         if not spans:
             raise LogError(f"{paths[0]}: no messages, nothing to replay")
         self.kind = kind
         self.first, self.last = spans[0][0], max(last for _, last, _ in spans)
         self._spans = spans
-        self._infos: dict[Path, RecorderInfo | None] = {}
+        self._microphone = microphone
+        self._infos: dict[Path, list[RecorderInfo]] = {}
 
     def span(self, options: ReplayOptions) -> tuple[int, int]:
         """Return the span of time that is replayed.
@@ -87,6 +91,11 @@ class LogSet:
     def nothing(self) -> LogError:
         """Make the error that says that there is nothing to replay."""
         what = "clips" if self.kind == "audio" else "features"
+        there = sorted({info.microphone for infos in self._infos.values() for info in infos})
+        if self._microphone is not None and there and self._microphone not in there:
+            return LogError(
+                f"no microphone is called {self._microphone!r} there; choose {listed(there)}"
+            )
         seconds = (self.last - self.first) / NANOSECONDS
         return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
 
@@ -108,18 +117,19 @@ class LogSet:
         LogError
             If they are of several microphones or nodes, or one is damaged or there twice.
         """
-        infos = []
+        infos: list[RecorderInfo] = []
         for first, last, path in self._spans:
             if first < end and last >= start:
                 if path not in self._infos:
-                    self._infos[path] = read_recorder_info(path, self.kind)
-                if (info := self._infos[path]) is not None:
-                    infos.append(info)
+                    self._infos[path] = read_recorder_infos(path, self.kind)
+                infos += self._infos[path]
+        if self._microphone is not None:
+            infos = [info for info in infos if info.microphone == self._microphone]
         names = sorted({f"{info.node}/{info.microphone}" for info in infos})
         if len(names) > 1:
             raise LogError(
-                f"{infos[0].path} and others are of several microphones ({', '.join(names)}); "
-                "replay the logs of one at a time"
+                f"{infos[0].path}: these logs are of several microphones ({', '.join(names)}); "
+                "replay one at a time, with --microphone or by naming only its logs"
             )
         by_frame: dict[tuple[int, int], RecorderInfo] = {}
         for info in infos:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hearthlog.tools.cli.browser import print_recording
-from hearthlog.tools.cli.options import Json
+from hearthlog.tools.cli.options import Json, Microphone
 from hearthlog.tools.cli.text import moment, tell, wrong_use
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _MAX_RATE = "max"
 
 
 def replay(
-    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of one microphone.")],
+    path: Annotated[Path, typer.Argument(help="A log, or a folder of logs, of one recorder.")],
     *,
     output: Annotated[
         Path | None,
@@ -46,6 +46,7 @@ def replay(
             "logs; if it is not there, there are statistics but no labels (exit status 3)."
         ),
     ] = None,
+    microphone: Microphone = None,
     source: Annotated[
         Literal["features", "clips"],
         typer.Option("--from", help="Replay the features, or the clips of sound."),
@@ -83,7 +84,7 @@ def replay(
         loop=loop,
     )
     _check_output(output, path)
-    logs = LogSet(find_logs(path), options.kind)
+    logs = LogSet(find_logs(path), options.kind, microphone)
     models = _Models(model, (Path(), Path("models"), path if path.is_dir() else path.parent))
     models.report(logs.chosen(options))
     stop = Flag()
