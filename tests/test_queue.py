@@ -164,7 +164,7 @@ def test_alike_sounds_are_near_with_the_model_and_without_it(recorded):
     halves = np.sort(np.concatenate([middles - NANOSECONDS, middles]))
     numbers = np.arange(len(halves))
     spans = JudgeableSpans(halves, halves + NANOSECONDS, numbers, numbers)
-    model = labelling_model(sources.with_topic("/mic/segment"), recorded)
+    model = labelling_model(sources.with_topic("/mic/segment"), "mic", recorded)
     assert model is not None
     for each in (model, None):
         points, gamma = span_sounds(spans, sources, "mic", each)
@@ -186,7 +186,7 @@ def test_what_was_not_recorded_is_like_nothing(recorded):
 def test_a_queue_has_long_enough_spans_and_every_fifth_item_is_a_minute(home, models):
     if models == "file":
         for log in find_logs(home):
-            assert labelling_model(find_labellings(log).logs, home) is not None
+            assert labelling_model(find_labellings(log).logs, "mic", home) is not None
     found = items(home)
     assert len(found) == 10
     assert [item.chosen for item in found] == [*[QUEUE] * 4, RANDOM] * 2

@@ -20,7 +20,7 @@ from spliced import raw_messages, run
 from stores import account, put
 
 from hearthlog.analyzer.logs.locations import location
-from hearthlog.analyzer.logs.recorder_info import read_recorder_info
+from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
@@ -128,7 +128,7 @@ def test_what_logs_of_a_store_say_of_themselves_is_read(logs, store):
     for here, there in zip(find_logs(logs), find_logs(store), strict=True):
         assert time_span(there) == time_span(here)
         assert topic_counts(there) == topic_counts(here)
-        one, other = read_recorder_info(here, "features"), read_recorder_info(there, "features")
+        (one,), (other,) = (read_recorder_infos(path, "features") for path in (here, there))
         assert other.path == there
         assert (other.node, other.microphone, other.model_sha256, other.first_frame) == (
             one.node,

@@ -116,7 +116,7 @@ def test_a_model_of_another_set_labels_no_log(old, model_file, hearthlog, verb):
 
 def test_a_log_that_names_no_set_is_of_the_first_one(old):
     log = find_logs(old)[0]
-    info = replace(recorder_info.read_recorder_info(log, "features"), feature_set="")
+    info = replace(recorder_info.read_recorder_infos(log, "features")[0], feature_set="")
     assert recorder_info.features_of(info) == AUROS21
 
 

@@ -21,9 +21,13 @@ def record_together(
     models: Mapping[str, Path] | None = None,
     **settings: Any,
 ) -> Path:
-    """Record microphones into logs of a minute, whichever source is quicker; return the folder."""
+    """Record microphones, whichever source is quicker, and return the folder.
+
+    Logs are of a minute, unless the settings say something else.
+    """
     microphones = [{"name": name, "device": name} for name in sources]
-    asked = Settings(output=folder, max_bag_duration=60, microphone=microphones, **settings)
+    wanted = {"max_bag_duration": 60, "microphone": microphones} | settings
+    asked = Settings(output=folder, **wanted)
     labelling = dict.fromkeys(sources, LabellingModels())
     with ExitStack() as stack:
         for name, path in (models or {}).items():

@@ -10,9 +10,9 @@ import numpy as np
 from hearthlog.analyzer.accuracy.events import AROUND, MINUTE
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.labelled_by import model_of
 from hearthlog.analyzer.logs.labelling import Labelling, overlaid, unified
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.spans import Spans, cut, overlay
 from hearthlog.analyzer.marks.marks import (
     CHOICES,
@@ -116,14 +116,16 @@ def _reviewed_labels(
     near = _logs_around(logs, spans[0].start, max(span.end for span in spans))
     sources = find_labellings(*near)
     name = labelling if labelling == LIVE else relabelling(labelling)
-    model = next(latest_records([log]), {}).get("model_sha256", "")
+    models = {name: model_of(log, name) for name in {span.microphone for span in spans}}
     marks = [mark for path in near for mark in _marks(path) if class_name(mark.label) != UNKNOWN]
     for span in spans:
         with suppress(LogError):  # nothing is labelled there
             around = span.start - _AROUND, span.end + _AROUND
             labels = unified(sources.read(span.microphone, name, *around).labelling)
             own = labelling_of_marks(mark for mark in marks if mark.microphone == span.microphone)
-            yield ReviewedLabels(span, labels, overlaid(labels, own), model)
+            yield ReviewedLabels(
+                span, labels, overlaid(labels, own), models[span.microphone].model_sha256
+            )
 
 
 def _logs_around(logs: HomeLogs, start: int, end: int) -> list[Path]:

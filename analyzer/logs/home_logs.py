@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.labelled_by import NO_MODEL, LabelledBy, models_of
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.schemas.errors import LogError
@@ -53,20 +54,22 @@ class HomeLogs:
         """
         return [e for e in self.entries if e.layer == layer and e.start < end and e.end > start]
 
-    def latest_models(self) -> list[tuple[str, str]]:
+    def latest_models(self) -> list[LabelledBy]:
         """List the models that labelled the latest log of each recorder, each of them once.
 
         Returns
         -------
-        list of (str, str)
-            Names and SHA-256, empty for a recorder without a model.
+        list of LabelledBy
+            Of all microphones of a recorder; empty texts for a microphone without a model.
         """
         by_node: dict[str, list[Path]] = {}
         for entry in self.between(0, _NEVER):
             by_node.setdefault(entry.node, []).append(entry.path)
-        records = (next(latest_records(logs), {}) for logs in by_node.values())
-        named = ((one.get("model", ""), one.get("model_sha256", "")) for one in records)
-        return list(dict.fromkeys(named))
+        found: dict[LabelledBy, None] = {}
+        for logs in by_node.values():
+            latest = next(filter(None, map(models_of, reversed(logs))), {"": NO_MODEL})
+            found |= dict.fromkeys(latest.values())
+        return list(found)
 
     def first_model(self) -> str:
         """Return the SHA-256 of the model that labelled the first log of one; empty if none did."""

@@ -27,14 +27,18 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import check_microphone_name, topic
 
 CONFIGURATION = "configuration.json"
+_INFO = ("device", "feature_set", "model", "model_sha256")
 TYPES = {
     "features": (message_types.FEATURES, ("frame", "header.stamp", "values")),
     "audio": (message_types.RAW_AUDIO, CLIP_FIELDS),
+    "info": (message_types.STREAM_INFO, _INFO),
 }
 _METHODS = {"auros21": "room21", "home33": "room"}  # which learns best, of the sets of ours
 _DIGEST = re.compile("[0-9a-f]{64}")
-_FRAME = ("frame", "header.stamp")
-_INFO = ("device", "feature_set", "model", "model_sha256")
+_FIRST: Mapping[str, Collection[str]] = {
+    message_types.STREAM_INFO: _INFO,
+    message_types.FEATURES: ("frame", "header.stamp"),
+}
 
 
 class Configuration(BaseModel):
@@ -79,32 +83,6 @@ class RecorderInfo:
     first_frame: tuple[int, int] | None
 
 
-def read_recorder_info(path: Path, kind: str) -> RecorderInfo | None:
-    """Read what a log of one microphone says of its recorder.
-
-    Parameters
-    ----------
-    path : Path
-    kind : str
-        As `read_recorder_infos` takes it.
-
-    Returns
-    -------
-    RecorderInfo or None
-        None if the log has no such topic, as layers have not.
-
-    Raises
-    ------
-    LogError
-        If it is damaged, of more than one microphone, or says what cannot be.
-    """
-    infos = read_recorder_infos(path, kind)
-    if len(infos) > 1:
-        names = ", ".join(info.microphone for info in infos)
-        raise LogError(f"{path}: is of several microphones ({names}); replay one at a time")
-    return infos[0] if infos else None
-
-
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     """Read what a log says of its recorder, for each of its microphones.
 
@@ -128,7 +106,7 @@ def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     with LogFile(path) as file:
         if not file.channels:
             read_chunks(file, file.chunks[:1])  # a log without an index says it there
-        microphones = sorted(_microphones(file, kind))
+        microphones = sorted(microphones_of(file, kind))
         if not microphones:
             return []
         attachments = attachments_of(file)
@@ -145,8 +123,8 @@ def _info_of(
     attachments: Sequence[Attachment],
 ) -> RecorderInfo:
     path = file.path
-    own = _first(file, topic(microphone, "info"), message_types.STREAM_INFO, _INFO)
-    frame = _first(file, topic(microphone, "features"), message_types.FEATURES, _FRAME)
+    own = first_message(file, topic(microphone, "info"), message_types.STREAM_INFO)
+    frame = first_message(file, topic(microphone, "features"), message_types.FEATURES)
     info = {**record, **own}
     digest = info.get("model_sha256", "")
     first = None
@@ -242,7 +220,16 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
     return features
 
 
-def _microphones(file: LogFile, kind: str) -> set[str]:
+def microphones_of(file: LogFile, kind: str) -> set[str]:
+    """Return the names of the microphones that have a topic in a log.
+
+    Parameters
+    ----------
+    file : LogFile
+        Open.
+    kind : str
+        A key of `TYPES`.
+    """
     names = set()
     for channel in file.channels.values():
         schema = file.schemas.get(channel.schema_id)
@@ -252,13 +239,28 @@ def _microphones(file: LogFile, kind: str) -> set[str]:
     return names
 
 
-def _first(file: LogFile, name: str, kind: str, fields: Collection[str]) -> dict[str, Any]:
-    """Return the fields of the first message of a topic; nothing if it has none."""
+def first_message(file: LogFile, name: str, kind: str) -> dict[str, Any]:
+    """Return some fields of the first message of a topic; nothing if it has none.
+
+    Parameters
+    ----------
+    file : LogFile
+        Open.
+    name : str
+        Of the topic.
+    kind : str
+        Its type: that of features, or of the info of a microphone.
+
+    Raises
+    ------
+    LogError
+        If the message is damaged.
+    """
     ids = {i for i, channel in file.channels.items() if channel.topic == name}
     chunks = file.with_channels(file.chunks, ids)
     for i in range(len(chunks)):
         messages = read_chunks(file, chunks[i : i + 1], [name])
-        for columns in decode_types(file.path, messages, {kind: fields}):
+        for columns in decode_types(file.path, messages, {kind: _FIRST[kind]}):
             return {field: values[0] for field, values in columns.fields.items()}
     return {}
 

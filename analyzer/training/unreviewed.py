@@ -8,7 +8,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, labelling_of
-from hearthlog.analyzer.logs.recorder_info import read_recorder_info
+from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.analyzer.training.confirmed import Candidates, chosen, labelled_segments
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.marked_sound import read_sound_of
@@ -93,24 +93,23 @@ def _recent(folders: Sequence[Path]) -> list[Path]:
 def _labelled(log: Path, model: Model, names: Collection[str], length: int) -> Iterator[Candidates]:
     """Cut classes out of the beginning of a log."""
     with suppress(LogError):  # why it cannot be read is said when it is labelled
-        info = read_recorder_info(log, "features")
-        if info is None or info.first_frame is None:
-            return
-        begin = info.first_frame[1]
         features = feature_set(model.description.feature_set)
-        for sound in read_sound_of(log, features, {info.microphone}, (begin, begin + length)):
-            yield labelled_segments(sound, model.classes, names)
+        for info in read_recorder_infos(log, "features"):
+            if info.first_frame is not None:
+                begin = info.first_frame[1]
+                part = begin, begin + length
+                for sound in read_sound_of(log, features, {info.microphone}, part):
+                    yield labelled_segments(sound, model.classes, names)
 
 
 def _labelled_time(log: Path, names: Collection[str]) -> int:
     """Return for how long classes were labelled in a log, in nanoseconds."""
+    amount = 0
     with suppress(LogError):
-        info = read_recorder_info(log, "features")
-        if info is not None:
-            name = topic(info.microphone, "segment")
-            columns = read_columns([log], {name}, fields=SEGMENT_FIELDS).get(name)
-            if columns is not None:
-                labelling = labelling_of(columns)
-                own = np.isin(labelling.labels.astype(str), sorted(names))
-                return int((labelling.ends - labelling.starts)[own].sum())
-    return 0
+        infos = read_recorder_infos(log, "features")
+        topics = {topic(info.microphone, "segment") for info in infos}
+        for columns in read_columns([log], topics, fields=SEGMENT_FIELDS).values():
+            labelling = labelling_of(columns)
+            own = np.isin(labelling.labels.astype(str), sorted(names))
+            amount += int((labelling.ends - labelling.starts)[own].sum())
+    return amount

@@ -162,7 +162,7 @@ def make_queue(  # noqa: PLR0913
     parts = means.uncertainty.values(), differing, means.novelty.values()
     if ranking == USEFUL:
         logs = sources.with_topic(labelling_topic(microphone, side.name, "segment"))
-        model = labelling_model(logs, models)
+        model = labelling_model(logs, microphone, models)
 
         def sounds(some: JudgeableSpans) -> SpanSounds:
             return span_sounds(

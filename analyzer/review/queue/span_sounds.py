@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.labelled_by import model_of
 from hearthlog.analyzer.logs.labellings import Labellings, LogContents
 from hearthlog.analyzer.logs.spans import ranges
 from hearthlog.analyzer.review.queue.judgeable_spans import JudgeableSpans
@@ -22,8 +23,6 @@ from hearthlog.models.modelfile.registry import find_model
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.provenance import read_provenance
-from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
@@ -50,13 +49,14 @@ class SpanSounds(NamedTuple):
     gamma: float
 
 
-def labelling_model(logs: list[LogContents], models: Path) -> Model | None:
-    """Find the model of the latest of some logs or layers.
+def labelling_model(logs: list[LogContents], microphone: str, models: Path) -> Model | None:
+    """Find the model that labelled a microphone in the latest of some logs or layers.
 
     Parameters
     ----------
     logs : list of LogContents
         In the order of time.
+    microphone : str
     models : Path
         Folder of model files; the starter models are known without.
 
@@ -65,10 +65,8 @@ def labelling_model(logs: list[LogContents], models: Path) -> Model | None:
     Model or None
         None if its file is gone, or cannot be used.
     """
-    with suppress(LogError, ModelError):
-        with LogFile(logs[-1].path) as file:
-            record = next(reversed(read_provenance(file)), {})
-        path = find_model(models, record.get("model_sha256", ""))
+    with suppress(ModelError):
+        path = find_model(models, model_of(logs[-1].path, microphone).model_sha256)
         return None if path is None else load_model(path)
     return None
 

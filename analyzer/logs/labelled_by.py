@@ -1,0 +1,66 @@
+"""The models that labelled the microphones of a log as it was recorded."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.analyzer.logs.recorder_info import first_message, microphones_of
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.provenance import read_provenance
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import topic
+
+_ANY = ""  # microphone, where the record alone names a model
+
+
+class LabelledBy(NamedTuple):
+    """A model; both texts are empty for none."""
+
+    model: str
+    model_sha256: str
+
+
+NO_MODEL = LabelledBy("", "")
+
+
+def models_of(log: Path) -> Mapping[str, LabelledBy]:
+    """Read which models labelled the microphones of a log.
+
+    Parameters
+    ----------
+    log : Path
+        A log; or a layer, which is by one model.
+
+    Returns
+    -------
+    mapping of str to LabelledBy
+        By the names of the microphones, in their order. Of a file in which none of them says it,
+        that of its `hearthlog` record, by an empty name. Empty if it says nothing, is damaged, or
+        has no message of several microphones yet.
+    """
+    found: dict[str, LabelledBy] = {}
+    with suppress(LogError), LogFile(log) as file:
+        names = sorted(microphones_of(file, "info"))
+        for name in names:
+            info = first_message(file, topic(name, "info"), message_types.STREAM_INFO)
+            if info:
+                found[name] = LabelledBy(info["model"], info["model_sha256"])
+        if not found and len(names) <= 1:
+            for record in read_provenance(file)[-1:]:
+                found[_ANY] = LabelledBy(record.get("model", ""), record.get("model_sha256", ""))
+    return found
+
+
+def model_of(log: Path, microphone: str) -> LabelledBy:
+    """Read which model labelled a microphone of a log, or of a layer; as `models_of`.
+
+    Parameters
+    ----------
+    log : Path
+    microphone : str
+        Its name.
+    """
+    models = models_of(log)
+    return models.get(microphone, models.get(_ANY, NO_MODEL))

@@ -1,0 +1,100 @@
+"""What is learned and measured where a log is of several microphones, each with its own model."""
+
+from pathlib import Path
+
+import pytest
+from kept import keep_models
+from spliced import run
+from together import record_together
+
+from hearthlog.analyzer.accuracy.reviewed_labels import read_reviewed_labels
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.labelled_by import model_of
+from hearthlog.analyzer.logs.labellings import find_labellings
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.review.queue.span_sounds import labelling_model
+from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds
+from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, is_layer, relabel_path
+
+SECOND = 10**9
+START = 1_772_348_400 * SECOND
+MODELS = {"kitchen": "one", "bath": "two"}
+LATER = {"kitchen": 0, "bath": 240 * SECOND}  # the sound has three minutes
+
+
+@pytest.fixture
+def home(day, tmp_path, model_file, monkeypatch):
+    """A home with a log of two microphones, in the current folder."""
+    keep_models(tmp_path / "models", model_file)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HEARTHLOG_MODEL")
+    sources = {name: FileSource([day], START + later) for name, later in LATER.items()}
+    models = {name: file_of(name) for name in sources}
+    return record_together(Path("logs"), sources, models, max_bag_duration=3600)
+
+
+def file_of(microphone):
+    return Path("models", f"{MODELS[microphone]}.safetensors")
+
+
+def log_in(home):
+    (log,) = (path for path in find_logs(home) if not is_layer(path))
+    return log
+
+
+def loudest(home, microphone):
+    """Start, end and label of the longest sound that is not silence."""
+    found = read_columns([log_in(home)], [f"/{microphone}/segment"])[f"/{microphone}/segment"]
+    each = zip(found["header.stamp"], found["duration"], found["label"], strict=True)
+    start, length, label = max((one for one in each if one[2] != "silence"), key=lambda one: one[1])
+    return int(start), int(start + length), str(label)
+
+
+def test_it_is_known_of_each_microphone_which_model_labels_it(home):
+    for name, model in MODELS.items():
+        wanted = model, load_model(file_of(name)).sha256
+        assert model_of(log_in(home), name) == wanted
+        assert wanted in find_home_logs([home]).latest_models()
+        logs = find_labellings(log_in(home)).with_topic(f"/{name}/segment")
+        assert labelling_model(logs, name, Path("models")).sha256 == wanted[1]
+
+
+def test_a_layer_is_of_its_own_model_for_each_microphone(home, capfd):
+    assert run(capfd, "relabel", home, "--model", file_of("bath")).returncode == 0
+    layer = relabel_path(log_in(home), "two")
+    assert {model_of(layer, name).model for name in MODELS} == {"two"}
+
+
+def test_a_review_is_of_the_model_of_its_microphone(home):
+    log = log_in(home)
+    spans = [ReviewedSpan(name, *loudest(home, name)[:2]) for name in MODELS]
+    write_marks(log, [], reviewed=spans)
+    found = read_reviewed_labels(find_home_logs([home]), "live", 0, 1 << 62, [])
+    assert {one.span.microphone: one.model for one in found} == {
+        name: load_model(file_of(name)).sha256 for name in MODELS
+    }
+
+
+def test_what_nobody_looked_at_is_kept_of_each_microphone(home):
+    model = load_model(file_of("kitchen"))
+    names = {loudest(home, name)[2] for name in MODELS}
+    sounds = unreviewed_sounds([home], model, names)
+    silence = [one for part in unreviewed_silence([home], model) for one in part.recordings]
+    for recordings in (sounds, silence):
+        assert {one.span[0] >= START + LATER["bath"] for one in recordings} == {False, True}
+
+
+def test_training_asks_for_a_base_and_then_learns_of_both_microphones(home, capfd):
+    log = log_in(home)
+    marks = [Mark(name, *loudest(home, name)) for name in MODELS]
+    write_marks(log, marks, reviewed=[ReviewedSpan(*mark[:3]) for mark in marks])
+    asked = run(capfd, "train", "--home", home)
+    assert (asked.returncode, asked.stderr) == (
+        2,
+        "hearthlog: the latest logs are labelled by two and one: choose one with --base\n",
+    )
+    done = run(capfd, "train", "--home", home, "--base", file_of("kitchen"))
+    assert done.returncode == 0, done.stderr
