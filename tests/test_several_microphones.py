@@ -2,20 +2,25 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import soundfile
 from kept import keep_models
 from spliced import run
 from together import record_together
 
 from hearthlog.analyzer.accuracy.reviewed_labels import read_reviewed_labels
+from hearthlog.analyzer.gate.evidence import right_at_random
+from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelled_by import model_of
 from hearthlog.analyzer.logs.labellings import find_labellings
-from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.queue.span_sounds import labelling_model
 from hearthlog.analyzer.training.unreviewed import unreviewed_silence, unreviewed_sounds
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer, relabel_path
 
@@ -98,3 +103,22 @@ def test_training_asks_for_a_base_and_then_learns_of_both_microphones(home, capf
     )
     done = run(capfd, "train", "--home", home, "--base", file_of("kitchen"))
     assert done.returncode == 0, done.stderr
+    assert "several microphones" not in done.stderr
+    assert "what it would change" in done.stderr
+
+
+def test_models_are_judged_by_what_each_microphone_heard_at_the_same_time(
+    day, model_file, tmp_path
+):
+    noise = np.random.default_rng(5).standard_normal(180 * SAMPLE_RATE) / 3000
+    soundfile.write(tmp_path / "night.wav", noise, SAMPLE_RATE)
+    files = {"kitchen": tmp_path / "night.wav", "bath": day}
+    sources = {name: FileSource([file], START) for name, file in files.items()}
+    models = dict.fromkeys(files, model_file)
+    home = record_together(tmp_path / "logs", sources, models, max_bag_duration=3600)
+    heard = loudest(home, "bath")
+    spans = [ReviewedSpan(name, *heard[:2], chosen=RANDOM) for name in files]
+    write_marks(log_in(home), [], reviewed=spans)
+    model = load_model(model_file)
+    right = right_at_random(model, model, recent_logs([home]))
+    assert (right.sounds, right.before, right.after) == (2, 2, 2)

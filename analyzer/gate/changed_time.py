@@ -45,6 +45,7 @@ def find_changed_time(
     before: Model,
     after: Model,
     logs: Sequence[RecentLog],
+    microphone: str,
     progress: Progress = ignore_progress,
 ) -> ChangedTime:
     """Run two models over the sample of the recent time of a home, as `gather_evidence` does.
@@ -54,7 +55,8 @@ def find_changed_time(
     before, after : Model
         Of the same feature set.
     logs : sequence of RecentLog
-        Of one microphone.
+    microphone : str
+        Whose sound is labelled.
     progress : callable, optional
         Is told the share of the sound that is done, 0 to 1.
 
@@ -66,7 +68,10 @@ def find_changed_time(
     losses: list[str] = []
     learned = learned_by(before, after, known_sounds(logs, losses))
     models = TwoModels(before, after)
-    parts = unlearned_sample(logs, learned)
+    parts = [
+        one._replace(part=one.part._replace(microphone=microphone))
+        for one in unlearned_sample(logs, learned)
+    ]
     frames = joined_frames(list(label_parts(models, parts, losses, progress)))
     changes = changes_of_sample(models.classes, frames, logs)
     return ChangedTime(_differing(frames, len(models.classes)), changes, losses)

@@ -166,12 +166,17 @@ def _is_in(spans: Spans, sound: Sound) -> bool:
 def _places(known: KnownSounds) -> list[tuple[Part, list[Sound]]]:
     """Join sounds that are near each other, so that they are labelled at once; the latest ones."""
     places: list[tuple[Part, list[Sound]]] = []
-    for log, sounds in known:
+    by_microphone = (
+        (log.path, name, [sound for sound in sounds if sound.microphone == name])
+        for log, sounds in known
+        for name in sorted({sound.microphone for sound in sounds})
+    )
+    for log, microphone, sounds in by_microphone:
         times = spans_of([(s.start, s.end) for s in sounds], _NEAR)
         rows = rows_at(times, np.array([s.start for s in sounds], np.int64))
         for row, (start, end) in enumerate(zip(*(edge.tolist() for edge in times), strict=True)):
             inside = [sound for sound, own in zip(sounds, rows, strict=True) if own == row]
-            places.append((Part(log.path, start, end), inside))
+            places.append((Part(log, start, end, microphone), inside))
     # What was drawn at random goes first, then the latest.
     places.sort(key=lambda place: (any(s.random for s in place[1]), place[0].start), reverse=True)
     seconds = np.cumsum([(part.end - part.start) / NANOSECONDS for part, _ in places])

@@ -95,7 +95,8 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
     known: list[Sound] = []
     for place, log in enumerate(logs, 1):
         try:
-            known += reference(log, logs[place:])
+            sounds = reference(log, logs[place:])
+            known += [sound for sound in sounds if sound.microphone == name]
         except LogError as error:
             losses.append(str(error))
     sides = [unified(side.labelling) for side in (live, candidate)]

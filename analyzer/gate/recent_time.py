@@ -44,6 +44,7 @@ class Part(NamedTuple):
     log: Path
     start: int
     end: int
+    microphone: str | None = None  # None for all of them
 
 
 class WeightedPart(NamedTuple):

@@ -1,6 +1,7 @@
 """What is known of the sounds of a home: marks, and what was looked at and left as it was."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,12 +26,14 @@ class Sound(NamedTuple):
     label : str
     random : bool
         Whether it is of time that was drawn at random, and not chosen.
+    microphone : str
     """
 
     start: int
     end: int
     label: str
     random: bool
+    microphone: str
 
 
 def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
@@ -56,7 +59,7 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
     inside = [sound for span in drawn for sound in _true(labellings, span, marks)]
     others = [
-        Sound(mark.start, mark.end, mark.label, random=False)
+        Sound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
         for mark in marks
         if not any(_inside(mark, span) for span in drawn)
     ]
@@ -65,14 +68,15 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[Sound]:
 
 def _true(labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]) -> Iterator[Sound]:
     """Yield what is true of a reviewed span: the labelling, and the marks over it."""
+    known = partial(Sound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
-        yield Sound(max(mark.start, span.start), min(mark.end, span.end), mark.label, random=True)
+        yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
     name = labellings.find(span.microphone, span.corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling
     rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
     for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):
-        yield Sound(int(start), int(end), str(label), random=True)
+        yield known(int(start), int(end), str(label))
 
 
 def _drawn(reviewed: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.gate.recent_time import Part
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.relabel.reading import infos_for_model
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
@@ -15,7 +16,6 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
-from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
 
 _FLOOR_WARM_UP = 150 * NANOSECONDS
@@ -92,16 +92,18 @@ class TwoModels:
         Returns
         -------
         LabelledFrames
-            Those that both models label, with indices of `classes`.
+            Those that both models label, with indices of `classes`: one microphone after the other.
 
         Raises
         ------
         LogError
             If the log cannot be read, or has no features of the set of the models.
         """
-        (info, *others), _ = infos_for_model(part.log, self._model, part.log)
-        if others:
-            raise LogError(f"{part.log}: is of several microphones; models are compared on one")
+        infos, _ = infos_for_model(part.log, self._model, part.log)
+        wanted = [info for info in infos if part.microphone in {None, info.microphone}]
+        return joined_frames([self._label(info, part, weight) for info in wanted])
+
+    def _label(self, info: RecorderInfo, part: Part, weight: float) -> LabelledFrames:
         start, end = part.start - _FLOOR_WARM_UP, part.end + _BEHIND
         sound = [
             event

@@ -66,7 +66,7 @@ def changed_by(  # noqa: PLR0913, PLR0917
     topic = labelling_topic(microphone, LIVE, "segment")
     paths = [log.path for log in sources.with_topic(topic)]
     before = _champion(folder, after, paths)
-    changed = find_changed_time(before, after, recent_logs(paths), progress)
+    changed = find_changed_time(before, after, recent_logs(paths), microphone, progress)
     sources.losses.extend(loss for loss in changed.losses if loss not in sources.losses)
     left = without(_where(changed, side), reviewed_time(sources, microphone).spans)
     spans = judgeable_spans(left)
