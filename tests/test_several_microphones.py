@@ -1,5 +1,6 @@
 """What is learned and measured where a log is of several microphones, each with its own model."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from together import record_together
 
 from hearthlog.analyzer.accuracy.reviewed_labels import read_reviewed_labels
 from hearthlog.analyzer.gate.evidence import right_at_random
+from hearthlog.analyzer.gate.judge import find_champion
 from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelled_by import model_of
@@ -122,3 +124,18 @@ def test_models_are_judged_by_what_each_microphone_heard_at_the_same_time(
     model = load_model(model_file)
     right = right_at_random(model, model, recent_logs([home]))
     assert (right.sounds, right.before, right.after) == (2, 2, 2)
+
+
+@pytest.mark.parametrize("microphone", ["kitchen", "bath"])
+def test_a_model_is_compared_with_the_one_that_it_was_adapted_from(home, microphone):
+    Path("models", "champion.safetensors").unlink()
+    labels_now = load_model(file_of(microphone))
+    about = labels_now.description
+    data = about.training_data.model_copy(update={"base_sha256": labels_now.sha256})
+    adapted = replace(
+        labels_now,
+        description=about.model_copy(update={"training_data": data}),
+        sha256="0" * 64,
+    )
+    champion = find_champion(Path("models"), [home], adapted)
+    assert champion.sha256 == labels_now.sha256

@@ -105,7 +105,8 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
     folder : Path
         Folder of models, whose champion it is, unless that is the model that is judged or is gone.
     home : sequence of Path
-        Folders of logs, the latest of which it else has labelled.
+        Folders of logs, the latest of which it else has labelled; of several such models the one
+        that the model was adapted from goes first.
     model : Model
         The one that is judged.
 
@@ -124,16 +125,17 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
         if champion.sha256 != model.sha256:
             return champion
     with suppress(LogError):
-        for name, labelled_by in find_home_logs(home).latest_models():
-            if name:
-                path = find_model(folder, labelled_by)
-                if path is None:
-                    raise ModelError(
-                        f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
-                        "nor a starter model of this version: put its file there to compare with "
-                        f"it, or insist: `hearthlog models promote {model.name} --anyway`"
-                    )
-                return load_model(path)
+        named = [one for one in find_home_logs(home).latest_models() if one.model]
+        base = model.description.training_data.base_sha256
+        for name, labelled_by in sorted(named, key=lambda one: one.model_sha256 != base)[:1]:
+            path = find_model(folder, labelled_by)
+            if path is None:
+                raise ModelError(
+                    f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
+                    "nor a starter model of this version: put its file there to compare with "
+                    f"it, or insist: `hearthlog models promote {model.name} --anyway`"
+                )
+            return load_model(path)
     return None
 
 
