@@ -1186,6 +1186,13 @@ def test_logs_of_an_evening_for_which_the_clock_was_wrong_by_days_follow_each_ot
     assert found(tmp_path) == {("warning", GAP)}
 
 
+def test_a_log_before_the_clock_was_set_may_have_been_deleted(tmp_path):
+    ahead = 60 * 86_400
+    _, second, *_ = find_logs(clock_set(tmp_path, 3600, ahead, -ahead, 3600))
+    second.unlink()
+    assert found(tmp_path) == {("warning", GAP), ("warning", "missing-log")}
+
+
 def test_a_log_whose_frames_do_not_continue_is_found(folder):
     path = find_logs(folder)[2]
     log = Log(path)

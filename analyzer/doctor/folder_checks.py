@@ -122,6 +122,12 @@ def _say_missing(microphone: str, previous: ExaminedFile, file: ExaminedFile, mi
     frames, last = file.frames[microphone], previous.frames[microphone].last
     assert frames.first is not None
     assert last is not None
+    if frames.gap_before is not None and abs(frames.gap_before[0] - last[1]) >= NANOSECONDS:
+        when = millisecond_text(frames.gap_before[0])
+        what = f"{microphone}: goes on with a log that ends at {when}, which is not here"
+        advice = "the clock was set then; it was deleted, or is missing"
+        file.findings.warning("missing-log", what, advice, time=frames.first[1])
+        return
     elapsed = frames.first[1] - last[1]
     counted = (frames.first[0] - last[0]) * FRAME_NANOSECONDS
     name = previous.findings.path.name

@@ -18,7 +18,7 @@ from hearthlog.tools.month.shared_state import SharedState
 DEVICE = "simulated microphone"
 _BLOCK = int(SAMPLE_RATE * BLOCK_SECONDS)
 _QUIET_BLOCK = 10 * _BLOCK  # where nothing happens: most of the work is by the block
-_PPM = 30.0  # by which its crystal is slow
+PPM = 30.0  # by which its crystal is slow
 _LATE_SECONDS = 0.0002  # on average, of the times that the sound card tells
 _DELAY_SECONDS = 0.004  # from the last sample of a block to its arrival
 _HELD_SECONDS = 32.0  # in the pipe, while the recorder stands still
@@ -163,7 +163,7 @@ class FastMicrophone:
         return SampleBlock(index, samples, overflowed, adc, time.monotonic())
 
     def _time_of(self, sample: int) -> int:
-        return self._begin + int(sample * NANOSECONDS / SAMPLE_RATE * (1 + _PPM * 1e-6))
+        return self._begin + int(sample * NANOSECONDS / SAMPLE_RATE * (1 + PPM * 1e-6))
 
     def _monotonic(self) -> int:
         return self._state.now - self._state.boot

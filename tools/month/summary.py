@@ -11,6 +11,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.times import NANOSECONDS
 from hearthlog.tools.month.account import holes
+from hearthlog.tools.month.fast_microphone import PPM
 from hearthlog.tools.month.faults import Fault
 from hearthlog.tools.month.folders import MonthFolder
 from hearthlog.tools.month.watch import MonthRecord, Run
@@ -86,7 +87,7 @@ def _add_losses(summary: Summary, record: MonthRecord, folder: MonthFolder) -> N
     lost: dict[str, list[float]] = {}
     for run in record.runs:
         frames = last.get(run.process, -1) + 1
-        seconds = (run.sound - frames * FRAME_NANOSECONDS) / NANOSECONDS
+        seconds = (run.sound - frames * FRAME_NANOSECONDS * (1 + PPM * 1e-6)) / NANOSECONDS
         lost.setdefault(run.end, []).append(seconds)
     for end, each in lost.items():
         summary.add(

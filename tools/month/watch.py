@@ -234,7 +234,7 @@ def _sample(process: int, now: int) -> Sample | None:
     try:
         lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
         fields = dict(line.split(":", 1) for line in lines[1:])
-        memory = sum(int(fields[name].split()[0]) for name in ("Private_Dirty", "Private_Clean"))
+        memory = int(fields["Anonymous"].split()[0])  # the composed sound is a mapped file
         descriptors = sum(1 for _ in Path(f"/proc/{process}/fd").iterdir())
     except (OSError, ValueError, KeyError):  # it has just ended
         return None
