@@ -21,6 +21,7 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import app
 from hearthlog.tools.home.__main__ import home as simulate_home
 from hearthlog.tools.home.simulate import write_day, write_training_set
+from hearthlog.tools.month.__main__ import month as simulate_month
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -64,9 +65,10 @@ def options_of(verb):
 
 DEVELOPERS = typer.Typer()  # what is no verb
 DEVELOPERS.command()(simulate_home)
+DEVELOPERS.command()(simulate_month)
 OPTIONS = {
     name
-    for verb in (*VERBS.values(), typer.main.get_command(DEVELOPERS))
+    for verb in (*VERBS.values(), *typer.main.get_command(DEVELOPERS).commands.values())
     for name in options_of(verb)
 } | {"--help"}
 

@@ -62,13 +62,16 @@ def recording(folder, logs, *arguments, env=None):
 
 def wait_for(condition, seconds=30):
     deadline = time.monotonic() + seconds
-    while not condition():
+    while True:
+        with suppress(LogError):  # a log is completed, and gets its name, at any time
+            if condition():
+                return
         assert time.monotonic() < deadline, f"not in {seconds} s"
         time.sleep(0.1)
 
 
 def count(logs, kind):
-    with suppress(LogError):  # a log is completed, and gets its name, at any time
+    with suppress(LogError):
         return len(read(logs, kind)) if logs.exists() and list(logs.rglob("*.mcap*")) else 0
     return 0
 
