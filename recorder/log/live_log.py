@@ -4,14 +4,13 @@ import errno
 import os
 import shutil
 import time
-from collections import deque
 from collections.abc import Iterable, Sequence
-from itertools import groupby
 from pathlib import Path
 
 from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.folder_lock import FolderLock
+from hearthlog.recorder.log.held_messages import Held, HeldMessages
 from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
@@ -22,7 +21,7 @@ _HELD_BYTES = 8 << 20  # twenty minutes of one microphone
 _RETRY_SECONDS = 2.0
 _SPARE_BYTES = 1 << 20  # what must be free beside what is held
 
-_Held = EncodedMessage | LogDescription  # a description: here another log begins
+_WRITTEN_AT_ONCE = 256  # messages of those that were held
 
 
 class LiveLog:
@@ -48,8 +47,7 @@ class LiveLog:
         self._node = node
         self._lock = lock
         self._mount = _mount_of(root)
-        self._held: deque[_Held] = deque()  # not yet known to be on the disk
-        self._held_bytes = 0
+        self._held = HeldMessages()  # not yet known to be on the disk
         self._safe = 0  # messages that were held and no longer are
         self._failing = False
         self._reason = ""
@@ -59,7 +57,7 @@ class LiveLog:
     @property
     def is_full(self) -> bool:
         """Whether nothing more can be held, so that sound must be dropped."""
-        return self._failing and self._held_bytes >= _HELD_BYTES
+        return self._failing and self._held.size >= _HELD_BYTES
 
     @property
     def finished(self) -> list[Path]:
@@ -74,7 +72,7 @@ class LiveLog:
         messages : sequence of EncodedMessage
             In the order of their log times.
         """
-        self._hold(messages)
+        self._held.extend(messages)
         self._write(messages)
 
     def notices(self) -> list[Notice]:
@@ -112,7 +110,7 @@ class LiveLog:
         messages : sequence of EncodedMessage
             The last ones of the open file, in the order of their log times.
         """
-        self._hold([*messages, description])
+        self._held.extend([*messages, description])
         self._write([*messages, description])
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
@@ -128,7 +126,7 @@ class LiveLog:
         LogError
             If the disk refuses them.
         """
-        self._hold(messages)
+        self._held.extend(messages)
         self._retry_at = 0.0
         self._write(messages)
         if self._failing:
@@ -138,11 +136,7 @@ class LiveLog:
             raise LogError(f"{what}; the last {seconds:.0f} s are lost")
         self._log.finish()
 
-    def _hold(self, items: Sequence[_Held]) -> None:
-        self._held.extend(items)
-        self._held_bytes += sum(map(_size, items))
-
-    def _write(self, items: Sequence[_Held]) -> None:
+    def _write(self, items: Sequence[Held]) -> None:
         """Write what was just held, or all that is held if the disk refused it before."""
         if self._failing and time.monotonic() < self._retry_at:
             return
@@ -156,7 +150,7 @@ class LiveLog:
                 self._log.sync()
             else:
                 self._pour(items)
-                if self._held_bytes >= _HELD_BYTES:
+                if self._held.size >= _HELD_BYTES:
                     self._log.sync()
         except (LogError, OSError) as error:
             self._fail(error)
@@ -167,19 +161,22 @@ class LiveLog:
                 self._complete_what_was_cut()
         self._let_go()
 
-    def _pour(self, items: Iterable[_Held]) -> None:
-        for is_message, run in groupby(items, lambda item: isinstance(item, EncodedMessage)):
-            if is_message:
-                self._log.write([item for item in run if isinstance(item, EncodedMessage)])
-                continue
-            for description in run:
-                assert isinstance(description, LogDescription)
-                self._log.begin_anew(description, [])
+    def _pour(self, items: Iterable[Held]) -> None:
+        messages: list[EncodedMessage] = []
+        for item in items:
+            if isinstance(item, EncodedMessage):
+                messages.append(item)
+            if len(messages) == _WRITTEN_AT_ONCE or isinstance(item, LogDescription):
+                self._log.write(messages)
+                messages = []
+            if isinstance(item, LogDescription):
+                self._log.begin_anew(item, [])
+        self._log.write(messages)
 
     def _check_disk(self) -> None:
         if not self._mount.is_mount():  # the folder below it is on another disk
             raise OSError(errno.ENODEV, f"{self._mount} is not mounted")
-        if shutil.disk_usage(self._mount).free < 2 * self._held_bytes + _SPARE_BYTES:
+        if shutil.disk_usage(self._mount).free < 2 * self._held.size + _SPARE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _fail(self, error: LogError | OSError) -> None:
@@ -198,17 +195,12 @@ class LiveLog:
 
     def _let_go(self) -> None:
         """Forget the messages that are on the disk."""
-        while self._held and (self._safe < self._log.safe or self._has_begun(self._held[0])):
-            item = self._held.popleft()
-            self._held_bytes -= _size(item)
-            self._safe += isinstance(item, EncodedMessage)
-
-    def _has_begun(self, item: _Held) -> bool:
-        return isinstance(item, LogDescription) and not self._failing
-
-
-def _size(item: _Held) -> int:
-    return len(item.data) if isinstance(item, EncodedMessage) else 0
+        while self._held:
+            begins_log = self._held.begins_log
+            if self._safe == self._log.safe and (self._failing or not begins_log):
+                return
+            self._held.drop_first()
+            self._safe += not begins_log
 
 
 def _mount_of(folder: Path) -> Path:
