@@ -274,7 +274,7 @@ class RecordingSession:
             file_bytes=settings.max_bag_size,
             finisher=self._finisher,
         )
-        self._log = LiveLog(log, settings.output, settings.node, lock) if is_live else log
+        self._log = LiveLog(log, settings.output, lock) if is_live else log
         pipelines = [stream.pipeline for stream in self._streams.values()]
         self._clips = ClipRecorder(settings, pipelines, self._log.file_at)
         self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None

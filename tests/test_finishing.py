@@ -98,7 +98,7 @@ def live_hour(tmp_path_factory):
 
     class Held(LogFinisher):
         def add(self, active):
-            held.append(active)
+            held.extend(active)
 
     log = RollingLog(describe_log(about, info, DEFAULT, None), 3600, 1.0, 5.0, finisher=Held())
     data = np.random.default_rng(0).bytes(1 << 16)
@@ -160,7 +160,7 @@ def test_a_rewriting_ends_with_the_recorder_and_the_next_start_does_it(live_hour
     code = (
         "import os, sys; from pathlib import Path\n"
         "from hearthlog.recorder.log.finishing import LogFinisher\n"
-        "finisher = LogFinisher(); finisher.add(Path(sys.argv[1]))\n"
+        "finisher = LogFinisher(); finisher.add([Path(sys.argv[1])])\n"
         "print(finisher._processes[0].pid, flush=True); os.kill(os.getpid(), 9)"
     )
     recorder = subprocess.run(
@@ -190,9 +190,9 @@ def test_without_room_for_a_copy_a_log_gets_its_name_as_it_is(live_hour, tmp_pat
 def test_what_a_process_left_is_done_by_the_next_one(live_hour, tmp_path):
     first = shutil.copy(live_hour[0], tmp_path / live_hour[0].name)
     finisher = LogFinisher()
-    finisher.add(first)
+    finisher.add([first])
     finisher._processes[0].kill()
     second = complete(tmp_path / "home_20260301T000000Z.mcap", [[START]])
-    finisher.add(second)
+    finisher.add([second])
     finisher.close()
     assert [path.suffix for path in find_logs(tmp_path)] == [".mcap", ".mcap"]

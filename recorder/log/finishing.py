@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -34,16 +35,16 @@ class LogFinisher:
         self._left: list[Path] = []
         self._processes: list[subprocess.Popen[bytes]] = []
 
-    def add(self, active: Path) -> None:
-        """Begin to write a log anew that is completed but not named; return at once.
+    def add(self, active: Sequence[Path]) -> None:
+        """Begin to write logs anew that are completed or cut, but not named; return at once.
 
         Parameters
         ----------
-        active : Path
-            Its active name; nobody writes it any more.
+        active : sequence of Path
+            Their active names; one that somebody still writes is left alone.
         """
         self._forget([process for process in self._processes if process.poll() is not None])
-        self._left = [path for path in [*self._left, active] if path.exists()]
+        self._left = [path for path in dict.fromkeys([*self._left, *active]) if path.exists()]
         command = [*_COMMAND, *map(str, self._left)]
         with suppress(OSError):  # no memory for a process: the next one does it
             self._processes.append(subprocess.Popen(command, stdin=subprocess.PIPE))  # noqa: S603
@@ -73,10 +74,13 @@ def finish_log(active: Path) -> None:
     Parameters
     ----------
     active : Path
-        Its active name. If it is gone, or somebody else is at it, nothing is done.
+        Its active name. If it is gone, or somebody else is at it, nothing is done. What is damaged
+        in it is said on standard error.
     """
     try:
-        complete_log(active)
+        for recovered in complete_log(active):
+            if recovered.damage:
+                sys.stderr.write(f"hearthlog: {recovered.damage}\n")
     except (LogError, OSError):  # there is no room for a copy
         with suppress(LogError, OSError):  # else it is left for the next start
             _name_as_it_is(active)

@@ -11,7 +11,6 @@ from hearthlog.recorder.events import OK, WARNING, Notice
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.held_messages import Held, HeldMessages
-from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
@@ -33,18 +32,13 @@ class LiveLog:
         Live.
     root : Path
         Its folder.
-    node : str
-        Name of the recorder.
     lock : FolderLock or None
         Of the folder.
     """
 
-    def __init__(
-        self, log: RollingLog, root: Path, node: str, lock: FolderLock | None = None
-    ) -> None:
+    def __init__(self, log: RollingLog, root: Path, lock: FolderLock | None = None) -> None:
         self._log = log
         self._root = root
-        self._node = node
         self._lock = lock
         self._mount = _mount_of(root)
         self._held = HeldMessages()  # not yet known to be on the disk
@@ -158,7 +152,7 @@ class LiveLog:
             if self._failing:
                 self._failing = False
                 self._notices.append(Notice(OK, f"{self._root} can be written again"))
-                self._complete_what_was_cut()
+                self._log.complete_what_was_cut()
         self._let_go()
 
     def _pour(self, items: Iterable[Held]) -> None:
@@ -187,11 +181,6 @@ class LiveLog:
             self._failing = True
             what = f"{self._root} cannot be written ({self._reason})"
             self._notices.append(Notice(WARNING, f"{what}: it is held in memory until it can"))
-
-    def _complete_what_was_cut(self) -> None:
-        for recovered in recover_active(self._root, self._node):
-            if recovered.damage:
-                self._notices.append(Notice(WARNING, recovered.damage))
 
     def _let_go(self) -> None:
         """Forget the messages that are on the disk."""

@@ -60,9 +60,9 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
         By name; a log that begins but has no message is not there.
     """
     completed = []
-    for active in sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}"))):
+    for active in active_logs(root, node):
         try:
-            completed += _recover_abandoned(active)
+            completed += complete_log(active)
         except (LogError, OSError) as error:
             what = error if isinstance(error, LogError) else error.strerror or error
             text = f"{active}: cannot be completed ({what}); it is left as it is"
@@ -70,7 +70,20 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
     return completed
 
 
-def complete_log(active: Path) -> None:
+def active_logs(root: Path, node: str) -> list[Path]:
+    """Return the logs of a node, and their clips, that have no final name yet, by name.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the logs.
+    node : str
+        Name of the node.
+    """
+    return sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}")))
+
+
+def complete_log(active: Path) -> list[Recovered]:
     """Complete one log as `recover_active` does.
 
     Parameters
@@ -78,16 +91,26 @@ def complete_log(active: Path) -> None:
     active : Path
         If it is gone, or somebody else is at it, nothing is done.
 
+    Returns
+    -------
+    list of Recovered
+        None or one.
+
     Raises
     ------
-    LogError
+    LogError, OSError
         If it cannot be read or completed.
     """
     if not active.exists():
-        return
+        return []
     with lock_abandoned(active) as is_abandoned:
-        if is_abandoned:
-            _recover(active, active.with_name(stem(active) + SUFFIX))
+        if not is_abandoned:
+            return []
+        if not active.stat().st_size:
+            active.unlink()
+            return [Recovered(active, f"{active}: was empty, and is deleted", completed=False)]
+        recover = _recover_clips if is_layer(active) else _recover
+        return recover(active, active.with_name(stem(active) + SUFFIX))
 
 
 def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
@@ -134,17 +157,6 @@ def _end_in(file: LogFile, microphone: str) -> int:
         if read:
             return max(int(raw.log_times.max()) + later[raw.channel.topic] for raw in read)
     return 0
-
-
-def _recover_abandoned(active: Path) -> list[Recovered]:
-    with lock_abandoned(active) as is_abandoned:
-        if not is_abandoned:
-            return []
-        if not active.stat().st_size:
-            active.unlink()
-            return [Recovered(active, f"{active}: was empty, and is deleted", completed=False)]
-        recover = _recover_clips if is_layer(active) else _recover
-        return recover(active, active.with_name(stem(active) + SUFFIX))
 
 
 def _recover_clips(active: Path, path: Path) -> list[Recovered]:

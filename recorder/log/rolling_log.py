@@ -9,6 +9,7 @@ from pathlib import Path
 from hearthlog.recorder.events import Notice
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.finishing import LogFinisher
+from hearthlog.recorder.log.recovery import active_logs
 from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import free_log_path, log_path
@@ -218,6 +219,11 @@ class RollingLog:
         self._description = description
         self._until = 0
 
+    def complete_what_was_cut(self) -> None:
+        """Have the files completed that the disk has refused, clips among them; return at once."""
+        if self._finisher is not None:
+            self._finisher.add(active_logs(self._description.root, self._description.node))
+
     def begin_after_failure(self) -> None:
         """Go on after an error: the messages that are not `safe` are to be written again.
 
@@ -253,7 +259,7 @@ class RollingLog:
                 self._writer.finish()
             else:
                 self._writer.complete()
-                self._finisher.add(self._writer.active_path)
+                self._finisher.add([self._writer.active_path])
             self.finished.append(self._writer.path)
             self._writer = None
         self.safe = self._given
