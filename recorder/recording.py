@@ -34,6 +34,7 @@ from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.microphone_stream import MicrophoneStream
+from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource
@@ -193,10 +194,13 @@ def _record(
     with ExitStack() as stack:
         models = _open_models(settings, list(sources), reload_requests, stack)
         session = RecordingSession(settings, sources, models, lock)
+        manager = ServiceManager(sources)
         try:
             for microphone, event in merged_events(sources, stop):
                 session.add(microphone, event)
+                manager.add(microphone, event)
         finally:
+            manager.stop()
             session.finish()
     return session.summary
 
