@@ -23,22 +23,24 @@ from pydantic_settings import (
 from pydantic_settings.sources import PydanticBaseSettingsSource
 
 from hearthlog.recorder.addresses import public_name
+from hearthlog.recorder.config_origins import DEFAULT, ENVIRONMENT, Key, Origins, key_lines
 from hearthlog.recorder.disk.keeping import KeepingRules
 from hearthlog.recorder.disk.retention import Limits
 from hearthlog.recorder.disk.sizes import Size
 from hearthlog.recorder.disk.thinning import ThinningDays
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.rest import Rest, check_quiet_hours, quiet_hours
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY
-from hearthlog.recorder.timezone import check_time_zone, machine_zone
+from hearthlog.recorder.timezone import check_time_zone, machine_zone, time_zone
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name
 from hearthlog.schemas.storage.small_file import read_toml
 
-Keep = Literal["off", "events", "unsure", "always"]  # which sound is kept as clips
+ReadableBy = Literal["owner", "group", "all"]
+Keep = Literal["off", "events", "unsure", "always"]
 NO_MODEL = Path("none")  # in place of a model file: there are no labels
 _LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
-_PREFIX = "HEARTHLOG_"
 
 
 def _checked(check: Any) -> AfterValidator:
@@ -56,10 +58,20 @@ class MicrophoneSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    name: Annotated[str, _checked(check_microphone_name)] = "mic"
-    device: str = ""  # as `hearthlog devices` lists it, or an address; empty: the default one
-    fallback: str = ""  # a device that is heard while that one is not there; empty: none
-    model: Path | None = None  # instead of the recorder's
+    name: Annotated[str, _checked(check_microphone_name)] = Field(
+        default="mic", description="Begins the topics."
+    )
+    device: str = Field(
+        default="",
+        description="As `hearthlog devices` lists it, or an rtsp:// or http:// address; empty: "
+        "the default one.",
+    )
+    fallback: str = Field(
+        default="", description="A device that is heard while that one is not there; empty: none."
+    )
+    model: Path | None = Field(
+        default=None, description="Instead of the recorder's; none: no labels."
+    )
 
     @field_serializer("device", "fallback", when_used="json")
     def _name_device(self, device: str) -> str:
@@ -70,8 +82,8 @@ class _Environment(EnvSettingsSource):
     """The variables of the environment: one that is unknown, or no JSON, is refused by name."""
 
     def __call__(self) -> dict[str, Any]:
-        fields = {_PREFIX + name.upper() for name in self.settings_cls.model_fields}
-        ours = [name for name in os.environ if name.upper().startswith(_PREFIX)]
+        fields = {ENVIRONMENT + name.upper() for name in self.settings_cls.model_fields}
+        ours = [name for name in os.environ if name.upper().startswith(ENVIRONMENT)]
         unknown = min((name for name in ours if name.upper() not in fields), default=None)
         if unknown is not None:
             raise ConfigurationError(f"environment: unknown variable {unknown[:64]!r}")
@@ -81,40 +93,95 @@ class _Environment(EnvSettingsSource):
         try:
             return super().decode_complex_value(field_name, field, value)
         except (ValueError, RecursionError) as error:
-            name = _PREFIX + field_name.upper()
+            name = ENVIRONMENT + field_name.upper()
             raise ConfigurationError(f"environment: {name} is not JSON ({error})") from error
 
 
 class Settings(BaseSettings):
     """Everything that can be configured; the field names are the keys of the TOML file."""
 
-    model_config = SettingsConfigDict(extra="forbid", env_prefix=_PREFIX, validate_default=True)
+    model_config = SettingsConfigDict(extra="forbid", env_prefix=ENVIRONMENT, validate_default=True)
 
-    node: Annotated[str, _checked(check_node_name)] = "home"
-    output: Path = Path("logs")
-    model: Path | None = None
-    feature_set: str = ""  # empty: that of the model, or the default one
-    max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds a file
-    max_bag_size: Size = 0  # bytes a file; 0: any
-    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # at most lost by a killed process
-    sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # at most lost by a power cut
-    statistics_every: int = Field(default=LOGGED_EVERY, ge=1)  # frames
-    timezone: Annotated[str, _checked(check_time_zone)] = Field(default_factory=machine_zone)
-    keep_audio: Keep = "off"
-    never_keep: list[str] = ["speech"]  # classes
-    clip_pre_roll_seconds: float = Field(default=2.0, ge=0.0, le=30.0)
-    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500)
-    clip_retention_days: int = Field(default=30, ge=1, le=3650)
-    clip_min_free_space: int = Field(default=500, ge=0)  # MB: with less, only the log goes on
-    retention_days: int = Field(default=0, ge=0)  # on which something was recorded; 0: no limit
-    max_bag_files: int = Field(default=0, ge=0)  # finished logs; 0: no limit
-    max_record_size: Size = Field(default=0, ge=0)  # bytes of all of them; 0: no limit
-    min_free_space: Size = Field(default=500_000_000, ge=0)  # bytes on the disk; 0: no floor
-    drop_statistics_days: int = Field(default=0, ge=0)  # 0: never
-    drop_features_days: int = Field(default=0, ge=0)  # and the statistics; 0: never
-    labels_only_days: int = Field(default=0, ge=0)  # all but labels, segments, gaps; 0: never
+    node: Annotated[str, _checked(check_node_name)] = Field(
+        default="home", description="Name of this recorder, with which the names of its logs begin."
+    )
+    output: Path = Field(default=Path("logs"), description="Folder of the logs.")
+    model: Path | None = Field(
+        default=None,
+        description="Model file, or a link to one; general or bathroom, which come with hearthlog; "
+        "none: no labels. By default models/champion.safetensors if there is one, else general.",
+    )
+    feature_set: str = Field(
+        default="", description="Empty: that of the model, or the default one."
+    )
     microphone: list[MicrophoneSettings] = Field(
-        default=[MicrophoneSettings()], min_length=1, max_length=16
+        default=[MicrophoneSettings()],
+        min_length=1,
+        max_length=16,
+        description="One table for each.",
+    )
+    max_bag_duration: int = Field(default=3600, ge=1, le=86_400, description="Seconds a file.")
+    max_bag_size: Size = Field(default=0, description="Bytes a file, such as 50M; 0: any.")
+    flush_seconds: float = Field(
+        default=1.0,
+        ge=1.0,
+        le=3600,
+        description="So much is lost at most if the recorder is killed.",
+    )
+    sync_seconds: float = Field(
+        default=5.0, ge=1.0, le=3600, description="So much is lost at most if the power is cut."
+    )
+    statistics_every: int = Field(
+        default=LOGGED_EVERY, ge=1, description="Frames from one message of statistics to the next."
+    )
+    timezone: Annotated[str, _checked(check_time_zone)] = Field(
+        default_factory=machine_zone,
+        description="Of the home, as Europe/Berlin; by default that of the machine.",
+    )
+    quiet_hours: list[Annotated[str, _checked(check_quiet_hours)]] = Field(
+        default=[], description='Hours of every day without listening, as ["22:00-06:30"].'
+    )
+    readable_by: ReadableBy = Field(
+        default="owner", description="Who of this machine may read new logs, with their folders."
+    )
+    keep_audio: Keep = Field(default="off", description="Which sound is kept as clips.")
+    never_keep: list[str] = Field(
+        default=["speech"], description="Classes whose sound is in no clip, however unsure."
+    )
+    clip_pre_roll_seconds: float = Field(
+        default=2.0, ge=0.0, le=30.0, description="What a clip has before its sound."
+    )
+    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500, description="Of clips, at most.")
+    clip_retention_days: int = Field(
+        default=30, ge=1, le=3650, description="Older clips are deleted."
+    )
+    clip_min_free_space: int = Field(
+        default=500,
+        ge=0,
+        description="MB on the disk; with less there are no clips, and the log goes on.",
+    )
+    retention_days: int = Field(
+        default=0, ge=0, description="Days with logs that are kept; 0: any number."
+    )
+    max_bag_files: int = Field(
+        default=0, ge=0, description="Finished logs that are kept; 0: any number."
+    )
+    max_record_size: Size = Field(
+        default=0, ge=0, description="Bytes of all logs, such as 20G; 0: any size."
+    )
+    min_free_space: Size = Field(
+        default=500_000_000, ge=0, description="Bytes on the disk that logs leave free; 0: none."
+    )
+    drop_statistics_days: int = Field(
+        default=0,
+        ge=0,
+        description="Days with logs after which they lose the statistics; 0: never.",
+    )
+    drop_features_days: int = Field(
+        default=0, ge=0, description="The same with features and statistics."
+    )
+    labels_only_days: int = Field(
+        default=0, ge=0, description="The same with all but labels, segments and gaps."
     )
 
     def keeping_rules(self) -> KeepingRules:
@@ -126,6 +193,11 @@ class Settings(BaseSettings):
             self.drop_statistics_days, self.drop_features_days, self.labels_only_days
         )
         return KeepingRules(str(self.output), self.node, limits, thinning)
+
+    def rest(self) -> Rest:
+        """Return when the microphones are closed."""
+        hours = [quiet_hours(text) for text in self.quiet_hours]
+        return Rest(hours, time_zone(self.timezone), self.output)
 
     @field_validator("max_bag_size")
     @classmethod
@@ -186,35 +258,65 @@ def load_settings(
         If the file cannot be read or is no TOML, if a variable of the environment is unknown or no
         JSON, or if a key is unknown or its value makes no sense; the message names it.
     """
+    return load_with_origins(file, command_line, microphone)[0]
+
+
+def load_with_origins(
+    file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
+) -> tuple[Settings, Origins]:
+    """Load settings as `load_settings` does, and tell where their values come from.
+
+    Parameters
+    ----------
+    file, command_line, microphone
+        As of `load_settings`.
+
+    Raises
+    ------
+    ConfigurationError
+        As `load_settings`.
+    """
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
+    lines = {} if file is None else key_lines(file.read_text("utf-8"))
+    origins = Origins(command_line, content, file, lines)
     try:
         settings = Settings(file=content, **command_line)  # type: ignore[call-arg]
-        _check_microphones(settings.microphone)
+        _check_microphones(settings.microphone, origins)
         if not microphone:
-            return settings
+            return settings, origins
         if len(settings.microphone) > 1:
             raise ConfigurationError(
                 f"{file}: has {len(settings.microphone)} microphones; say there what is to be said "
                 f"of one, not on the command line ({', '.join(microphone)})"
             )
         merged = settings.microphone[0].model_dump() | microphone
-        return settings.model_copy(update={"microphone": [MicrophoneSettings(**merged)]})
+        update = {"microphone": [MicrophoneSettings(**merged)]}
+        return settings.model_copy(update=update), origins
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] == "extra_forbidden":
-            raise ConfigurationError(f"{file or 'configuration'}: unknown key {key!r}") from error
-        message = first["msg"].removeprefix("Value error, ")
-        raise ConfigurationError(f"configuration: {key}: {message}") from error
+        raise _refusal(error, origins) from error
 
 
-def _check_microphones(microphones: list[MicrophoneSettings]) -> None:
+def _refusal(error: ValidationError, origins: Origins) -> ConfigurationError:
+    first = error.errors()[0]
+    where = _place(first["loc"], origins)
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return ConfigurationError(f"{where}: unknown key {key!r}")
+    return ConfigurationError(f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}")
+
+
+def _place(key: Key, origins: Origins) -> str:
+    """Say where something is wrong: a line of the file, or what else the value comes from."""
+    origin = origins.origin(key)
+    return "configuration" if origin == DEFAULT else origin
+
+
+def _check_microphones(microphones: list[MicrophoneSettings], origins: Origins) -> None:
     fallbacks = [each.fallback for each in microphones if each.fallback]
     for key, others in (("name", []), ("device", fallbacks)):
         values = [*(getattr(each, key) for each in microphones), *others]
         twice = next((value for value in values if values.count(value) > 1), None)
         if twice is not None:
             what = f"{key} {public_name(twice)!r}" if twice else "the default device"
-            raise ConfigurationError(
-                f"configuration: two microphones have {what}; say which is which"
-            )
+            where = _place(("microphone", len(microphones) - 1), origins)
+            raise ConfigurationError(f"{where}: two microphones have {what}; say which is which")

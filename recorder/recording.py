@@ -1,5 +1,6 @@
 """The recorder: sources of sound, a pipeline for each, and the log that they write."""
 
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -34,14 +35,18 @@ from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.microphone_stream import MicrophoneStream
+from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
-from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
 from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.messages.gaps import ON_PURPOSE
 
 _NOT_RUNNING = "the recorder was not running"
+_NOT_LOST = (_NOT_RUNNING, *ON_PURPOSE)  # with these the reasons of a gap begin
 
 
 @dataclass
@@ -117,17 +122,18 @@ def record_microphones(
     """
     with ExitStack() as stack:
         lock = stack.enter_context(FolderLock(settings.output, settings.node))
+        rest = settings.rest()
         # They capture, and their pipes hold, while older logs are completed.
         sources = {
             each.name: stack.enter_context(
-                closing(MicrophoneSource(each.device, fallback=each.fallback))
+                closing(MicrophoneSource(each.device, fallback=each.fallback, rest=rest))
             )
             for each in settings.microphone
         }
         recovered = recover_active(settings.output, settings.node)
         now = time.time_ns()
         resumed = {
-            name: _Resumed(source, end_of_sound(settings.output, settings.node, name, now))
+            name: _Resumed(source, end_of_sound(settings.output, settings.node, name, now), rest)
             for name, source in sources.items()
         }
         summary = _record(settings, resumed, stop, reload_requests, lock)
@@ -135,12 +141,53 @@ def record_microphones(
     return summary
 
 
+def check_recording(settings: Settings) -> None:
+    """Check whether microphones could be recorded so, and leave no trace.
+
+    Parameters
+    ----------
+    settings : Settings
+
+    Raises
+    ------
+    LogError
+        If the folder of the logs cannot be written to.
+    SourceError
+        If an address of a microphone cannot be one of sound, or ffmpeg is not there for it.
+    ModelError, ConfigurationError
+        As `record_files`.
+    """
+    sources = {each.name: _Unheard(each.device) for each in settings.microphone}
+    for device in (name for each in settings.microphone for name in (each.device, each.fallback)):
+        check_device(device)
+    with ExitStack() as stack:
+        models = _open_models(settings, list(sources), None, stack)
+        RecordingSession(settings, sources, models)
+    folder = settings.output.absolute()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise LogError(f"{settings.output}: cannot be written ({there} does not allow it)")
+
+
+@dataclass
+class _Unheard:
+    """A source that gives nothing."""
+
+    device: str
+
+    def events(self, stop: Flag) -> Iterator[Event]:
+        del stop
+        return iter(())
+
+
 class _Resumed:
     """A source with a gap before its first frame: from the end of the last log on."""
 
-    def __init__(self, source: SoundSource, end: int) -> None:
+    def __init__(self, source: SoundSource, end: int, rest: Rest) -> None:
         self._source = source
         self._end = end
+        resting = rest.reason()
+        self._reason = f"{_NOT_RUNNING}; {resting}" if resting else _NOT_RUNNING
 
     @property
     def device(self) -> str:
@@ -153,7 +200,7 @@ class _Resumed:
                 now = int(event.stamps[0])
                 if start < now:
                     lost = round((now - start) / FRAME_NANOSECONDS)
-                    yield Gap(start, now, _NOT_RUNNING, lost)
+                    yield Gap(start, now, self._reason, lost)
             yield event
 
 
@@ -312,7 +359,7 @@ class RecordingSession:
             self._log.write(stream.pipeline.report("disk", self._now, notice))
 
     def _record(self, stream: MicrophoneStream, event: Event) -> None:
-        if isinstance(event, Gap) and event.reason != _NOT_RUNNING:
+        if isinstance(event, Gap) and not event.reason.startswith(_NOT_LOST):
             self.summary.gaps += 1
             self.summary.frames_lost += event.frames_lost
         if isinstance(event, Frames):

@@ -192,3 +192,18 @@ def real_day(all_household, tmp_path_factory) -> Path:
             write_real_day(all_household, folder)
             (folder / "done").touch()
     return folder / "logs"
+
+
+@pytest.fixture
+def refused(hearthlog):
+    """Run a command that must fail with one line on stderr, and return that line."""
+
+    def run(*arguments, status=1, env=None):
+        result = hearthlog(*arguments, env=env)
+        assert result.returncode == status, result
+        assert result.stdout == ""
+        assert result.stderr.startswith("hearthlog: ")
+        assert result.stderr.count("\n") == 1
+        return result.stderr.removeprefix("hearthlog: ").rstrip()
+
+    return run

@@ -16,21 +16,6 @@ from hearthlog.models.modelfile.modelfile import load_model, save_model
 
 
 @pytest.fixture
-def refused(hearthlog):
-    """Run a command that must fail with one line on stderr, and return that line."""
-
-    def run(*arguments, status=1, env=None):
-        result = hearthlog(*arguments, env=env)
-        assert result.returncode == status, result
-        assert result.stdout == ""
-        assert result.stderr.startswith("hearthlog: ")
-        assert result.stderr.count("\n") == 1
-        return result.stderr.removeprefix("hearthlog: ").rstrip()
-
-    return run
-
-
-@pytest.fixture
 def sound(tmp_path):
     path = tmp_path / "sound.wav"
     soundfile.write(path, np.random.default_rng(0).normal(0, 0.1, 48_000), 16_000)
@@ -200,7 +185,7 @@ def test_an_alsa_configuration_that_is_missing(refused, tmp_path):
 def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, words):
     path = tmp_path / "hearthlog.toml"
     path.write_text(content)
-    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs")
+    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs", status=2)
     assert words in message
     assert not (tmp_path / "logs").exists()
 
@@ -215,7 +200,7 @@ def test_a_configuration_that_makes_no_sense(refused, sound, tmp_path, content, 
     ],
 )
 def test_a_configuration_that_is_no_regular_file(refused, sound, tmp_path, path, reason):
-    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs")
+    message = refused("record", sound, "--config", path, "-o", tmp_path / "logs", status=2)
     assert message == f"{path}: {reason}"
 
 
@@ -226,6 +211,9 @@ def test_a_configuration_may_have_a_line_of_dots_in_a_comment(hearthlog, sound, 
     assert (result.returncode, "/flat_" in result.stdout) == (0, True)
 
 
+OF_MICROPHONE = "environment, HEARTHLOG_MICROPHONE: "
+
+
 @pytest.mark.parametrize(
     ("variable", "words"),
     [
@@ -234,15 +222,16 @@ def test_a_configuration_may_have_a_line_of_dots_in_a_comment(hearthlog, sound, 
         ("HEARTHLOG_=flat", "environment: unknown variable 'HEARTHLOG_'"),
         ("HEARTHLOG_MICROPHONE=mic", "environment: HEARTHLOG_MICROPHONE is not JSON (Expecting"),
         ("HEARTHLOG_NEVER_KEEP=" + "[" * 100_000, "environment: HEARTHLOG_NEVER_KEEP is not JSON"),
-        ('HEARTHLOG_MICROPHONE=[{"noise": 1}]', "unknown key 'microphone.0.noise'"),
-        ("HEARTHLOG_FLUSH_SECONDS=never", "configuration: flush_seconds: Input should be"),
+        ('HEARTHLOG_MICROPHONE=[{"noise": 1}]', f"{OF_MICROPHONE}unknown key"),
+        ("HEARTHLOG_FLUSH_SECONDS=never", "environment, HEARTHLOG_FLUSH_SECONDS: flush_seconds: I"),
     ],
 )
 def test_a_variable_of_the_environment_that_makes_no_sense(
     refused, sound, tmp_path, variable, words
 ):
-    message = refused("record", sound, "-o", tmp_path / "logs", env=dict([variable.split("=")]))
-    assert message.startswith(words) or message == f"configuration: {words}"
+    env = dict([variable.split("=")])
+    message = refused("record", sound, "-o", tmp_path / "logs", status=2, env=env)
+    assert message.startswith(words)
     assert not (tmp_path / "logs").exists()
 
 

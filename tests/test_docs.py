@@ -119,6 +119,8 @@ def unknown_verbs(text):
                 continue
             if (group,) not in VERBS:
                 unknown.add(group)
+            elif rest and rest[0].startswith("-"):
+                continue
             elif (group,) not in LEAVES and rest and (group, rest[0]) not in VERBS:
                 unknown.add(f"{group} {rest[0]}")
     return unknown
@@ -308,6 +310,7 @@ def make_home(folder):
     for name in ("a.mcap", "b.mcap"):
         shutil.copy(log, name)
     (folder / "damaged.mcap").write_bytes(log.read_bytes()[:-5000])
+    (folder / "home.toml").write_text('node = "flat"\n')
 
 
 def write_foreign_labels(folder):

@@ -95,5 +95,5 @@ def test_the_device_of_another_microphone_is_no_fallback(hearthlog, tmp_path, ot
         f'[[microphone]]\nname = "b"\ndevice = "{other}"\nfallback = "spare"\n'
     )
     result = hearthlog("record", "--config", about)
-    assert result.returncode == 1
+    assert result.returncode == 2
     assert "two microphones have device 'spare'" in result.stderr

@@ -45,7 +45,7 @@ def test_the_zone_is_that_of_the_machine(machine, said, expected):
 def test_a_zone_that_there_is_not_is_refused_by_name(name):
     with pytest.raises(ConfigurationError) as error:
         load_settings(None, {"timezone": name}, {})
-    expected = f"configuration: timezone: no time zone {name!r} on this machine; "
+    expected = f"command line: timezone: no time zone {name!r} on this machine; "
     assert str(error.value) == f"{expected}name one as Europe/Berlin, or UTC"
 
 

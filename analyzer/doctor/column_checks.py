@@ -16,7 +16,7 @@ from hearthlog.analyzer.doctor.topic_types import (
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.messages.gaps import LOG_DAMAGED
+from hearthlog.schemas.messages.gaps import LOG_DAMAGED, ON_PURPOSE
 from hearthlog.schemas.messages.topics import ROSOUT
 
 STAMP = "header.stamp"
@@ -227,7 +227,7 @@ def check_gaps(findings: Findings, columns: Columns) -> None:
     lost, reasons = columns["frames_lost"], columns["reason"]
     findings.rows(
         "gap",
-        np.ones(len(times), bool),
+        ~np.isin(reasons, ON_PURPOSE),
         times,
         lambda i: (
             f"{columns.topic}: {durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: "

@@ -41,4 +41,4 @@ def size_text(size: int) -> str:
     return f"{size} B"
 
 
-Size = Annotated[int, BeforeValidator(parse_size)]
+Size = Annotated[int, BeforeValidator(parse_size, json_schema_input_type=int | str)]

@@ -10,6 +10,7 @@ import numpy as np
 from hearthlog.recorder.addresses import check_address, is_address, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
+from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
 from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess
@@ -27,6 +28,24 @@ _STEP_SECONDS = 0.25
 _FALLBACK_SECONDS = 10.0  # of patience with the device, before another one is heard
 
 
+def check_device(device: str) -> None:
+    """Check what can be known of a device before it is opened.
+
+    Parameters
+    ----------
+    device : str
+        As `MicrophoneSource` takes it.
+
+    Raises
+    ------
+    SourceError
+        If it is an address that cannot be one of sound, or for which ffmpeg is not there.
+    """
+    if is_address(device):
+        check_address(device)
+        check_ffmpeg()
+
+
 class MicrophoneSource:
     """One microphone, as one stream of frames.
 
@@ -40,6 +59,8 @@ class MicrophoneSource:
         Another device, which is heard as long as this one is not there; by default none.
     waits : bool, optional
         Whether a device that is not there at the start is waited for, as it is later.
+    rest : Rest or None
+        When the device is to be closed; by default never.
 
     Attributes
     ----------
@@ -54,18 +75,22 @@ class MicrophoneSource:
         if an address cannot be one of sound.
     """
 
-    def __init__(self, device: str, *, fallback: str = "", waits: bool = True) -> None:
+    def __init__(
+        self, device: str, *, fallback: str = "", waits: bool = True, rest: Rest | None = None
+    ) -> None:
         self._own = _Device(device)
         self._fallback = _Device(fallback) if fallback else None
         self._return: ReturnWatch | None = None  # as long as the fallback is heard
         self._lost_at = -math.inf  # when the device was lost
         self.device = self._own.name
+        self._rest = rest
         self._capture: Capture | None = None
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
         self._health = (OK, "starting")
-        if not (waits and is_address(device)):  # the recorder does not wait for a network
+        waits_later = waits and is_address(device)  # the recorder does not wait for a network
+        if not waits_later and not self._resting():
             self._try_at_the_start(waits=waits)
         self._last_health = self._health
         self._reported = -math.inf
@@ -87,13 +112,17 @@ class MicrophoneSource:
         """
         reason = "the microphone was started"
         while not stop.is_set():
+            reason = yield from self._rest_if_due(reason, stop)
             if self._capture is None:
                 yield from self._wait_for_device(stop)
             if self._capture is None:
-                return
+                continue
             if self._return is not None:
                 reason = f"{reason}; {self.device} is heard in its place"
             reason = yield from self._capture_run(self._capture, reason, stop)
+            if self._resting():
+                self.close()
+                continue
             returned = self._return.take() if self._return is not None else None
             self.close()
             if stop.is_set():
@@ -143,6 +172,8 @@ class MicrophoneSource:
                 yield from self._report(self._framer.last_stamp)
             if self._return is not None and self._return.is_there:
                 return "its device is there again"
+            if resting := self._resting():
+                return resting
         return "the recorder was stopped"
 
     def _try_at_the_start(self, *, waits: bool) -> None:
@@ -165,7 +196,7 @@ class MicrophoneSource:
 
     def _wait_for_device(self, stop: Flag) -> Iterator[Event]:
         pauses = iter(_RETRY_SECONDS)
-        while not stop.is_set():
+        while not stop.is_set() and not self._resting():
             try:
                 self._hear(self._own, self._open(self._own, stop))
             except SourceError as error:
@@ -179,6 +210,21 @@ class MicrophoneSource:
             yield from self._report(self._now())
             if cards_change(stop, next(pauses, _RETRY_SECONDS[-1])):
                 pauses = iter(_RETRY_SECONDS)  # what was plugged in may take a moment
+
+    def _resting(self) -> str:
+        return "" if self._rest is None else self._rest.reason()
+
+    def _rest_if_due(self, reason: str, stop: Flag) -> Generator[Event, None, str]:
+        """Close the device as long as nobody is to be listened to; return why there is no sound."""
+        while self._rest is not None and (resting := self._rest.reason()):
+            self.close()
+            if resting not in reason:
+                reason = f"{reason}; {resting}"
+            self._health = (OK, self._rest.describe())
+            yield from self._report(self._now())
+            if stop.wait(_LOOK_SECONDS):
+                break
+        return reason
 
     def _falls_back(self, stop: Flag) -> bool:
         """Hear the fallback, if there is one, and it is time; return whether it is heard."""
@@ -237,9 +283,7 @@ class _Device:
     """A device that is to be heard: by its name, and once it was heard, by what it is."""
 
     def __init__(self, device: str) -> None:
-        if is_address(device):
-            check_address(device)
-            check_ffmpeg()
+        check_device(device)
         self.name = public_name(device)
         self.wanted = device
         self.was_heard = False

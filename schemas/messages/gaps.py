@@ -9,6 +9,7 @@ from hearthlog.schemas.messages.message_types import (
 )
 
 LOG_DAMAGED = "the log was damaged"  # the reason of a gap that `recover` writes
+QUIET_HOURS, PAUSED = ON_PURPOSE = "quiet hours", "paused"  # nobody was to be listened to
 
 
 def encode_gap(microphone: str, start: int, end: int, reason: str, frames_lost: int) -> bytes:

@@ -13,10 +13,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from hearthlog import __version__
+from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.cat import cat
 from hearthlog.tools.cli.catalog import catalog
+from hearthlog.tools.cli.config import config
 from hearthlog.tools.cli.cut import cut
 from hearthlog.tools.cli.demo import demo
 from hearthlog.tools.cli.devices import devices
@@ -30,6 +32,7 @@ from hearthlog.tools.cli.manifest import manifest
 from hearthlog.tools.cli.merge import merge
 from hearthlog.tools.cli.models import models
 from hearthlog.tools.cli.output import OutputClosedError, checked_output
+from hearthlog.tools.cli.pause import pause, resume
 from hearthlog.tools.cli.record import record
 from hearthlog.tools.cli.recover import recover
 from hearthlog.tools.cli.relabel import relabel
@@ -46,11 +49,26 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_ON_LOGS = (record, devices, info, catalog, cat, export, merge, cut, doctor, recover, retain)
+_ON_LOGS = (
+    record,
+    pause,
+    resume,
+    devices,
+    info,
+    catalog,
+    cat,
+    export,
+    merge,
+    cut,
+    doctor,
+    recover,
+    retain,
+)
 _LEARNING = (manifest, train, enrol)
 for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)
 app.add_typer(annotate, name="annotate")
+app.add_typer(config, name="config")
 app.add_typer(evaluate, name="evaluate")
 app.add_typer(models, name="models")
 
@@ -106,7 +124,7 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
         if _debug["on"]:
             raise
         tell(_message(error))
-        return 1
+        return 2 if isinstance(error, ConfigurationError) else 1
 
 
 def _usage_text(error: typer.TyperException) -> str:

@@ -1,13 +1,16 @@
 """`hearthlog record`: a microphone, or audio files in its place, to a log."""
 
+import os
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.cli.options import (
     MaxBagFiles,
     MaxRecordSize,
@@ -18,9 +21,13 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.text import number, tell, wrong_use
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
     from hearthlog.recorder.recording import RecordingSummary
+
+_HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # from others, by `readable_by`
 
 
 def record(
@@ -35,8 +42,7 @@ def record(
         Path | None,
         typer.Option(
             help="Model file, or a link to one; general or bathroom, which come with hearthlog; "
-            "none: no labels. Another file that takes its place speaks within about a second, or "
-            "at SIGHUP.",
+            "none: no labels. Another file that takes its place speaks within about a second.",
             show_default="models/champion.safetensors if there is one, else general",
         ),
     ] = None,
@@ -87,7 +93,8 @@ def record(
 ) -> None:
     """Record sound to a labelled log, from a microphone or from files.
 
-    SIGINT (Ctrl-C) and SIGTERM complete the log. Exit status 3: there were gaps, or a log
+    SIGINT (Ctrl-C) and SIGTERM complete the log; SIGHUP starts again if the configuration has
+    changed. Exit status 3: there were gaps, or a log
     left by an earlier recorder was damaged, or a new model was refused.
     """
     from hearthlog.recorder.config import load_settings
@@ -107,12 +114,16 @@ def record(
         "min_free_space": min_free_space,
         "keep_audio": keep_audio,
     }
-    settings = load_settings(config, _given(given), _given({"name": name, "device": device}))
-    settings = _with_model(settings)
+    microphone = _given({"name": name, "device": device})
+    load = partial(load_settings, config, _given(given), microphone)
+    configured = load()
+    settings = with_model(configured)
+    os.umask(_HIDDEN[settings.readable_by])
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda *_: stop.set())
-    reload_requests = _look_at_hangup(stop)
+    changes = _ConfigurationChanges(load, configured, stop)
+    reload_requests = _look_at_hangup(stop, changes)
     if files:
         if len(settings.microphone) > 1:
             wrong_use("files take the place of one microphone; the configuration has several")
@@ -126,10 +137,13 @@ def record(
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")
         recording = record_microphones(settings, stop, reload_requests)
+        if changes.found:
+            tell("the configuration was changed; starting again with it")
+            os.execv(sys.executable, sys.orig_argv)  # noqa: S606  as this process was started
     _say(recording)
 
 
-def _with_model(settings: "Settings") -> "Settings":
+def with_model(settings: "Settings") -> "Settings":
     """Choose the model where none is configured, and say so where it has not heard the home."""
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
     from hearthlog.models.starter import GENERAL, STARTERS, starter_file
@@ -160,8 +174,28 @@ def _say(recording: "RecordingSummary") -> None:
         raise typer.Exit(3)
 
 
-def _look_at_hangup(stop: Flag) -> "ReloadRequests":
-    """Ask for a look at the model when SIGHUP comes, and stop if the terminal has gone with it."""
+class _ConfigurationChanges:
+    """Stops the recorder if it is configured otherwise than it was, and not wrongly."""
+
+    def __init__(self, load: "Callable[[], Settings]", now: "Settings", stop: Flag) -> None:
+        self.found = False
+        self._load = load
+        self._now = now
+        self._stop = stop
+
+    def look(self) -> None:
+        try:
+            changed = self._load() != self._now
+        except HearthlogError as error:
+            tell(f"{error}; the recorder goes on as it was configured")
+            return
+        if changed:
+            self.found = True
+            self._stop.set()
+
+
+def _look_at_hangup(stop: Flag, changes: _ConfigurationChanges) -> "ReloadRequests":
+    """Look at models and configuration when SIGHUP comes; stop if the terminal has gone with it."""
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
 
     reload_requests = ReloadRequests()
@@ -171,7 +205,9 @@ def _look_at_hangup(stop: Flag) -> "ReloadRequests":
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
+            return
         reload_requests.ask()
+        changes.look()
 
     signal.signal(signal.SIGHUP, handle)
     return reload_requests

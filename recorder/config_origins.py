@@ -1,0 +1,96 @@
+"""Where the values of a configuration come from: which line of which file, or what else."""
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ENVIRONMENT = "HEARTHLOG_"
+DEFAULT = "default"
+_TABLE = re.compile(r"\s*(\[\[?)\s*([\w-]+)\s*\]\]?")
+_KEY = re.compile(r"\s*([\w-]+)\s*=")
+
+Key = tuple[str | int, ...]  # such as ("microphone", 1, "device")
+
+
+class Origins(NamedTuple):
+    """What values were given, and where.
+
+    Attributes
+    ----------
+    command_line, file : mapping of str to object
+        By the name of the key.
+    path : Path or None
+        Of the file.
+    lines : mapping of Key to int
+        Of the keys and tables of the file.
+    """
+
+    command_line: Mapping[str, Any]
+    file: Mapping[str, Any]
+    path: Path | None
+    lines: Mapping[Key, int]
+
+    def origin(self, key: Key) -> str:
+        """Say where the value of a key comes from.
+
+        Parameters
+        ----------
+        key : Key
+        """
+        first = str(key[0]) if key else ""
+        if first in self.command_line:
+            return "command line"
+        if (variable := _variable(first)) is not None:
+            return f"environment, {variable}"
+        if first not in self.file or not self._is_given(key):
+            return DEFAULT
+        line = next((self.lines[up] for up in _upwards(key) if up in self.lines), None)
+        return f"{self.path}" if line is None else f"{self.path}, line {line}"
+
+    def _is_given(self, key: Key) -> bool:
+        value: Any = self.file
+        for part in key:
+            try:
+                value = value[part]
+            except (KeyError, IndexError, TypeError):
+                return False
+        return True
+
+
+def key_lines(text: str) -> dict[Key, int]:
+    """Return on which line each key, and each table, of a TOML file begins.
+
+    Parameters
+    ----------
+    text : str
+        Its content. Keys with dots or quotes are not looked for.
+
+    Returns
+    -------
+    dict of Key to int
+        Counted from 1.
+    """
+    lines: dict[Key, int] = {}
+    table: Key = ()
+    counts: dict[str, int] = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        if head := _TABLE.match(line):
+            name, is_one_of_many = head[2], head[1] == "[["
+            counts[name] = counts.get(name, -1) + 1
+            table = (name, counts[name]) if is_one_of_many else (name,)
+            lines.setdefault(table, number)
+        elif key := _KEY.match(line):
+            lines.setdefault((*table, key[1]), number)
+    return lines
+
+
+def _variable(name: str) -> str | None:
+    wanted = f"{ENVIRONMENT}{name}".upper()
+    return next((each for each in os.environ if each.upper() == wanted), None) if name else None
+
+
+def _upwards(key: Key) -> list[Key]:
+    """Return a key, and what it is in."""
+    return [key[:end] for end in range(len(key), 0, -1)]

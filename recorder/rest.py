@@ -1,0 +1,176 @@
+"""When nobody is to be listened to: quiet hours, and a pause that somebody asked for."""
+
+import re
+import time
+from datetime import datetime, timedelta, tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.messages.gaps import PAUSED, QUIET_HOURS
+
+_FORM = re.compile(r"([01]\d|2[0-3]):([0-5]\d)-([01]\d|2[0-3]):([0-5]\d)")
+_DAY = 24 * 60
+_PAUSE_FILE = ".pause"
+_LONGEST = 64  # bytes of what the file says
+_LAST = 1 << 32  # seconds of UTC: in 2106
+
+
+class QuietHours(NamedTuple):
+    """Hours of every day, in minutes of the home's time of day; the end may be on the next day."""
+
+    start: int
+    end: int
+
+    def minutes_left(self, minute: int) -> int:
+        """Return how many minutes of them are left, 0 outside.
+
+        Parameters
+        ----------
+        minute : int
+            Of the day.
+        """
+        length = (self.end - self.start) % _DAY or _DAY
+        return max(length - (minute - self.start) % _DAY, 0)
+
+
+def quiet_hours(text: str) -> QuietHours:
+    """Read hours such as `22:00-06:30`.
+
+    Parameters
+    ----------
+    text : str
+
+    Raises
+    ------
+    ConfigurationError
+        If they are written otherwise.
+    """
+    found = _FORM.fullmatch(text)
+    if found is None:
+        raise ConfigurationError(f"{text[:64]!r} are no hours; write them as 22:00-06:30")
+    hour, minute, last_hour, last_minute = map(int, found.groups())
+    return QuietHours(60 * hour + minute, 60 * last_hour + last_minute)
+
+
+def check_quiet_hours(text: str) -> str:
+    """Return hours as `quiet_hours` takes them.
+
+    Parameters
+    ----------
+    text : str
+
+    Raises
+    ------
+    ConfigurationError
+        If they are written otherwise.
+    """
+    quiet_hours(text)
+    return text
+
+
+class Rest:
+    """Tells whether the microphones of a home are to be closed.
+
+    Parameters
+    ----------
+    hours : sequence of QuietHours
+    zone : tzinfo
+        Of the home.
+    folder : Path
+        Of the logs, in which `pause` leaves its file.
+    """
+
+    def __init__(self, hours: list[QuietHours], zone: tzinfo, folder: Path) -> None:
+        self._hours = hours
+        self._zone = zone
+        self._folder = folder
+
+    def reason(self) -> str:
+        """Return why nobody is listened to now; empty if somebody is."""
+        if _is_paused(self._folder):
+            return PAUSED
+        return QUIET_HOURS if self._minutes_left() else ""
+
+    def describe(self) -> str:
+        """Say until when nobody is listened to."""
+        if _is_paused(self._folder):
+            end = paused_until(self._folder)
+            until = "hearthlog resume" if end is None else self._local(end)
+            return f"{PAUSED} until {until}: the microphone is closed"
+        until = self._local(time.time() + 60 * self._minutes_left())
+        return f"{QUIET_HOURS} until {until}: the microphone is closed"
+
+    def _minutes_left(self) -> int:
+        if not self._hours:
+            return 0
+        now = datetime.fromtimestamp(time.time(), self._zone)
+        return max(each.minutes_left(60 * now.hour + now.minute) for each in self._hours)
+
+    def _local(self, seconds: float) -> str:
+        return f"{datetime.fromtimestamp(seconds, self._zone):%H:%M}"
+
+
+def pause(folder: Path, duration: timedelta | None) -> None:
+    """Ask the recorders of a folder to close their microphones.
+
+    Parameters
+    ----------
+    folder : Path
+        Of their logs.
+    duration : timedelta or None
+        How long; None until `resume`.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written to.
+    """
+    end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
+    temporary = folder / f"{_PAUSE_FILE}.new"
+    temporary.write_text(end, encoding="ascii")
+    temporary.replace(folder / _PAUSE_FILE)
+
+
+def resume(folder: Path) -> bool:
+    """End a pause; return whether there was one.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the logs.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written to.
+    """
+    was_paused = _is_paused(folder)
+    (folder / _PAUSE_FILE).unlink(missing_ok=True)
+    return was_paused
+
+
+def paused_until(folder: Path) -> float | None:
+    """Return the end of a pause in seconds of UTC; None for one that somebody has to end.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the logs.
+    """
+    path = folder / _PAUSE_FILE
+    try:
+        if not path.is_file():  # what a pipe says would be waited for
+            return None
+        with path.open("rb") as file:
+            end = float(int(file.read(_LONGEST)))
+    except (OSError, ValueError):  # in doubt nobody is listened to
+        return None
+    return end if end < _LAST else None
+
+
+def _is_paused(folder: Path) -> bool:
+    if not (folder / _PAUSE_FILE).exists():
+        return False
+    end = paused_until(folder)
+    return end is None or time.time() < end

@@ -1,0 +1,82 @@
+"""`python -m hearthlog.tools.reference > docs/configuration.md`: what can be configured."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from hearthlog.recorder.config import Settings
+
+_HEAD = """\
+# Configuration
+
+    hearthlog record --config home.toml
+    hearthlog config --config home.toml
+    hearthlog config check home.toml
+
+A configuration is a TOML file of the keys below, all of which may be left out. `HEARTHLOG_` and
+the name of a key is a variable of the environment, with lists and tables as JSON. An option of
+the command line goes before the environment, that before the file, and that before the default.
+
+`hearthlog config` prints all values in force, and where each comes from: the line of the file, a
+variable, or the default. Passwords of addresses are left out. `hearthlog config check` starts
+nothing: exit status 2 says that a value makes no sense and on which line it is, 1 that the model
+or the folder cannot be used. `hearthlog config schema > home.schema.json` writes a JSON schema,
+by which editors check and complete the file if its first line is `#:schema ./home.schema.json`.
+
+At SIGHUP the recorder reads the file again. If the configuration has changed it completes its log
+and starts again, with a gap of a second or two that says so; if it is wrong, a line on standard
+error says why, and it goes on as before.
+"""
+
+
+def configuration_page() -> str:
+    """Return the page of everything that can be configured, as Markdown."""
+    schema = Settings.model_json_schema()
+    microphone = schema["$defs"]["MicrophoneSettings"]
+    return "\n".join(
+        [
+            _HEAD,
+            *_table(schema["properties"]),
+            "",
+            "## A microphone",
+            "",
+            "Each table `[[microphone]]` is one. Without any there is the default one: `mic`.",
+            "",
+            *_table(microphone["properties"]),
+            "",
+        ]
+    )
+
+
+def _table(properties: dict[str, Any]) -> Iterator[str]:
+    yield "| key | values | default | |"
+    yield "|---|---|---|---|"
+    for name, about in properties.items():
+        if name != "microphone":
+            default = _code(about["default"]) if "default" in about else ""
+            yield f"| `{name}` | {_values(about)} | {default} | {about['description']} |"
+
+
+def _values(about: dict[str, Any]) -> str:
+    if "enum" in about:
+        return ", ".join(map(_code, about["enum"]))
+    if about.get("type") == "array":
+        return "list of texts"
+    if "anyOf" in about:
+        types = {each.get("type") for each in about["anyOf"]}
+        return "size" if "integer" in types else "path"
+    if about["type"] == "string":
+        return "path" if about.get("format") == "path" else "text"
+    least, most = about.get("minimum"), about.get("maximum")
+    kind = "number" if about["type"] == "number" else "whole number"
+    if most is not None:
+        return f"{kind}, {least:g} to {most:g}"
+    return kind if least is None else f"{kind}, {least:g} or more"
+
+
+def _code(value: Any) -> str:
+    return "" if value is None else f"`{json.dumps(value)}`"
+
+
+if __name__ == "__main__":
+    print(configuration_page(), end="")
