@@ -247,7 +247,7 @@ def _record(
                 session.add(microphone, event)
                 manager.add(microphone, event)
         finally:
-            manager.stop()
+            manager.stop(restarts=reload_requests is not None and reload_requests.restart)
             session.finish()
     return session.summary
 

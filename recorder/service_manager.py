@@ -67,9 +67,17 @@ class ServiceManager:
             lines.append(f"STATUS={status}")
         self._tell(lines)
 
-    def stop(self) -> None:
-        """Tell that the recorder completes its log and ends."""
-        self._tell(["STOPPING=1", "STATUS=completing the log"])
+    def stop(self, *, restarts: bool) -> None:
+        """Tell that the recorder completes its log and ends.
+
+        Parameters
+        ----------
+        restarts : bool
+            Whether this very process starts again then.
+        """
+        now = time.monotonic_ns() // 1000
+        state = [f"RELOADING=1\nMONOTONIC_USEC={now}"] if restarts else ["STOPPING=1"]
+        self._tell([*state, "STATUS=completing the log"])
 
     def _describe(self, microphone: str, health: SourceHealth, now: float) -> str:
         summary = " ".join(health.summary.split())

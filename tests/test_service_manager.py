@@ -199,3 +199,25 @@ def test_a_watchdog_that_is_no_number_is_none(told, monkeypatch):
 def test_systemd_that_has_gone_does_not_stop_the_recorder(told, monkeypatch):
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/notify")
     assert told(("mic", frames()), microphones=["mic"]) == []
+
+
+def test_a_recorder_that_starts_again_by_itself_does_not_say_that_it_ends(
+    labmic, systemd, tmp_path
+):
+    file = tmp_path / "home.toml"
+    file.write_text('model = "none"\n[[microphone]]\ndevice = "labmic"\n')
+    command = [*HEARTHLOG, "record", "--config", str(file), "-o", str(tmp_path / "logs")]
+    env = labmic.env | systemd.env
+    with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as process:
+        try:
+            systemd.wait_for("STATUS=mic: listening")
+            file.write_text('node = "flat"\n' + file.read_text())
+            process.send_signal(signal.SIGHUP)
+            lines = systemd.wait_for("RELOADING=1")
+            lines += systemd.wait_for("READY=1")
+            assert "STOPPING=1" not in lines
+            systemd.wait_for("STATUS=mic: listening")
+            process.terminate()
+            systemd.wait_for("STOPPING=1")
+        finally:
+            process.kill()

@@ -32,9 +32,16 @@ class Loaded(NamedTuple):
 
 
 class ReloadRequests:
-    """Asks all watches to look at their files at once; a signal handler may do so."""
+    """Asks all watches to look at their files at once; a signal handler may do so.
+
+    Attributes
+    ----------
+    restart : bool
+        Whether the recorder, once it is stopped, starts again by itself.
+    """
 
     def __init__(self) -> None:
+        self.restart = False
         self._queues: list[SimpleQueue[None]] = []
 
     def queue(self) -> SimpleQueue[None]:

@@ -6,6 +6,7 @@ import sys
 from functools import partial
 from pathlib import Path
 from threading import Event as Flag
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -122,8 +123,7 @@ def record(
     stop = Flag()
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda *_: stop.set())
-    changes = _ConfigurationChanges(load, configured, stop)
-    reload_requests = _look_at_hangup(stop, changes)
+    reload_requests = _look_at_hangup(stop, load, configured)
     if files:
         if len(settings.microphone) > 1:
             wrong_use("files take the place of one microphone; the configuration has several")
@@ -137,7 +137,7 @@ def record(
         if sys.stderr.isatty():
             tell("listening; Ctrl-C completes the log")
         recording = record_microphones(settings, stop, reload_requests)
-        if changes.found:
+        if reload_requests.restart:
             tell("the configuration was changed; starting again with it")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  as this process was started
     _say(recording)
@@ -174,27 +174,9 @@ def _say(recording: "RecordingSummary") -> None:
         raise typer.Exit(3)
 
 
-class _ConfigurationChanges:
-    """Stops the recorder if it is configured otherwise than it was, and not wrongly."""
-
-    def __init__(self, load: "Callable[[], Settings]", now: "Settings", stop: Flag) -> None:
-        self.found = False
-        self._load = load
-        self._now = now
-        self._stop = stop
-
-    def look(self) -> None:
-        try:
-            changed = self._load() != self._now
-        except HearthlogError as error:
-            tell(f"{error}; the recorder goes on as it was configured")
-            return
-        if changed:
-            self.found = True
-            self._stop.set()
-
-
-def _look_at_hangup(stop: Flag, changes: _ConfigurationChanges) -> "ReloadRequests":
+def _look_at_hangup(
+    stop: Flag, load: "Callable[[], Settings]", configured: "Settings"
+) -> "ReloadRequests":
     """Look at models and configuration when SIGHUP comes; stop if the terminal has gone with it."""
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
 
@@ -202,12 +184,21 @@ def _look_at_hangup(stop: Flag, changes: _ConfigurationChanges) -> "ReloadReques
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # as nohup wants it
     at_terminal = sys.stderr.isatty() and not ignored
 
+    def look_at_configuration() -> None:
+        try:
+            changed = load() != configured
+        except HearthlogError as error:
+            tell(f"{error}; the recorder goes on as it was configured")
+            return
+        if changed:
+            reload_requests.restart = True
+            stop.set()
+
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
-            return
         reload_requests.ask()
-        changes.look()
+        Thread(target=look_at_configuration, daemon=True).start()
 
     signal.signal(signal.SIGHUP, handle)
     return reload_requests
