@@ -16,7 +16,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 # Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
 # probabilities hold for people whom they were not learned from.
-PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.1
+PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
 _UNSURE_CONFIDENCE = 0.5
 _UNSURE_NOVELTY = 0.7
 _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
