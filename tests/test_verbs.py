@@ -50,6 +50,9 @@ READING = (
     "report logs --day 2026-03-01 --output day.html",
     "replay logs --model first.safetensors",
     "models list --folder .",
+    "pause logs --for 1h",
+    "resume logs",
+    "config schema",
 )
 DRAWING = (
     "review logs --save day.rrd",
