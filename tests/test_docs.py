@@ -39,7 +39,7 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 # What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
 # a second program, or sound of many collections.
 NOT_HERE = re.compile(
-    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch| demo"
+    r"hearthlog( record( --model \S+)?( --keep-audio \w+)?$| devices| watch| demo| install-service"
     r"| evaluate adaptation|.* s3://|.*tcp:|.* --web|.* --microphone USB|.* --folds collection"
     r"|.*octaves|.*--config|.*--queue spans.csv$| review(?!.* --save))"
 )
@@ -99,7 +99,7 @@ def unknown_options(text):
     """Options that pages name and no verb has."""
     ours = [code for code in snippets(text) if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
     named = {name for code in ours for name in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code)}
-    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt"}
+    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt", "systemctl", "useradd"}
     foreign = {
         name
         for code in ours

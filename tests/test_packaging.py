@@ -29,7 +29,7 @@ def installed_as(path):
     if path.parts[0] not in FOLDERS or path.parts[:2] in MEASUREMENTS:
         return None
     kept = path.name in DATA or path.is_relative_to(CLIPS) or path.is_relative_to(STARTERS)
-    if path.suffix not in {".py", ".msg", ".toml"} and not kept:
+    if path.suffix not in {".py", ".msg", ".toml", ".service"} and not kept:
         return None
     inner = path.relative_to("tools/package") if path.parts[1] == "package" else path
     return f"hearthlog/{inner}"

@@ -28,6 +28,7 @@ from hearthlog.tools.cli.enrol import enrol
 from hearthlog.tools.cli.evaluate import evaluate
 from hearthlog.tools.cli.export import export
 from hearthlog.tools.cli.info import info
+from hearthlog.tools.cli.install_service import install_service
 from hearthlog.tools.cli.manifest import manifest
 from hearthlog.tools.cli.merge import merge
 from hearthlog.tools.cli.models import models
@@ -53,6 +54,7 @@ _ON_LOGS = (
     record,
     pause,
     resume,
+    install_service,
     devices,
     info,
     catalog,

@@ -1,0 +1,1 @@
+"""The recorder as a service of systemd."""

@@ -1,0 +1,60 @@
+"""What the service will find at its start: tried as the user that it is run by.
+
+A process of its own: ``rehearsal FOLDER [CONFIG]``. It answers in one line of JSON, with what the
+unit must allow, or with an error.
+"""
+
+import json
+import os
+import pwd
+import sys
+import tempfile
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from hearthlog.recorder.addresses import is_address
+from hearthlog.recorder.config import Settings, load_settings
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.recording import check_recording
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.tools.service.needs import STATE, Needs
+
+
+def main() -> None:
+    """Answer what the recorder needs, or why it cannot start."""
+    folder = Path(sys.argv[1])
+    config = Path(sys.argv[2]) if len(sys.argv) > 2 else None
+    with suppress(FileNotFoundError):  # systemd makes it
+        os.chdir(folder)
+    try:
+        answer = asdict(_rehearsed(load_settings(config, {}, {}), folder))
+    except (HearthlogError, OSError) as error:
+        answer = {"error": str(error), "is_wrong_use": isinstance(error, ConfigurationError)}
+    print(json.dumps(answer))
+
+
+def _rehearsed(settings: Settings, folder: Path) -> Needs:
+    """Return what a recorder needs, once it is known that it would start."""
+    output = folder / settings.output
+    _check_folder(output, folder)
+    is_made = output.is_relative_to(STATE) and not os.access(STATE, os.W_OK)  # by systemd
+    there = Path(tempfile.gettempdir()) if is_made else output
+    check_recording(settings.model_copy(update={"output": there}))
+    models = {settings.model, *(each.model for each in settings.microphone)} - {None}
+    files = [str(folder / model) for model in models if model is not None and model.exists()]
+    devices = [name for each in settings.microphone for name in (each.device, each.fallback)]
+    return Needs(str(output), files, any(map(is_address, devices)), settings.readable_by)
+
+
+def _check_folder(output: Path, folder: Path) -> None:
+    """Check a folder of logs, which must be there if it is outside of that of the service."""
+    user = pwd.getpwuid(os.getuid()).pw_name
+    if not output.is_relative_to(folder) and not output.is_dir():
+        raise LogError(f"{output}: no such folder; make it, and give it to {user}")
+    if output.is_dir() and not os.access(output, os.W_OK | os.X_OK):
+        raise LogError(f"{output}: {user} may not write there; give it to them with chown")
+
+
+if __name__ == "__main__":
+    main()

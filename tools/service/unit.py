@@ -1,0 +1,110 @@
+"""The text of the unit by which systemd starts the recorder."""
+
+import grp
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from hearthlog.tools.service.errors import ServiceError
+from hearthlog.tools.service.needs import STATE, Needs
+
+NAME = "hearthlog.service"
+_STATE_MODES = {"owner": "0700", "group": "0750", "all": "0755"}
+_NO_NETWORK = "RestrictAddressFamilies=AF_UNIX"
+_NETWORK = "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6"
+_SOUND_GROUP = "audio"  # whose members may open sound cards
+
+
+def system_unit(command: Sequence[str], account: str, needs: Needs) -> str:
+    """Return the unit of a service of the machine.
+
+    Parameters
+    ----------
+    command : sequence of str
+        That records.
+    account : str
+        The user that it is run by.
+    needs : Needs
+
+    Raises
+    ------
+    ServiceError
+        If a name cannot stand in a unit.
+    """
+    has_state = Path(needs.output).is_relative_to(STATE)
+    isolated = f"PrivateNetwork=yes\n{_NO_NETWORK}\nIPAddressDeny=any"
+    return _filled(
+        "system.service",
+        command=_command(command),
+        account=account,
+        groups=f"SupplementaryGroups={_SOUND_GROUP}" if _has_sound_group() else "",
+        folder=STATE,
+        mode=_STATE_MODES[needs.readable_by],
+        writable="" if has_state else f"ReadWritePaths={_word(needs.output)}",
+        network=_NETWORK if needs.has_network else isolated,
+    )
+
+
+def user_unit(command: Sequence[str], folder: Path, needs: Needs) -> str:
+    """Return the unit of a service of a user.
+
+    Parameters
+    ----------
+    command : sequence of str
+        That records.
+    folder : Path
+        In which it is run.
+    needs : Needs
+
+    Raises
+    ------
+    ServiceError
+        If a name cannot stand in a unit.
+    """
+    return _filled(
+        "user.service",
+        command=_command(command),
+        folder=_printable(folder).replace("%", "%%"),
+        network=_NETWORK if needs.has_network else _NO_NETWORK,
+    )
+
+
+def is_ours(unit: str) -> bool:
+    """Tell whether the text of a unit is one that was made here."""
+    return unit.startswith(_template("system.service").partition("\n")[0])
+
+
+def _filled(template: str, **values: object) -> str:
+    text = _template(template)
+    for name, value in values.items():
+        text = text.replace(f"{{{name}}}\n", f"{value}\n" if value else "")
+    return text
+
+
+def _template(name: str) -> str:
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+def _has_sound_group() -> bool:
+    try:
+        grp.getgrnam(_SOUND_GROUP)
+    except KeyError:
+        return False
+    return True
+
+
+def _command(words: Sequence[str]) -> str:
+    return " ".join(_word(word).replace("$", "$$") for word in words)
+
+
+def _word(text: str | Path) -> str:
+    """Return a word of a unit's line, in which no character has a meaning of its own."""
+    escaped = _printable(text).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
+    return escaped if escaped.replace("/", "").replace("-", "").isalnum() else f'"{escaped}"'
+
+
+def _printable(text: str | Path) -> str:
+    text = str(text)
+    if not text.isprintable():
+        raise ServiceError(f"{text!r}: a unit of systemd cannot name it")
+    return text
