@@ -162,7 +162,7 @@ def missing_paths(text):
         if not path.endswith((".safetensors", ".mcap"))
     ]
     outside = re.sub(r"^```toml\n.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
-    names = set(re.findall(r"\bhearthlog(?:\.[a-z_]\w*)+(?:\.[A-Z]\w*)?", outside))
+    names = set(re.findall(r"(?<!/)\bhearthlog(?:\.[a-z_]\w*)+(?:\.[A-Z]\w*)?", outside))
     return missing + [name for name in sorted(names) if not is_importable(name)]
 
 

@@ -1,6 +1,8 @@
 """Every verb, as it is installed, in a folder whose files have the names of modules."""
 
+import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -65,6 +67,7 @@ LISTENING = (
 )
 RECORDING = "record --device labmic --output heard"
 WATCHING = "watch logs --serve"
+INSTALLING = "install-service --user"
 LOST = 3
 needs_viewer = pytest.mark.skipif(find_spec("rerun") is None, reason="needs hearthlog[viewer]")
 
@@ -120,7 +123,7 @@ def sprung(folder):
 
 
 def test_every_verb_is_tried_here():
-    commands = (*MAKING, *READING, *DRAWING, *LISTENING, RECORDING, WATCHING)
+    commands = (*MAKING, *READING, *DRAWING, *LISTENING, RECORDING, WATCHING, INSTALLING)
     tried = {command.split()[0] for command in commands}
     assert tried == set(typer.main.get_command(app).commands)
 
@@ -191,3 +194,12 @@ def test_without_a_viewer_a_verb_that_draws_says_in_a_line_what_to_install(folde
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
     assert "pip install" in line
+
+
+def test_installing_imports_nothing_of_the_folder(folder, tmp_path):
+    (tmp_path / "systemctl").symlink_to(shutil.which("true"))
+    own = {"PATH": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "XDG_RUNTIME_DIR": ""}
+    result = run(folder, INSTALLING, os.environ | own)
+    assert sprung(folder) == []
+    assert result.returncode == 0, result.stderr
+    assert f"WorkingDirectory={folder}\n" in Path(result.stdout.strip()).read_text("utf-8")
