@@ -83,7 +83,7 @@ def booted(folder: Path):
     command += [
         "--private-network",
         "--console=pipe",
-        "--machine=hearthlog-test",
+        f"--machine=hearthlog-{os.getpid()}",
         *binds,
         f"--bind={folder}",
         "-b",

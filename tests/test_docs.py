@@ -32,9 +32,11 @@ PAGES = sorted(
 TEXT = "\n".join(path.read_text("utf-8") for path in PAGES)
 CODE = re.compile(r"^(?P<fence>```)(?P<language>\w*)\n(?P<fenced>.*?)^```|`(?P<inline>[^`\n]+)`|"
                   r"^ {4}(?P<indented>\S[^\n]*)$", re.DOTALL | re.MULTILINE)  # fmt: skip
-# Options of dask, rerun, mcap and systemd that pages name alone.
+# Options of dask, rerun, mcap, systemd and podman that pages name alone.
 FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--nthreads"} | {
-    "--memory-limit"
+    "--memory-limit",
+    "--group-add",
+    "--volume",
 }
 # What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
 # a second program, or sound of many collections.
@@ -99,7 +101,7 @@ def unknown_options(text):
     """Options that pages name and no verb has."""
     ours = [code for code in snippets(text) if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
     named = {name for code in ours for name in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code)}
-    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt", "systemctl", "useradd"}
+    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt", "systemctl", "useradd", "podman"}
     foreign = {
         name
         for code in ours
