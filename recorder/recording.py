@@ -34,12 +34,14 @@ from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.machine import MachineWatch
 from hearthlog.recorder.microphone_stream import MicrophoneStream
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.service_manager import ServiceManager
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.merged import merged_events
 from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
+from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -285,7 +287,7 @@ class RecordingSession:
     models : mapping of str to LabellingModels
         By the name of the microphone; several may have the same.
     lock : FolderLock or None
-        Of the folder of the logs.
+        Of the folder of the logs, where microphones are recorded into it.
 
     Attributes
     ----------
@@ -307,6 +309,7 @@ class RecordingSession:
         models: Mapping[str, LabellingModels],
         lock: FolderLock | None = None,
     ) -> None:
+        self._settings = settings
         self._streams = {
             name: MicrophoneStream(settings, name, source, models[name])
             for name, source in sources.items()
@@ -329,6 +332,7 @@ class RecordingSession:
         pipelines = [stream.pipeline for stream in self._streams.values()]
         self._clips = ClipRecorder(settings, pipelines, self._log.file_at)
         self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None
+        self._machine = None if lock is None else MachineWatch(settings.output)
         self._journal = HealthJournal()
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
@@ -353,7 +357,8 @@ class RecordingSession:
         for accepted in stream.accepted(event, log_is_full=self._log.is_full):
             self._record(stream, accepted)
         if isinstance(event, SourceHealth):
-            self._journal.add(microphone, event)
+            self._journal.add(microphone, stream.pipeline.judged(event))
+            self._look_at_the_machine(event.stamp)
         for notice in self._log.notices():
             say(notice.text)
             self._log.write(stream.pipeline.report("disk", self._now, notice))
@@ -380,6 +385,14 @@ class RecordingSession:
             self._log.write(messages)
             for problem in problems:
                 say(problem)
+
+    def _look_at_the_machine(self, stamp: int) -> None:
+        """Tell how the machine is, as often as the first microphone tells how it is."""
+        if self._machine is None:
+            return
+        if (health := self._machine.tick(stamp)) is not None:
+            self._journal.add("machine", health)
+            self._log.write([diagnostics(f"{self._settings.node} machine", health)])
 
     def finish(self) -> None:
         """Complete the log and its clips.

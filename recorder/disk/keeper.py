@@ -11,13 +11,12 @@ from pathlib import Path
 from hearthlog.recorder.disk.keeping import DiskReport, KeepingRules, keep_disk
 from hearthlog.recorder.disk.retention import Limits, disk_of
 from hearthlog.recorder.disk.thinning import ThinningDays
-from hearthlog.recorder.events import OK, WARNING
+from hearthlog.recorder.events import OK, WARNING, SourceHealth
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.messages import EncodedMessage
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.message_types import encode, header, message
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT
+from hearthlog.schemas.messages.topics import ROSOUT
 from hearthlog.schemas.times import NANOSECONDS
 
 _COMMAND = module_command("hearthlog.recorder.disk.keeper")
@@ -128,21 +127,12 @@ def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMe
     list of EncodedMessage
         One for `/diagnostics`, named `hearthlog: <node> disk`, and one for each line of `/rosout`.
     """
-    status = message(
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=WARNING if report.problem else OK,
-        name=f"hearthlog: {node} disk",
-        message=report.problem or report.done or "nothing to delete",
-        hardware_id=node,
-        values=[
-            message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
-            for key, value in report.values.items()
-        ],
-    )
-    array = message(message_types.DIAGNOSTICS, header=header(stamp, ""), status=[status])
+    level = WARNING if report.problem else OK
+    text = report.problem or report.done or "nothing to delete"
+    health = SourceHealth(stamp, level, text, report.values)
     lines = [rosout.notice_line("disk", stamp, notice) for notice in report.notices()]
     return [
-        EncodedMessage(stamp, DIAGNOSTICS, encode(array)),
+        diagnostics(f"{node} disk", health),
         *(EncodedMessage(stamp, ROSOUT, line) for line in lines),
     ]
 

@@ -4,7 +4,8 @@ import errno
 import os
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 from hearthlog.recorder.events import OK, WARNING, Notice
@@ -140,7 +141,8 @@ class LiveLog:
                 if self._lock is not None:
                     self._lock.renew()
                 self._log.begin_after_failure()
-                self._pour(self._held)
+                for batch in _batches(self._held):
+                    self._pour(batch)
                 self._log.sync()
             else:
                 self._pour(items)
@@ -155,17 +157,14 @@ class LiveLog:
                 self._log.complete_what_was_cut()
         self._let_go()
 
-    def _pour(self, items: Iterable[Held]) -> None:
-        messages: list[EncodedMessage] = []
-        for item in items:
-            if isinstance(item, EncodedMessage):
-                messages.append(item)
-            if len(messages) == _WRITTEN_AT_ONCE or isinstance(item, LogDescription):
-                self._log.write(messages)
-                messages = []
-            if isinstance(item, LogDescription):
-                self._log.begin_anew(item, [])
-        self._log.write(messages)
+    def _pour(self, items: Sequence[Held]) -> None:
+        for is_message, run in groupby(items, lambda item: isinstance(item, EncodedMessage)):
+            if is_message:
+                self._log.write([item for item in run if isinstance(item, EncodedMessage)])
+                continue
+            for description in run:
+                assert isinstance(description, LogDescription)
+                self._log.begin_anew(description, [])
 
     def _check_disk(self) -> None:
         if not self._mount.is_mount():  # the folder below it is on another disk
@@ -190,6 +189,20 @@ class LiveLog:
                 return
             self._held.drop_first()
             self._safe += not begins_log
+
+
+def _batches(held: Iterable[Held]) -> Iterator[list[Held]]:
+    """Cut what is held where the time moves on: files may begin there."""
+    batch: list[Held] = []
+    last = -1
+    for item in held:
+        now = item.log_time if isinstance(item, EncodedMessage) else -1
+        if len(batch) >= _WRITTEN_AT_ONCE and now != last:
+            yield batch
+            batch = []
+        batch.append(item)
+        last = now
+    yield batch
 
 
 def _mount_of(folder: Path) -> Path:

@@ -221,8 +221,12 @@ class RollingLog:
 
     def complete_what_was_cut(self) -> None:
         """Have the files completed that the disk has refused, clips among them; return at once."""
-        if self._finisher is not None:
-            self._finisher.add(active_logs(self._description.root, self._description.node))
+        if self._finisher is None:
+            return
+        # What is open stays out of it: the disk may refuse it before that process has begun.
+        is_open = None if self._writer is None else self._writer.active_path
+        logs = active_logs(self._description.root, self._description.node)
+        self._finisher.add([path for path in logs if path != is_open])
 
     def begin_after_failure(self) -> None:
         """Go on after an error: the messages that are not `safe` are to be written again.

@@ -7,6 +7,7 @@ from threading import Event as Flag
 
 import numpy as np
 
+from hearthlog.models.features.floor import decibels
 from hearthlog.recorder.addresses import check_address, is_address, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
@@ -17,6 +18,7 @@ from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkP
 from hearthlog.recorder.sources.return_watch import ReturnWatch
 from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
+from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.times import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
@@ -88,6 +90,9 @@ class MicrophoneSource:
         self._framer = Framer()
         self._silent_frames = 0
         self._frames_lost = 0
+        self._overruns = 0  # blocks of which the sound card lost a part
+        self._last_block = time.monotonic()  # its arrival
+        self._level = _Level()
         self._health = (OK, "starting")
         waits_later = waits and is_address(device)  # the recorder does not wait for a network
         if not waits_later and not self._resting():
@@ -161,7 +166,8 @@ class MicrophoneSource:
             if blocks is None:
                 return "the capture process ended"
             for block in blocks:
-                last_block = block.arrival
+                last_block = self._last_block = block.arrival
+                self._overruns += block.overflowed
                 for event in self._framer.add(block):
                     self._watch(event)
                     yield event
@@ -242,6 +248,7 @@ class MicrophoneSource:
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
             return
+        self._level.add(event.samples)
         sounding = np.flatnonzero(event.samples.any(axis=1))
         zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
@@ -274,9 +281,35 @@ class MicrophoneSource:
             values = {
                 "device": self.device,
                 "frames_lost": str(self._frames_lost),
+                "overruns": str(self._overruns),
                 "clock_ppm": f"{self._framer.ppm:.1f}",
+                "block_age_seconds": f"{now - self._last_block:.1f}",
+                **self._level.take(),
             }
             yield SourceHealth(stamp, level, summary, values)
+
+
+class _Level:
+    """The level of the sound since it was last told."""
+
+    def __init__(self) -> None:
+        self._power = self._peak = 0.0
+        self._samples = 0
+
+    def add(self, samples: Float32) -> None:
+        self._power += float(np.square(samples, dtype=np.float64).sum())
+        self._peak = max(self._peak, float(np.abs(samples).max()))
+        self._samples += samples.size
+
+    def take(self) -> dict[str, str]:
+        """Return it in decibels of full scale; empty without sound."""
+        if not self._samples:
+            return {}
+        mean = float(decibels(np.array(self._power / self._samples)))
+        peak = float(decibels(np.square(np.array(self._peak))))
+        self._power = self._peak = 0.0
+        self._samples = 0
+        return {"level_dbfs": f"{mean:.1f}", "peak_dbfs": f"{peak:.1f}"}
 
 
 class _Device:

@@ -13,6 +13,7 @@ from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.stream import rosout
+from hearthlog.recorder.stream.diagnostics import diagnostics
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.recorder.stream.sound_watch import SoundWatch
@@ -22,8 +23,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.gaps import encode_gap
-from hearthlog.schemas.messages.message_types import encode, header, message
-from hearthlog.schemas.messages.topics import CANDIDATE, DIAGNOSTICS, LIVE, ROSOUT, topic
+from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, ROSOUT, topic
 
 
 class Pipeline:
@@ -215,11 +215,22 @@ class Pipeline:
         list of EncodedMessage
             One for `/diagnostics`, one for `/rosout`.
         """
-        name = f"hearthlog: {self.microphone} {subject}"
+        subject = f"{self.microphone} {subject}"
         return [
-            self._diagnostics(stamp, notice.level, name, notice.text, {}),
+            diagnostics(subject, SourceHealth(stamp, *notice), self.microphone),
             EncodedMessage(stamp, ROSOUT, rosout.notice_line(self.microphone, stamp, notice)),
         ]
+
+    def judged(self, health: SourceHealth) -> SourceHealth:
+        """Return the health of the source, or what is wrong with its sound.
+
+        Parameters
+        ----------
+        health : SourceHealth
+        """
+        if health.level == OK and (problem := self._watch.problem()):
+            return replace(health, level=WARNING, summary=problem)
+        return health
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         self._features.restart()
@@ -285,14 +296,13 @@ class Pipeline:
         ]
 
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
-        if health.level == OK and (problem := self._watch.problem()):
-            health = replace(health, level=WARNING, summary=problem)
+        health = self.judged(health)
         # A report of a later time than the sound says that there is none: what is still to be said
         # of the sound is older, and comes first.
         closing = self._close(self._end) if health.stamp > self._end else []
-        name = f"hearthlog: {self.microphone}"
         values = {**health.values, **self._floor_value()}
-        messages = [self._diagnostics(health.stamp, health.level, name, health.summary, values)]
+        told = replace(health, values=values)
+        messages = [diagnostics(self.microphone, told, self.microphone)]
         if health.level != self._level:
             self._level = health.level
             line = rosout.health_line(self.microphone, health)
@@ -303,27 +313,6 @@ class Pipeline:
         if self._recent_floors is None or not len(self._recent_floors):
             return {}
         return {"floor_dbfs": f"{decibels(self._recent_floors[-1, -1]):.1f}"}
-
-    def _diagnostics(
-        self, stamp: int, level: int, name: str, text: str, values: Mapping[str, str]
-    ) -> EncodedMessage:
-        status = message(
-            "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
-            name=name,
-            message=text,
-            hardware_id=self.microphone,
-            values=[
-                message("diagnostic_msgs/msg/KeyValue", key=key, value=value)
-                for key, value in values.items()
-            ],
-        )
-        data = encode(
-            message(
-                message_types.DIAGNOSTICS, header=header(stamp, self.microphone), status=[status]
-            )
-        )
-        return EncodedMessage(stamp, DIAGNOSTICS, data)
 
 
 def _from_frame(what: str, model: Model | None, frame: int) -> Notice:
