@@ -18,6 +18,7 @@ _LOW_VOLTAGE, _SLOWED = 1 << 0, (1 << 1) | (1 << 2) | (1 << 3)
 _TIME_ERROR = 5  # the state of a clock that nobody sets
 _TIMEX_BYTES = 512  # more than any kernel writes
 _STATUS = Path("/proc/self/status")
+_TIMESYNC = Path("/run/systemd/timesync")  # for a service, which may not ask the kernel
 
 
 class MachineWatch:
@@ -89,7 +90,9 @@ def clock_is_synchronized() -> bool | None:
         state = libc.adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
     except (OSError, AttributeError):
         return None
-    return None if state < 0 else state != _TIME_ERROR
+    if state < 0:
+        return (_TIMESYNC / "synchronized").exists() if _TIMESYNC.is_dir() else None
+    return bool(state != _TIME_ERROR)
 
 
 def _problem(temperature: float | None, throttled: int) -> str:

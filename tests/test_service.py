@@ -124,6 +124,21 @@ def test_the_service_records_in_its_sandbox(service):
     assert set(owners) == {"hearthlog"}
 
 
+def clock_of(logs):
+    """What the newest report says of the clock."""
+    statuses = [status for message in read(logs, "diagnostics") for status in message.status]
+    values = [value for status in statuses for value in status.values]
+    return [value.value for value in values if value.key == "clock_synchronized"][-1:]
+
+
+def test_the_service_knows_of_the_clock_although_it_may_not_ask_for_it(service):
+    service.run("mkdir", "-p", "/run/systemd/timesync")
+    install(service)
+    service.wait(lambda: clock_of(logs_of(service)) == ["no"])
+    service.run("touch", "/run/systemd/timesync/synchronized")
+    service.wait(lambda: clock_of(logs_of(service)) == ["yes"])
+
+
 def test_an_upgrade_completes_the_log_and_the_next_one_states_the_gap(service):
     install(service)
     wait_for_labels(service)
@@ -178,6 +193,23 @@ def test_logs_are_written_where_the_configuration_says(service):
     service.run("install", "-d", "-o", "hearthlog", "/srv/logs")
     install(service, "--config", "/etc/home.toml")
     wait_for_labels(service, "/srv/logs")
+
+
+def test_a_service_takes_over_another_configuration_and_refuses_a_wrong_one(service):
+    service.write("/etc/home.toml", "node = 'one'\n")
+    install(service, "--config", "/etc/home.toml")
+    wait_for_labels(service)
+    process = service.shows("MainPID")
+    service.write("/etc/home.toml", "node = 'one\n")
+    service.run("systemctl", "reload", "hearthlog")
+    said = ("journalctl", "-u", "hearthlog", "-o", "cat")
+    service.wait(lambda: "goes on as it was configured" in service.run(*said).stdout)
+    service.write("/etc/home.toml", "node = 'two'\n")
+    service.run("systemctl", "reload", "hearthlog")
+    service.wait(lambda: list(logs_of(service).rglob("two_*.active")))
+    assert service.shows("ActiveState") == "active"
+    assert (service.shows("MainPID"), service.shows("NRestarts")) == (process, "0")
+    assert not errors(logs_of(service))
 
 
 def test_a_service_of_a_user_records_in_the_folder_it_was_installed_in(service):
