@@ -2,23 +2,44 @@
 
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hearthlog.schemas.text import printable
 from hearthlog.tools.cli.options import Json, LocalLog
+from hearthlog.tools.cli.text import print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
 
 
-def doctor(path: LocalLog, *, as_json: Json = False) -> None:
-    """Check logs: MCAP, the contract, and how they follow each other.
+def doctor(
+    path: LocalLog,
+    *,
+    live: Annotated[
+        bool, typer.Option("--live", help="Look at the recorders of the folder, not at its logs.")
+    ] = False,
+    ping_url: Annotated[
+        str | None,
+        typer.Option(
+            "--ping",
+            help="With --live: ask for this address if all is well, for /fail below if not.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Check logs: MCAP, the contract, and how they follow each other; or what records them now.
 
-    Exit status 1: a log is damaged, or not as hearthlog writes them; 3: one has gaps, or is
-    unfinished.
+    Exit status 1: a log is damaged, or not as hearthlog writes them, or nothing is recorded now; 3:
+    a log has gaps, or is unfinished, or something is not as it should be now.
     """
+    if ping_url is not None and not live:
+        wrong_use("--ping goes with --live")
+    if live:
+        _examine_live(path, ping_url, as_json=as_json)
+        return
     from hearthlog.analyzer.doctor import examine
     from hearthlog.tools.cli.progress import share_done
 
@@ -29,6 +50,24 @@ def doctor(path: LocalLog, *, as_json: Json = False) -> None:
     else:
         _print(files)
     levels = {level for findings in files for level, _ in findings.counts}
+    if levels:
+        raise typer.Exit(1 if "error" in levels else 3)
+
+
+def _examine_live(folder: Path, ping_url: str | None, *, as_json: bool) -> None:
+    from hearthlog.analyzer.live import examine_live
+    from hearthlog.tools.cli.ping import check_ping_address, ping
+
+    if ping_url is not None:
+        check_ping_address(ping_url)
+    states = examine_live(folder)
+    if as_json:
+        print(json.dumps([state._asdict() for state in states], indent=2))
+    else:
+        print_lines(f"{state.level}: {state.subject}: {state.text}" for state in states)
+    levels = {state.level for state in states} - {"ok"}
+    if ping_url is not None and (problem := ping(ping_url, is_well="error" not in levels)):
+        tell(f"the ping did not arrive: {problem}")
     if levels:
         raise typer.Exit(1 if "error" in levels else 3)
 

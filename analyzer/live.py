@@ -1,0 +1,184 @@
+"""The state of the recorders of a folder now: whether they run, hear, write, and what to do."""
+
+import fcntl
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from hearthlog.recorder.rest import paused_until
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.logs.files import find_logs, log_name
+from hearthlog.schemas.messages.topics import DIAGNOSTICS
+from hearthlog.schemas.times import NANOSECONDS, millisecond_text
+
+Level = Literal["ok", "warning", "error"]
+_LEVELS: tuple[Level, ...] = ("ok", "warning", "error")  # by the levels of diagnostics
+_SPEAKS_SECONDS = 30.0  # it says something every ten
+_OTHERS = 0o077  # the rights of everybody but the owner
+_NOT_SET = "clock_synchronized", "no"
+
+
+class _Status(NamedTuple):
+    """The last word of a recorder on one thing."""
+
+    subject: str
+    time: int  # in nanoseconds of UTC
+    level: int
+    text: str
+    values: Mapping[str, str]
+
+
+class State(NamedTuple):
+    """What is to be said of one thing.
+
+    Attributes
+    ----------
+    level : str
+        `ok`, `warning` or `error`.
+    subject : str
+        What it is about: a microphone, `recorder`, `disk`, `clock` …
+    text : str
+        What is the case, and what to do.
+    """
+
+    level: Level
+    subject: str
+    text: str
+
+
+def examine_live(folder: Path) -> list[State]:
+    """Look at a folder of logs, at the disk, and at what its recorders say of themselves.
+
+    Parameters
+    ----------
+    folder : Path
+        Of this machine.
+
+    Returns
+    -------
+    list of State
+        Of the recorders, one after the other, then of the folder.
+
+    Raises
+    ------
+    LogError
+        If there is no such folder.
+    """
+    if not folder.is_dir():
+        raise LogError(f"{folder}: no such folder; name the one that the recorder writes to")
+    locks = sorted(folder.glob(".*.lock"))
+    states = [state for lock in locks for state in _recorder(folder, lock)]
+    if not locks:
+        states.append(State("error", "recorder", f"nothing was ever recorded in {folder}"))
+    return [*states, *_folder(folder)]
+
+
+def _recorder(folder: Path, lock: Path) -> Iterator[State]:
+    node = lock.name.removeprefix(".").removesuffix(".lock")
+    process = _holder(lock)
+    statuses = _last_statuses(folder, node)
+    newest = max((status.time for status in statuses), default=None)
+    if process is None:
+        since = "" if newest is None else f" since {_moment(newest)}"
+        text = f"{node} does not run{since}: start it, or see `journalctl -u hearthlog` for why"
+        yield State("error", "recorder", text)
+        return
+    yield State("ok", "recorder", f"{node} runs (process {process})")
+    silent = None if newest is None else time.time() - newest / NANOSECONDS
+    if silent is None or abs(silent) > _SPEAKS_SECONDS:
+        since = "nothing yet" if silent is None else f"nothing for {abs(silent):.0f} s"
+        text = f"{node} wrote {since}: see the disk below, or restart it"
+        yield State("error", "recorder", text)
+    for status in statuses:
+        yield from _of_status(status)
+
+
+def _of_status(status: _Status) -> Iterator[State]:
+    advice = ""
+    if "device" in status.values and _LEVELS[status.level] == "error":
+        advice = "; look at its cable and power; `hearthlog devices` lists what is there"
+    yield State(_LEVELS[status.level], status.subject, status.text + advice)
+    if status.values.get(_NOT_SET[0]) == _NOT_SET[1]:
+        text = "is not synchronized: connect the machine to the network, or give it a clock module"
+        yield State("warning", "clock", text)
+
+
+def _holder(lock: Path) -> int | None:
+    """Return the process that holds a lock; None if nobody does."""
+    try:
+        descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with suppress(ValueError):
+            return int(os.pread(descriptor, 20, 0))
+        return 0
+    else:
+        return None
+    finally:
+        os.close(descriptor)
+
+
+def _last_statuses(folder: Path, node: str) -> list[_Status]:
+    """Return the last word on each thing in the newest log of a recorder that says anything."""
+    with suppress(LogError):
+        logs = [log for log in find_logs(folder) if log_name(log).node == node]
+        for log in reversed(logs[-3:]):  # the newest may have been begun this moment
+            with suppress(LogError):
+                columns = read_columns([log], [DIAGNOSTICS], fields=["status"])
+                last = {each.subject: each for each in _statuses(columns[DIAGNOSTICS], node)}
+                if last:
+                    return [last[subject] for subject in sorted(last)]
+    return []
+
+
+def _statuses(columns: Columns, node: str) -> Iterator[_Status]:
+    for stamp, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
+        for status in statuses:
+            subject = status["name"].removeprefix("hearthlog: ").removeprefix(f"{node} ")
+            level = min(int(status["level"]), len(_LEVELS) - 1)
+            values = {pair["key"]: pair["value"] for pair in status["values"]}
+            yield _Status(subject, stamp, level, status["message"], values)
+
+
+def _folder(folder: Path) -> Iterator[State]:
+    if (folder / ".pause").exists():
+        end = paused_until(folder)
+        until = "`hearthlog resume`" if end is None else _moment(int(end) * NANOSECONDS)
+        if end is None or end > time.time():
+            yield State("ok", "pause", f"nobody is listened to until {until}")
+    problem = _write_problem(folder)
+    if problem:
+        text = (
+            f"{folder} cannot be written ({problem}): what is heard is held in memory for a while"
+        )
+        yield State("error", "disk", f"{text}; make room, or mend the disk")
+    if folder.stat().st_mode & _OTHERS:
+        text = f"others on this machine may look into {folder}: `chmod -R go= {folder}`"
+        yield State("warning", "rights", text)
+
+
+def _moment(stamp: int) -> str:
+    return f"{millisecond_text(stamp)[:16].replace('T', ' ')} UTC"
+
+
+def _write_problem(folder: Path) -> str:
+    """Try the disk with a block; return what it says, empty if it takes it."""
+    probe = folder / f".probe-{os.getpid()}"
+    try:
+        with probe.open("xb") as file:
+            file.write(bytes(4096))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return error.strerror or str(error)
+    finally:
+        with suppress(OSError):
+            probe.unlink()
+    return ""

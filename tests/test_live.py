@@ -1,0 +1,154 @@
+"""`hearthlog doctor --live` says what is wrong with a recorder now, and what to do."""
+
+import json
+import signal
+import subprocess
+import time
+from contextlib import closing, suppress
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from socket import create_server
+from threading import Thread
+
+import pytest
+from conftest import HEARTHLOG
+from test_capture import wait_for_frames
+from test_disk import small_disk
+from test_rest import recording
+from test_swap import wait_for
+
+from hearthlog.analyzer.live import examine_live
+from hearthlog.tools.cli import ping
+
+__all__ = ["small_disk"]
+
+
+def states(logs):
+    return {state.subject: (state.level, state.text) for state in examine_live(logs)}
+
+
+def doctor(*arguments):
+    return subprocess.run([*HEARTHLOG, "doctor", "--live", *map(str, arguments)], check=False,
+                          capture_output=True, text=True)  # fmt: skip
+
+
+def test_what_is_well_is_said_too(labmic, tmp_path):
+    logs = tmp_path / "logs"
+    with recording(labmic, logs) as process:
+        wait_for_frames(logs, 30)
+        assert states(logs)["recorder"] == ("ok", f"home runs (process {process.pid})")
+        assert states(logs)["mic"] == ("ok", "listening")
+        result = doctor(logs, "--json")
+    levels = {state["subject"]: state["level"] for state in json.loads(result.stdout)}
+    assert (levels["mic"], levels["machine"]) == ("ok", "ok")
+    assert "error" not in levels.values()
+    assert result.returncode in {0, 3}, "3 where nothing keeps the clock of this machine right"
+
+
+def test_a_microphone_that_is_gone_is_an_error_until_it_is_back(labmic, tmp_path):
+    logs = tmp_path / "logs"
+    with recording(labmic, logs):
+        wait_for_frames(logs, 30)
+        labmic.unplug()
+        wait_for(lambda: states(logs)["mic"][0] == "error")
+        assert "`hearthlog devices` lists what is there" in states(logs)["mic"][1]
+        assert doctor(logs).returncode == 1
+        labmic.restore()
+        wait_for(lambda: states(logs)["mic"] == ("ok", "listening"))
+
+
+def test_a_recorder_that_does_not_run_is_an_error(labmic, tmp_path):
+    logs = tmp_path / "logs"
+    with recording(labmic, logs):
+        wait_for_frames(logs, 10)
+    level, text = states(logs)["recorder"]
+    assert level == "error"
+    assert text.startswith("home does not run since 20")
+    assert "start it" in text
+
+
+def test_a_recorder_that_hangs_is_an_error(labmic, tmp_path, monkeypatch):
+    monkeypatch.setattr("hearthlog.analyzer.live._SPEAKS_SECONDS", 2.0)
+    logs = tmp_path / "logs"
+    with recording(labmic, logs) as process:
+        wait_for_frames(logs, 30)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(2.5)
+        found = [state for state in examine_live(logs) if state.level == "error"]
+        process.send_signal(signal.SIGCONT)
+    assert [state.subject for state in found] == ["recorder"]
+    assert "or restart it" in found[0].text
+
+
+def test_a_full_disk_is_an_error(small_disk):
+    logs = small_disk / "logs"
+    logs.mkdir(mode=0o700)
+    with suppress(OSError):
+        (small_disk / "rest").write_bytes(bytes(1 << 30))
+    assert states(logs)["disk"][0] == "error"
+    assert "No space left on device" in states(logs)["disk"][1]
+    assert "make room" in states(logs)["disk"][1]
+    (small_disk / "rest").unlink()
+    assert "disk" not in states(logs)
+    assert list(logs.iterdir()) == []
+
+
+def test_a_folder_that_others_may_look_into_is_a_warning(tmp_path):
+    logs = tmp_path / "logs"
+    logs.mkdir(mode=0o755)
+    logs.chmod(0o755)
+    level, text = states(logs)["rights"]
+    assert (level, text.endswith(f"`chmod -R go= {logs}`")) == ("warning", True)
+    logs.chmod(0o700)
+    assert "rights" not in states(logs)
+
+
+def test_there_is_no_such_folder():
+    result = doctor("nowhere")
+    assert result.returncode == 1
+    assert result.stderr.startswith("hearthlog: nowhere: no such folder; name the one that the re")
+
+
+@pytest.fixture
+def watchdog():
+    """A server that remembers what it was asked for."""
+    asked = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            """Say nothing."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/mine", asked
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
+    url, asked = watchdog
+    logs = tmp_path / "logs"
+    with recording(labmic, logs):
+        wait_for_frames(logs, 30)
+        doctor(logs, "--ping", url)
+    doctor(logs, "--ping", url)
+    assert asked == ["/mine", "/mine/fail"]
+
+
+def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
+    monkeypatch.setattr(ping, "_SECONDS", 0.5)
+    with closing(create_server(("127.0.0.1", 0))) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}/"
+        assert ping.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
+    assert ping.ping(url, is_well=True) == "Connection refused"
+
+
+@pytest.mark.parametrize("url", ["file:///etc/passwd", "watchdog", "https://", "ftp://a/b"])
+def test_what_is_no_address_of_a_watchdog_is_refused(tmp_path, url):
+    result = doctor(tmp_path, "--ping", url)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr.startswith("hearthlog: --ping wants an address")
