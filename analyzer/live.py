@@ -131,9 +131,9 @@ def _last_statuses(folder: Path, node: str) -> list[_Status]:
         logs = [log for log in find_logs(folder) if log_name(log).node == node]
         for log in reversed(logs[-3:]):  # the newest may have been begun this moment
             with suppress(LogError):
-                columns = read_columns([log], [DIAGNOSTICS], fields=["status"])
-                last = {each.subject: each for each in _statuses(columns[DIAGNOSTICS], node)}
-                if last:
+                columns = read_columns([log], [DIAGNOSTICS], fields=["status"]).values()
+                told = [status for each in columns for status in _statuses(each, node)]
+                if last := {each.subject: each for each in told}:
                     return [last[subject] for subject in sorted(last)]
     return []
 

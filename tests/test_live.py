@@ -1,6 +1,7 @@
 """`hearthlog doctor --live` says what is wrong with a recorder now, and what to do."""
 
 import json
+import shutil
 import signal
 import subprocess
 import time
@@ -90,6 +91,12 @@ def test_a_full_disk_is_an_error(small_disk):
     (small_disk / "rest").unlink()
     assert "disk" not in states(logs)
     assert list(logs.iterdir()) == []
+
+
+def test_a_folder_into_which_files_were_recorded_has_no_recorder(recorded, tmp_path):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    assert states(logs)["recorder"][0] == "error"
 
 
 def test_a_folder_that_others_may_look_into_is_a_warning(tmp_path):
