@@ -188,11 +188,20 @@ def test_a_service_without_a_microphone_is_alive_and_says_so(service):
     assert service.shows("NRestarts") == "0"
 
 
-def test_logs_are_written_where_the_configuration_says(service):
-    service.write("/etc/home.toml", "output = '/srv/logs'\n")
-    service.run("install", "-d", "-o", "hearthlog", "/srv/logs")
-    install(service, "--config", "/etc/home.toml")
-    wait_for_labels(service, "/srv/logs")
+def test_logs_and_configuration_may_be_anywhere_and_have_any_name(service):
+    config, folder = "/etc/my 100% $HOME \\ 'x'.toml", '/srv/logs/of "us" 5%'
+    service.write(config, f"output = '{folder}'\n")
+    service.run("install", "-d", "-o", "hearthlog", folder)
+    install(service, "--config", config)
+    wait_for_labels(service, folder)
+
+
+def test_a_service_that_does_not_start_is_an_error_that_says_where_to_look(service):
+    service.write(f"{UNIT}.d/broken.conf", "[Service]\nExecStartPre=false\n")
+    result = install(service, check=False)
+    assert result.returncode == 1
+    expected = "hearthlog.service did not start; `journalctl -u hearthlog.service` says why"
+    assert result.stderr == f"hearthlog: {expected}\n"
 
 
 def test_a_service_takes_over_another_configuration_and_refuses_a_wrong_one(service):

@@ -19,7 +19,7 @@ from hearthlog.tools.service.unit import NAME, is_ours, system_unit, user_unit
 
 _UNSEEN = tuple(map(Path, ("/home", "/root", "/run/user", "/tmp", "/var/tmp")))  # noqa: S108
 _SYSTEMD = Path("/run/systemd/system")  # is there as long as it runs
-_REHEARSAL_SECONDS = 60
+_REHEARSAL_SECONDS = 120
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,8 @@ def _rehearse(folder: Path, config: Path | None, person: pwd.struct_passwd | Non
         )
     except PermissionError as error:
         raise ServiceError(_cannot_run(person, str(error.strerror))) from error
+    except subprocess.TimeoutExpired as error:
+        raise ServiceError(_cannot_run(person, f"no answer in {_REHEARSAL_SECONDS} s")) from error
     if result.returncode:
         raise ServiceError(_cannot_run(person, (result.stderr.splitlines() or [""])[-1]))
     answer = json.loads(result.stdout)
@@ -152,7 +154,7 @@ def _cannot_run(person: pwd.struct_passwd | None, reason: str) -> str:
     name = "you" if person is None else person.pw_name
     return (
         f"{sys.prefix}: {name} cannot run hearthlog from there ({reason}); "
-        "install it where everyone may read, such as in /opt/hearthlog"
+        "install it where everyone may read, as `sudo python3 -m venv /opt/hearthlog` does"
     )
 
 
