@@ -99,9 +99,21 @@ SHOWN = sorted({line for path in PAGES for line in shown_commands(path.read_text
 
 def unknown_options(text):
     """Options that pages name and no verb has."""
-    ours = [code for code in snippets(text) if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
+    codes = (code.removeprefix("sudo ") for code in snippets(text))
+    ours = [code for code in codes if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
     named = {name for code in ours for name in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code)}
-    others = {"rerun", "dask", "ssh", "pip", "mcap", "apt", "systemctl", "useradd", "podman"}
+    others = {
+        "rerun",
+        "dask",
+        "ssh",
+        "pip",
+        "mcap",
+        "apt",
+        "apt-get",
+        "systemctl",
+        "useradd",
+        "podman",
+    }
     foreign = {
         name
         for code in ours
