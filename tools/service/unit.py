@@ -1,6 +1,7 @@
 """The text of the unit by which systemd starts the recorder."""
 
 import grp
+import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +13,7 @@ NAME = "hearthlog.service"
 _STATE_MODES = {"owner": "0700", "group": "0750", "all": "0755"}
 _NO_NETWORK = "RestrictAddressFamilies=AF_UNIX"
 _NETWORK = "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6"
+_PLAIN = re.compile(r"[\w./-]+")
 _SOUND_GROUP = "audio"  # whose members may open sound cards
 
 
@@ -100,7 +102,7 @@ def _command(words: Sequence[str]) -> str:
 def _word(text: str | Path) -> str:
     """Return a word of a unit's line, in which no character has a meaning of its own."""
     escaped = _printable(text).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
-    return escaped if escaped.replace("/", "").replace("-", "").isalnum() else f'"{escaped}"'
+    return escaped if _PLAIN.fullmatch(escaped) else f'"{escaped}"'
 
 
 def _printable(text: str | Path) -> str:
