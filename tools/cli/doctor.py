@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.text import printable
-from hearthlog.tools.cli.options import Json, LocalLog
-from hearthlog.tools.cli.text import print_lines, tell, wrong_use
+from hearthlog.tools.cli.options import Json, LocalLog, check_output
+from hearthlog.tools.cli.text import number, print_lines, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
@@ -28,6 +28,12 @@ def doctor(
             help="With --live: ask for this address if all is well, for /fail below if not.",
         ),
     ] = None,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(
+            help="New ZIP file for somebody who helps; nothing of what was heard is in it."
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check logs: MCAP, the contract, and how they follow each other; or what records them now.
@@ -37,6 +43,9 @@ def doctor(
     """
     if ping_url is not None and not live:
         wrong_use("--ping goes with --live")
+    if bundle is not None:
+        _write_bundle(bundle, path)
+        return
     if live:
         _examine_live(path, ping_url, as_json=as_json)
         return
@@ -52,6 +61,19 @@ def doctor(
     levels = {level for findings in files for level, _ in findings.counts}
     if levels:
         raise typer.Exit(1 if "error" in levels else 3)
+
+
+def _write_bundle(bundle: Path, folder: Path) -> None:
+    from zipfile import ZIP_DEFLATED, ZipFile
+
+    from hearthlog.analyzer.support import support_bundle
+    from hearthlog.schemas.storage.new_files import new_file
+
+    check_output("--bundle", bundle, ".zip", "a bundle")
+    with new_file(bundle) as temporary, ZipFile(temporary, "x", ZIP_DEFLATED) as archive:
+        for name, content in support_bundle(folder):
+            archive.writestr(name, content)
+            print(f"{bundle}: {name}, {number(len(content), 'byte')}")
 
 
 def _examine_live(folder: Path, ping_url: str | None, *, as_json: bool) -> None:
