@@ -144,6 +144,10 @@ class Settings(BaseSettings):
     readable_by: ReadableBy = Field(
         default="owner", description="Who of this machine may read new logs, with their folders."
     )
+    privacy: list[str] = Field(
+        default=[],
+        description='Classes whose features are logged coarsely, as ["speech"]: over a second.',
+    )
     keep_audio: Keep = Field(default="off", description="Which sound is kept as clips.")
     never_keep: list[str] = Field(
         default=["speech"], description="Classes whose sound is in no clip, however unsure."

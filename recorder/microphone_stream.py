@@ -33,7 +33,8 @@ class MicrophoneStream:
     ModelError
         If the configured feature set is not installed.
     ConfigurationError
-        If the model is for another feature set than the configured one.
+        If the model is for another feature set than the configured one, or does not know what is
+        private.
     """
 
     def __init__(
@@ -52,7 +53,15 @@ class MicrophoneStream:
             models.classifier,
             settings.statistics_every,
             models.candidate_classifier,
+            settings.privacy,
         )
+        if unknown := self.pipeline.unknown_private():
+            classes = self.pipeline.classes
+            what = f"this one tells apart {', '.join(classes)}" if classes else "there is none"
+            raise ConfigurationError(
+                f"privacy needs a model that knows {', '.join(map(repr, unknown))} ({what}); take "
+                "one that does, or set privacy = [] to log the features of everything"
+            )
 
     def accepted(self, event: Event, *, log_is_full: bool) -> list[Event]:
         """Return what is to be recorded now.

@@ -358,7 +358,7 @@ class RecordingSession:
             self._record(stream, accepted)
         if isinstance(event, SourceHealth):
             self._journal.add(microphone, stream.pipeline.judged(event))
-            self._look_at_the_machine(event.stamp)
+            self._look_at_the_machine(stream, event.stamp)
         for notice in self._log.notices():
             say(notice.text)
             self._log.write(stream.pipeline.report("disk", self._now, notice))
@@ -370,29 +370,30 @@ class RecordingSession:
         if isinstance(event, Frames):
             self._look_for_models(stream, event)
         if stream.device_changes():
-            self._log.begin_anew(self._describe(), [])
+            self._log.begin_anew(self._describe(), stream.pipeline.flush())
         notices = self._clips.before(stream.pipeline.microphone, event)
         self._log.write(stream.pipeline.push(event))
         labels = stream.pipeline.last_labels
         notices += self._clips.after(stream.pipeline.microphone, event, labels)
         self._now = event_time(event)
         self._log.write(self._clip_messages(stream, notices))
-        self._look_after_the_disk()
+        self._look_after_the_disk(stream)
 
-    def _look_after_the_disk(self) -> None:
+    def _look_after_the_disk(self, stream: MicrophoneStream) -> None:
         if self._keeper is not None:
             messages, problems = self._keeper.tick(self._now)
-            self._log.write(messages)
+            self._log.write(stream.pipeline.hold(messages))
             for problem in problems:
                 say(problem)
 
-    def _look_at_the_machine(self, stamp: int) -> None:
+    def _look_at_the_machine(self, stream: MicrophoneStream, stamp: int) -> None:
         """Tell how the machine is, as often as the first microphone tells how it is."""
         if self._machine is None:
             return
         if (health := self._machine.tick(stamp)) is not None:
             self._journal.add("machine", health)
-            self._log.write([diagnostics(f"{self._settings.node} machine", health)])
+            message = diagnostics(f"{self._settings.node} machine", health)
+            self._log.write(stream.pipeline.hold([message]))
 
     def finish(self) -> None:
         """Complete the log and its clips.

@@ -131,6 +131,8 @@ def read_sound_of(
 ) -> Iterator[HomeSound]:
     """Read what microphones recorded in a part of a log, and some seconds around it.
 
+    Frames that were logged coarsely, for privacy, are left out: no sound is so.
+
     Parameters
     ----------
     log : Path
@@ -159,16 +161,28 @@ def read_sound_of(
         values = recorded["values"]
         if not _is_of(recorded, features):
             values = np.empty((len(values), 0), np.float32)
+        floors = _floors(recorded, earlier.get(name), features)
+        own = ~_coarse(values, features)
         yield HomeSound(
             log,
             microphone,
             [mark for mark in marks if mark.microphone == microphone],
             [span for span in reviewed if span.microphone == microphone],
-            recorded["header.stamp"],
-            recorded["frame"].astype(np.int64),
-            values,
-            _floors(recorded, earlier.get(name), features),
+            recorded["header.stamp"][own],
+            recorded["frame"][own].astype(np.int64),
+            values[own],
+            None if floors is None else floors[own],
         )
+
+
+def _coarse(values: Float32, features: FeatureSet) -> Bool:
+    """Tell which frames have the very values of one beside them, though there is sound."""
+    coarse = np.zeros(len(values), bool)
+    if values.shape[1]:
+        same = (values[1:] == values[:-1]).all(axis=1) & (features.power(values[1:]) > 0)
+        coarse[1:] |= same
+        coarse[:-1] |= same
+    return coarse
 
 
 def _columns_before(log: Path, topics: Collection[str], start: int) -> dict[str, Columns]:

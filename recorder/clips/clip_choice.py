@@ -10,17 +10,14 @@ from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.config import Keep
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.stream.private_frames import PrivateFrames
 from hearthlog.schemas.arrays import Bool, Float32, Int16, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.times import NANOSECONDS
 
-# Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
-# probabilities hold for people whom they were not learned from.
-PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
 _UNSURE_CONFIDENCE = 0.5
 _UNSURE_NOVELTY = 0.7
 _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
-_BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
 
 
 class KeptSound(NamedTuple):
@@ -40,9 +37,7 @@ class KeptSound(NamedTuple):
 class ClipFinder:
     """Holds sound back until it is certain whether it may be kept, and is worth keeping.
 
-    A label is known with the last frame of its window. A frame may be kept if all windows within a
-    second of it, before and behind, were labelled, and none of them is likely to be of a class that
-    is never kept. Frames beside a gap have fewer windows, and are not kept.
+    A frame may be kept unless it is private, as of `PrivateFrames`.
 
     Parameters
     ----------
@@ -55,29 +50,36 @@ class ClipFinder:
         Frames kept before a sound that is worth keeping.
     window_frames : int
         A second, or the length of the window of a label, if that is longer.
+    late_frames : int
+        Frames by which the log is later than its labels.
     """
 
     def __init__(
-        self, keep: Keep, never: Sequence[str], pre_roll_frames: int, window_frames: int
+        self,
+        keep: Keep,
+        never: Sequence[str],
+        pre_roll_frames: int,
+        window_frames: int,
+        late_frames: int = 0,
     ) -> None:
         self._window = window_frames
         self._keep = keep
-        self._never = tuple(never)
+        self._guard = PrivateFrames(never, window_frames)
         # How many frames before a label's own frame are kept because of the label.
         self._before = 0 if keep == "always" else self._window - 1 + pre_roll_frames
-        self._ahead = max(self._before, self._window - 1)
+        self._ahead = max(self._before, self._window - 1 + late_frames)
         self._begin()
 
     def _begin(self) -> None:
         """Hold nothing.
 
-        `_private` and `_worth` begin some frames before the sound that is held: these frames are
-        decided, but what follows them is kept because of them.
+        `_private` is of the first frames that are held. `_worth` begins some frames before them:
+        these frames are decided, but what follows them is kept because of them.
         """
         self._next = -1
         self._samples: Int16 = np.empty((0, FRAME_SAMPLES), np.int16)
         self._stamps: Int64 = np.empty(0, np.int64)
-        self._private: Bool = self._unlabelled(_AFTER_FRAMES)
+        self._private: Bool = np.zeros(0, bool)
         self._worth: Bool = np.zeros(_AFTER_FRAMES, bool)
 
     def push(self, frames: Frames, labels: FrameLabels | None) -> list[KeptSound]:
@@ -110,7 +112,7 @@ class ClipFinder:
         list of KeptSound
             In the order of time.
         """
-        self._private = np.append(self._private, self._unlabelled(self._ahead))
+        self._private = np.append(self._private, self._guard.close())
         self._worth = np.append(self._worth, np.zeros(self._ahead, bool))
         sounds = self._decide(len(self._samples))
         self._begin()
@@ -118,40 +120,29 @@ class ClipFinder:
 
     def _append(self, frames: Frames, labels: FrameLabels | None) -> None:
         count = len(frames.samples)
-        private, worth = self._unlabelled(count), np.zeros(count, bool)
+        worth = np.zeros(count, bool)
         if labels is not None and len(labels.novelty):
-            labelled = slice(count - len(labels.novelty), None)
-            private[labelled], worth[labelled] = self._judge(labels)
+            worth[count - len(labels.novelty) :] = self._judge(labels)
         self._samples = np.concatenate([self._samples, _pcm(frames.samples)])
         self._stamps = np.append(self._stamps, frames.stamps)
-        self._private = np.append(self._private, private)
+        self._private = np.append(self._private, self._guard.push(count, labels))
         self._worth = np.append(self._worth, worth)
 
-    def _judge(self, labels: FrameLabels) -> tuple[Bool, Bool]:
-        """Return whether each window may be private, and whether it is worth keeping."""
-        probabilities, elsewhere = labels.probabilities, labels.calibrated_elsewhere
-        never = [labels.classes.index(name) for name in self._never]
-        limit = PRIVATE_LIMIT_ELSEWHERE if elsewhere else PRIVATE_LIMIT
-        private = np.any(~(probabilities[:, never] < limit), axis=1)  # as NaN is
+    def _judge(self, labels: FrameLabels) -> Bool:
+        """Return whether each window is worth keeping."""
         if self._keep == "unsure":
-            unsure = labels.novelty > _UNSURE_NOVELTY
-            if not elsewhere:
-                unsure |= probabilities.max(axis=1) < _UNSURE_CONFIDENCE
-            return private, unsure
+            unsure: Bool = labels.novelty > _UNSURE_NOVELTY
+            if not labels.calibrated_elsewhere:
+                unsure |= labels.probabilities.max(axis=1) < _UNSURE_CONFIDENCE
+            return unsure
         loud = np.array([class_name(name) != SILENCE for name in labels.classes])
-        return private, loud[probabilities.argmax(axis=1)]
-
-    def _unlabelled(self, count: int) -> Bool:
-        """Return whether frames without a label may be private: unless nothing is."""
-        return np.full(count, bool(self._never))
+        return loud[labels.probabilities.argmax(axis=1)]
 
     def _decide(self, count: int) -> list[KeptSound]:
         """Decide on the first frames that are held."""
         if count <= 0:
             return []
-        span = _BEHIND_FRAMES + self._window
-        private = self._private[_AFTER_FRAMES - _BEHIND_FRAMES :][: count + span - 1]
-        kept = ~sliding_window_view(private, span).any(axis=1)
+        kept = ~self._private[:count]
         if self._keep != "always":
             around = self._worth[: _AFTER_FRAMES + count + self._before]
             kept &= sliding_window_view(around, _AFTER_FRAMES + self._before + 1).any(axis=1)

@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from datetime import datetime, time, timedelta
 from pathlib import Path
 
-from hearthlog.recorder.clips.clip_choice import PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE, KeptSound
+from hearthlog.recorder.clips.clip_choice import KeptSound
 from hearthlog.recorder.clips.clip_retention import find_clips
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, WARNING, Notice
+from hearthlog.recorder.stream.private_frames import PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE
 from hearthlog.recorder.timezone import time_zone
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE

@@ -11,6 +11,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import WARNING, Event, Frames, Gap, Notice, event_time
 from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.recorder.stream.veil import TOGETHER
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.times import NANOSECONDS
 
@@ -109,7 +110,11 @@ class _MicrophoneClips:
         self._writer = writer
         frames = round(settings.clip_pre_roll_seconds * NANOSECONDS / FRAME_NANOSECONDS)
         self._finder = ClipFinder(
-            self._keep, self._never, frames, pipeline.feature_set.window_frames
+            self._keep,
+            self._never,
+            frames,
+            pipeline.feature_set.window_frames,
+            TOGETHER if settings.privacy else 0,
         )
         self._classes: Sequence[str] | None = pipeline.classes
         self._refused = self._refusal()  # why no sound may be kept, or empty

@@ -1,6 +1,7 @@
 """Frames in, encoded messages out: features, statistics, labels and segments. No I/O."""
 
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -14,14 +15,14 @@ from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, SourceHealth
 from hearthlog.recorder.stream import rosout
 from hearthlog.recorder.stream.diagnostics import diagnostics
+from hearthlog.recorder.stream.feature_messages import FeatureMessages
 from hearthlog.recorder.stream.label_stream import LabelStream
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.recorder.stream.sound_watch import SoundWatch
 from hearthlog.recorder.stream.statistics import LOGGED_EVERY, RollingStatistics
+from hearthlog.recorder.stream.veil import Veil
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.gaps import encode_gap
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, ROSOUT, topic
 
@@ -41,6 +42,9 @@ class Pipeline:
         Frames from one statistics message to the next: those of the frames whose number it divides.
     candidate : Classifier or None
         Of a model on trial, which labels beside the other one.
+    private : sequence of str
+        Classes whose features are logged coarsely, as of `Veil`. With one, all messages come two
+        seconds later at most, so that log time never runs backwards.
 
     Attributes
     ----------
@@ -48,13 +52,14 @@ class Pipeline:
     feature_set : FeatureSet
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917
         self,
         microphone: str,
         features: FeatureSet,
         classifier: Classifier | None = None,
         statistics_every: int = LOGGED_EVERY,
         candidate: Classifier | None = None,
+        private: Sequence[str] = (),
     ) -> None:
         self.microphone = microphone
         self.feature_set = features
@@ -62,9 +67,13 @@ class Pipeline:
             LIVE: self._stream(LIVE, classifier),
             CANDIDATE: self._stream(CANDIDATE, candidate),
         }
-        self._statistics_every = statistics_every
+        window, width = features.window_frames, features.width
         self._features = features.extractor()
-        self._statistics = RollingStatistics(features.window_frames, features.width)
+        statistics = RollingStatistics(window, width)
+        self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
+        self._veil = Veil(private, width, window) if private else None
+        self._held: list[EncodedMessage] = []
+        self._recent: Float32 | None = None  # features of the last frames, one less than a window
         self._floor = None if features.band_powers is None else FloorTracker()
         self._recent_floors: Float64 | None = None  # of the last window
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
@@ -107,8 +116,8 @@ class Pipeline:
             self._watch.add_samples(event.samples)
             return self.push_features(self._features(event.samples), event.first, event.stamps)
         if isinstance(event, Gap):
-            return self._push_gap(event)
-        return self._push_health(event)
+            return self.hold(self._push_gap(event))
+        return self.hold(self._push_health(event))
 
     def push_features(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
         """Turn the features of successive frames into messages.
@@ -126,20 +135,56 @@ class Pipeline:
         list of EncodedMessage
             In the order of their log times.
         """
-        mean, std = self._statistics(features)
-        frames = np.arange(first, first + len(features))
-        logged = np.flatnonzero(frames % self._statistics_every == 0)
-        statistics = {"mean": mean[logged], "std": std[logged]}
-        messages = [
-            *self._feature_messages("features", frames, stamps, {"values": features}),
-            *self._feature_messages("statistics", frames[logged], stamps[logged], statistics),
-            *self._labels(features, self._track_floor(features, first), first, stamps),
-        ]
+        labels = self._labels(features, self._track_floor(features, first), first, stamps)
+        logged = features, first, stamps
+        if self._veil is not None:
+            logged = self._veil.push(*logged, self.last_labels)
+        messages = [*self._feature_messages(*logged), *labels]
         messages.sort(key=attrgetter("log_time"))
+        self._remember(features, stamps)
+        return self.hold(messages)
+
+    def _remember(self, features: Float32, stamps: Int64) -> None:
+        before = features[:0] if self._recent is None else self._recent
+        window = self.feature_set.window_frames
+        self._recent = np.concatenate([before, features])[1 - window :]
         recent = np.concatenate([self._recent_stamps, stamps])
         self._recent_stamps = recent[-self.feature_set.window_frames :]
         self._end = int(stamps[-1]) + FRAME_NANOSECONDS
+
+    def hold(self, messages: Sequence[EncodedMessage]) -> list[EncodedMessage]:
+        """Return what may be logged: all, or what is not later than features that are held.
+
+        Parameters
+        ----------
+        messages : sequence of EncodedMessage
+            In the order of their log times, none before the last event.
+
+        Returns
+        -------
+        list of EncodedMessage
+            In the order of their log times; of what was held before, too.
+        """
+        if self._veil is None:
+            return list(messages)
+        self._held = sorted([*self._held, *messages], key=attrgetter("log_time"))
+        ready = bisect_left(self._held, self._veil.start, key=attrgetter("log_time"))
+        messages, self._held = self._held[:ready], self._held[ready:]
         return messages
+
+    def flush(self) -> list[EncodedMessage]:
+        """Return what is held, before the log ends.
+
+        Returns
+        -------
+        list of EncodedMessage
+            In the order of their log times.
+        """
+        return self.hold(self._unveil())
+
+    def _unveil(self) -> list[EncodedMessage]:
+        """Return the features that are held."""
+        return [] if self._veil is None else self._feature_messages(*self._veil.close())
 
     def finish(self) -> list[EncodedMessage]:
         """End the open segment where the sound ends.
@@ -147,9 +192,9 @@ class Pipeline:
         Returns
         -------
         list of EncodedMessage
-            The last segments; empty without a model.
+            What was held, and the last segments.
         """
-        return self._close(self._end)
+        return self.hold([*self._unveil(), *self._close(self._end)])
 
     def change_model(
         self,
@@ -179,19 +224,31 @@ class Pipeline:
         opening : list of EncodedMessage
             First messages of the log of this model.
         """
+        held = self.flush()
         earlier, stream = self._streams[labelling], self._stream(labelling, classifier)
         self._streams[labelling] = stream
         closing = [] if earlier is None else earlier.close(stamp)
         self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
         what = "model" if labelling == LIVE else labelling
-        return closing, self.report("model", stamp, _from_frame(what, model, frame))
+        opening = self.report("model", stamp, _from_frame(what, model, frame))
+        if unknown := self.unknown_private():
+            names = ", ".join(map(repr, unknown))
+            text = (
+                f"features are logged coarsely: the model does not know {names}, which is private"
+            )
+            opening += self.report("model", stamp, Notice(WARNING, text))
+        return [*held, *closing], opening
+
+    def unknown_private(self) -> list[str]:
+        """Return the private classes that the model in use does not know."""
+        return [] if self._veil is None else self._veil.unknown(self.classes)
 
     def _stream(self, labelling: str, classifier: Classifier | None) -> LabelStream | None:
         return None if classifier is None else LabelStream(self.microphone, labelling, classifier)
 
     def _follow(self, stream: LabelStream | None, frame: int, unlabelled: int) -> None:
         """Let a stream begin at a frame, with what is remembered of the frames before."""
-        recent, floors = self._statistics.recent, self._recent_floors
+        recent, floors = self._recent, self._recent_floors
         if stream is None or recent is None:
             return
         stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
@@ -216,10 +273,12 @@ class Pipeline:
             One for `/diagnostics`, one for `/rosout`.
         """
         subject = f"{self.microphone} {subject}"
-        return [
-            diagnostics(subject, SourceHealth(stamp, *notice), self.microphone),
-            EncodedMessage(stamp, ROSOUT, rosout.notice_line(self.microphone, stamp, notice)),
-        ]
+        return self.hold(
+            [
+                diagnostics(subject, SourceHealth(stamp, *notice), self.microphone),
+                EncodedMessage(stamp, ROSOUT, rosout.notice_line(self.microphone, stamp, notice)),
+            ]
+        )
 
     def judged(self, health: SourceHealth) -> SourceHealth:
         """Return the health of the source, or what is wrong with its sound.
@@ -233,13 +292,16 @@ class Pipeline:
         return health
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
+        held = self._unveil()
         self._features.restart()
-        self._statistics.restart()
+        self._feature_messages.restart()
+        self._recent = None
         self._recent_floors = None
         if self._floor is not None:
             self._floor.restart()
         data = encode_gap(self.microphone, gap.start, gap.end, gap.reason, gap.frames_lost)
         return [
+            *held,
             *self._close(self._end),
             EncodedMessage(gap.end, topic(self.microphone, "gap"), data),
             EncodedMessage(gap.end, ROSOUT, rosout.gap_line(self.microphone, gap)),
@@ -273,33 +335,12 @@ class Pipeline:
         messages = [message for stream in streams for message in stream.close(end)]
         return sorted(messages, key=attrgetter("log_time"))
 
-    def _feature_messages(
-        self, kind: str, frames: Int64, stamps: Int64, arrays: Mapping[str, Float32]
-    ) -> list[EncodedMessage]:
-        columns: dict[str, Column] = {
-            "header.stamp": stamps,
-            "header.frame_id": self.microphone,
-            "frame": frames,
-            **arrays,
-        }
-        typename = message_types.FEATURES if kind == "features" else message_types.STATISTICS
-        return self._messages(kind, typename, stamps, columns)
-
-    def _messages(
-        self, kind: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
-    ) -> list[EncodedMessage]:
-        name = topic(self.microphone, kind)
-        rows = encode_rows(typename, columns, len(log_times))
-        return [
-            EncodedMessage(time, name, row)
-            for time, row in zip(log_times.tolist(), rows, strict=True)
-        ]
-
     def _push_health(self, health: SourceHealth) -> list[EncodedMessage]:
         health = self.judged(health)
         # A report of a later time than the sound says that there is none: what is still to be said
         # of the sound is older, and comes first.
-        closing = self._close(self._end) if health.stamp > self._end else []
+        ended = health.stamp > self._end
+        closing = [*self._unveil(), *self._close(self._end)] if ended else []
         values = {**health.values, **self._floor_value()}
         told = replace(health, values=values)
         messages = [diagnostics(self.microphone, told, self.microphone)]

@@ -1,0 +1,96 @@
+"""Which frames nobody can be talking in. No I/O."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.schemas.arrays import Bool
+
+# Probability of speech: measured, see docs/recorder.md. The higher limit is for models whose
+# probabilities hold for people whom they were not learned from.
+PRIVATE_LIMIT, PRIVATE_LIMIT_ELSEWHERE = 0.02, 0.04
+_BEHIND_FRAMES = 12  # with a window of 0.4 s before them: what ended less than a second ago counts
+
+
+class PrivateFrames:
+    """Tells which frames are private, as soon as it is certain.
+
+    A label is known with the last frame of its window. A frame is private unless all windows within
+    a second of it, before and behind, were labelled, and none of them is likely to be of a class
+    that is. Frames beside a gap have fewer windows, and are private.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Those that are private; if there are none, no frame is.
+    window_frames : int
+        A second, or the length of the window of a label, if that is longer.
+
+    Attributes
+    ----------
+    delay : int
+        Frames from one to that with which it is certain.
+    """
+
+    def __init__(self, classes: Sequence[str], window_frames: int) -> None:
+        self.delay = window_frames - 1
+        self._classes = tuple(classes)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._likely: Bool = self._unlabelled(_BEHIND_FRAMES)
+
+    def push(self, count: int, labels: FrameLabels | None) -> Bool:
+        """Add frames, which follow the ones before.
+
+        Parameters
+        ----------
+        count : int
+            At least one.
+        labels : FrameLabels or None
+            Of the last of these frames; their classes include all that are private.
+
+        Returns
+        -------
+        np.ndarray [shape=(m,)], bool
+            Of the next m frames that are certain, whether they are private.
+        """
+        likely = self._unlabelled(count)
+        if labels is not None and len(labels.novelty):
+            likely[count - len(labels.novelty) :] = self._judge(labels)
+        self._likely = np.append(self._likely, likely)
+        return self._decide()
+
+    def close(self) -> Bool:
+        """Return whether the frames are private that are not certain yet, and begin anew.
+
+        Returns
+        -------
+        np.ndarray [shape=(m,)], bool
+        """
+        self._likely = np.append(self._likely, self._unlabelled(self.delay))
+        private = self._decide()
+        self._begin()
+        return private
+
+    def _judge(self, labels: FrameLabels) -> Bool:
+        """Return whether each window may be of a private class."""
+        columns = [labels.classes.index(name) for name in self._classes]
+        limit = PRIVATE_LIMIT_ELSEWHERE if labels.calibrated_elsewhere else PRIVATE_LIMIT
+        likely: Bool = np.any(~(labels.probabilities[:, columns] < limit), axis=1)  # as NaN is
+        return likely
+
+    def _unlabelled(self, count: int) -> Bool:
+        """Return whether frames without a label may be private: unless nothing is."""
+        return np.full(count, bool(self._classes))
+
+    def _decide(self) -> Bool:
+        span = _BEHIND_FRAMES + self.delay + 1
+        count = len(self._likely) - span + 1
+        if count <= 0:
+            return np.zeros(0, bool)
+        private = np.asarray(sliding_window_view(self._likely, span).any(axis=1))
+        self._likely = self._likely[count:]
+        return private

@@ -1,0 +1,122 @@
+"""Features as they may be logged: those of what is private are averaged over a second. No I/O."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.models.labels.labeller import FrameLabels
+from hearthlog.recorder.stream.private_frames import PrivateFrames
+from hearthlog.schemas.arrays import Bool, Float32, Int64
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.times import NANOSECONDS
+
+TOGETHER = NANOSECONDS // FRAME_NANOSECONDS  # frames that are averaged
+_NEVER = 2**63 - 1  # nanoseconds of UTC
+
+
+class LoggedFrames(NamedTuple):
+    """Features of successive frames, as they are logged.
+
+    Attributes
+    ----------
+    features : np.ndarray [shape=(n, d)], float32
+    first : int
+        Number of the first frame.
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    """
+
+    features: Float32
+    first: int
+    stamps: Int64
+
+
+class Veil:
+    """Holds features back until it is certain which are private, and makes those coarse.
+
+    Seconds begin at frames whose numbers 20 divides, so they are the same in blocks of any size.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Those that are private.
+    width : int
+        Number of features of a frame.
+    window_frames : int
+        As of `PrivateFrames`.
+    """
+
+    def __init__(self, classes: Sequence[str], width: int, window_frames: int) -> None:
+        self._classes = frozenset(classes)
+        self._guard = PrivateFrames(classes, window_frames)
+        self._held = LoggedFrames(np.empty((0, width), np.float32), 0, np.empty(0, np.int64))
+        self._private: Bool = np.empty(0, bool)  # of the first frames that are held
+
+    @property
+    def start(self) -> int:
+        """Start of the first frame that is held, in nanoseconds of UTC; without one, never."""
+        return int(self._held.stamps[0]) if len(self._held.stamps) else _NEVER
+
+    def unknown(self, classes: Sequence[str] | None) -> list[str]:
+        """Return the private classes that a model does not know.
+
+        Parameters
+        ----------
+        classes : sequence of str or None
+            Those that it tells apart; None without a model.
+        """
+        return sorted(self._classes.difference(classes or ()))
+
+    def push(
+        self, features: Float32, first: int, stamps: Int64, labels: FrameLabels | None
+    ) -> LoggedFrames:
+        """Add frames, which follow the ones before.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        labels : FrameLabels or None
+            Of the last of these frames; of a model that does not know what is private, all is.
+
+        Returns
+        -------
+        LoggedFrames
+            Those of the seconds that are certain; perhaps none.
+        """
+        held = self._held
+        self._held = LoggedFrames(
+            np.concatenate([held.features, features]),
+            held.first if len(held.stamps) else first,
+            np.append(held.stamps, stamps),
+        )
+        if labels is not None and self.unknown(labels.classes):
+            labels = None
+        self._private = np.append(self._private, self._guard.push(len(stamps), labels))
+        begun = (self._held.first + len(self._private)) % TOGETHER
+        return self._release(max(len(self._private) - begun, 0))
+
+    def close(self) -> LoggedFrames:
+        """Return what is held, as the frames to come do not follow those before.
+
+        Returns
+        -------
+        LoggedFrames
+        """
+        self._private = np.append(self._private, self._guard.close())
+        return self._release(len(self._private))
+
+    def _release(self, count: int) -> LoggedFrames:
+        features, first, stamps = self._held
+        private, self._private = self._private[:count], self._private[count:]
+        self._held = LoggedFrames(features[count:], first + count, stamps[count:])
+        shown = features[:count].copy()
+        second = (first + np.arange(count)) // TOGETHER
+        for number in np.unique(second[private]):
+            rows = private & (second == number)
+            shown[rows] = shown[rows].mean(axis=0, dtype=np.float64)
+        return LoggedFrames(shown, first, stamps[:count])
