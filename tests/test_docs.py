@@ -103,6 +103,7 @@ def unknown_options(text):
     ours = [code for code in codes if re.match(r"(hearthlog|make|-|[a-z ]+ -)", code)]
     named = {name for code in ours for name in re.findall(r"(?<![\w-])--[a-z][a-z-]*", code)}
     others = {
+        "rsync",
         "rerun",
         "dask",
         "ssh",
