@@ -12,14 +12,17 @@ SECONDS = 30  # a file; the machine may be busy
 class Victim:
     """A process that reads whatever it is given, and is started again when that has killed it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, readers=None) -> None:
         self._folder = folder
+        self._readers = READERS if readers is None else readers
         self._context = multiprocessing.get_context("spawn")
         self._start()
 
     def _start(self) -> None:
         self._pipe, other = self._context.Pipe()
-        self._process = self._context.Process(target=_serve, args=(other, self._folder))
+        self._process = self._context.Process(
+            target=_serve, args=(other, self._folder, self._readers)
+        )
         self._process.start()
         other.close()
 
@@ -44,18 +47,17 @@ class Victim:
         return what
 
 
-def _serve(pipe, folder: Path) -> None:
-    from logreader import LogReader  # noqa: PLC0415
+def _serve(pipe, folder: Path, readers) -> None:
+    import logreader  # noqa: F401, PLC0415  before the memory is limited
 
-    from hearthlog.analyzer.doctor import examine  # noqa: PLC0415
+    import hearthlog.analyzer.doctor  # noqa: PLC0415
+    import hearthlog.recorder.recording  # noqa: F401, PLC0415
 
-    assert examine
-    assert LogReader
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
     while True:
         path = pipe.recv()
-        pipe.send("".join(_try(reader, path, folder) for reader in READERS))
+        pipe.send("".join(_try(reader, path, folder) for reader in readers))
 
 
 def _try(reader, path: Path, folder: Path) -> str:

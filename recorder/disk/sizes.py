@@ -21,7 +21,7 @@ def parse_size(value: object) -> int:
     ValueError
         If it is neither.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?([kmgt]?)b?", str(value).lower())
+    match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,15})?) ?([kmgt]?)b?", str(value).lower())
     if match is None:
         raise ValueError("say how many bytes, such as 500M or 20G")
     return int(float(match[1]) * _UNITS[match[2]])
