@@ -14,6 +14,7 @@ from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.bench import guard
 from hearthlog.tools.bench.guard import FAR, NEAR, WAYS, heard_clip, maskers_of, measure, unheard
 from hearthlog.tools.home.clips import SHIPPED
@@ -79,6 +80,14 @@ def test_sources_that_the_model_has_learned_from_are_left_out(tmp_path, clips):
         writer.writerows([["path", "source_group"], ["a.wav", "fsdd_theo"]])
     left = unheard([SHIPPED], learned)
     assert {clip.source_group for clip in clips} - {c.source_group for c in left} == {"fsdd_theo"}
+
+
+def test_a_list_of_what_was_learned_that_cannot_be_used_is_refused(tmp_path):
+    there = tmp_path / "there.csv"
+    there.write_text("path,source\n")
+    for path, what in ((there, "no column source_group"), (tmp_path / "gone.csv", "gone.csv")):
+        with pytest.raises(HearthlogError, match=what):
+            unheard([SHIPPED], path)
 
 
 def test_it_is_one_command(tmp_path, clips, capsys):

@@ -5,7 +5,6 @@ Clips of sources that the model has not learned from are heard one after another
 of their loud frames `keep_audio = "always"` keeps; of other sounds that is what the guard costs.
 """
 
-import csv
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -17,10 +16,11 @@ import typer
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.scenes import background
+from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.analyzer.training.dataset import clip_frames
-from hearthlog.analyzer.training.manifest import LabelledClip, read_manifest
+from hearthlog.analyzer.training.manifest import SIZE_LIMIT, LabelledClip, read_manifest
 from hearthlog.analyzer.training.rooms import reverberated
 from hearthlog.analyzer.training.scenario import LABELS
 from hearthlog.models.classes import MUSIC, SILENCE, SPEECH
@@ -266,8 +266,12 @@ def unheard(manifests: Sequence[Path], learned: Path) -> list[LabelledClip]:
     DataError
         If a manifest cannot be used.
     """
-    with learned.open(encoding="utf-8", newline="") as rows:
-        heard = {row["source_group"] for row in csv.DictReader(rows)}
+    lines = csv_records(learned, read_text(learned, "manifest", SIZE_LIMIT))
+    _, header = next(lines, (1, []))
+    if "source_group" not in header:
+        raise DataError(f"{learned}:1: no column source_group in the first line")
+    place = header.index("source_group")
+    heard = {record[place] for _, record in lines if len(record) > place}
     clips = [clip for path in manifests for clip in read_manifest(path, LABELS)]
     return [clip for clip in clips if clip.source_group not in heard]
 

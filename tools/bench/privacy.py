@@ -65,8 +65,8 @@ def privacy(
 
     Where the manifest does not say what is said, it is what the recogniser hears in the original.
     """
-    texts = _texts(manifest)
     clips = [clip for clip in read_manifest(manifest, LABELS) if clip.label == SPEECH]
+    texts = _texts(manifest)
     digits = [_spoken(clip, texts) for clip in clips if texts.get(clip.path) in DIGITS]
     sentences = _sentences([clip for clip in clips if texts.get(clip.path) not in DIGITS], texts)
     sentences = sentences[:: -(-len(sentences) // most) or 1]
