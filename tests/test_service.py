@@ -196,6 +196,18 @@ def test_logs_and_configuration_may_be_anywhere_and_have_any_name(service):
     wait_for_labels(service, folder)
 
 
+def test_a_service_may_use_the_network_if_a_microphone_is_there(service):
+    address = "http://127.0.0.1:8123/nursery.wav"
+    service.write("/etc/home.toml", f"[[microphone]]\ndevice = '{address}'\n")
+    install(service, "--config", "/etc/home.toml")
+    sends = "ffmpeg -re -f lavfi -i anoisesrc=a=0.1 -f wav -listen 1"
+    service.run(
+        "systemd-run", "-q", "--unit=camera", "-p", "Restart=always", *sends.split(), address
+    )
+    wait_for_labels(service)
+    service.run("systemctl", "stop", "camera")
+
+
 def test_a_service_that_does_not_start_is_an_error_that_says_where_to_look(service):
     service.write(f"{UNIT}.d/broken.conf", "[Service]\nExecStartPre=false\n")
     result = install(service, check=False)
