@@ -112,7 +112,7 @@ def completed(*words):
     [
         (
             ("hearthlog", "re"),
-            ["record", "recover", "retain", *["review", "report", "replay", "relabel"]],
+            ["record", "resume", "recover", "retain", *["review", "report", "replay", "relabel"]],
         ),
         (("hearthlog", "models", "pro"), ["promote"]),
         (("hearthlog", "evaluate", ""), [*_WAYS]),

@@ -13,7 +13,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 from hearthlog import __version__
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.cat import cat
@@ -125,6 +124,8 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
+        from hearthlog.recorder.errors import ConfigurationError
+
         tell(_message(error))
         return 2 if isinstance(error, ConfigurationError) else 1
 
