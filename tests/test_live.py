@@ -52,6 +52,7 @@ def test_a_microphone_that_is_gone_is_an_error_until_it_is_back(labmic, tmp_path
         labmic.unplug()
         wait_for(lambda: states(logs)["mic"][0] == "error")
         assert "`hearthlog devices` lists what is there" in states(logs)["mic"][1]
+        wait_for(lambda: "waiting for it" in states(logs)["mic"][1])
         assert doctor(logs).returncode == 1
         labmic.restore()
         wait_for(lambda: states(logs)["mic"] == ("ok", "listening"))

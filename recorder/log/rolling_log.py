@@ -19,6 +19,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 # The longest time from a sound to its writing: a block of frames, and the delay of the capture.
 _DELAY_SECONDS = 0.9
+_QUIET_SECONDS = 2.0  # without a flush; sound has one every half a second
 _FILES = 256  # to remember: even with one a second, longer than clips are held back
 _LATE = 10 * NANOSECONDS  # of one microphone behind another: beyond that the clock was set back
 _NEVER = (1 << 63) - 1
@@ -70,6 +71,7 @@ class RollingLog:
         self._file_bytes = file_bytes
         self._flush_nanoseconds = int((flush_seconds - _DELAY_SECONDS) * NANOSECONDS)
         self._sync_seconds = sync_seconds - _DELAY_SECONDS
+        self._live = live
         self._name = free_log_path if live else log_path
         self._finisher = finisher
         self._writer: LogWriter | None = None
@@ -77,6 +79,7 @@ class RollingLog:
         self._late = _LATE if len(description.infos) > 1 else 0
         self._last = self._until = 0  # no time lies between: the first message opens a file
         self._flush_at: int | None = None
+        self._flushed = time.monotonic()
         self._synced = time.monotonic()
         self._begun: deque[tuple[int, Path]] = deque(maxlen=_FILES)
 
@@ -102,10 +105,17 @@ class RollingLog:
                     self._roll(message.log_time)
                 self._append(message)
                 self._given += 1
-            if self._flush_at is not None and self._last >= self._flush_at:
+            if self._is_flush_due():
                 self.flush()
             if time.monotonic() - self._synced >= self._sync_seconds:
                 self.sync()
+
+    def _is_flush_due(self) -> bool:
+        if self._flush_at is None:
+            return False
+        # Without sound there is a message every ten seconds, which is not to wait for the next.
+        waits = self._live and time.monotonic() - self._flushed >= _QUIET_SECONDS
+        return waits or self._last >= self._flush_at
 
     def flush(self) -> None:
         """Hand what was written over to the operating system.
@@ -118,6 +128,7 @@ class RollingLog:
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
             self._flush_at = None
+            self._flushed = time.monotonic()
             if self._file_bytes and self._writer.size >= self._file_bytes:
                 self._until = 0
 
