@@ -10,6 +10,8 @@ class SourceError(HearthlogError):
 class ConfigurationError(HearthlogError):
     """The configuration is unknown, wrong or contradicts itself."""
 
+    status = 2
+
 
 class DeviceError(SourceError):
     """A microphone is not there, or cannot be opened now."""

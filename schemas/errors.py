@@ -4,7 +4,15 @@ from hearthlog.schemas.text import printable
 
 
 class HearthlogError(Exception):
-    """Base of hearthlog's errors; the command line prints the message and exits with 1."""
+    """Base of hearthlog's errors; the command line prints the message and ends.
+
+    Attributes
+    ----------
+    status : int
+        Exit status of the command line.
+    """
+
+    status = 1
 
     def __str__(self) -> str:
         return printable(super().__str__())  # it may quote a file

@@ -153,5 +153,5 @@ def test_another_file_begins_where_one_has_grown_large(description, tmp_path):
 
 def test_files_are_not_so_small_that_two_begin_in_a_second(tmp_path, hearthlog):
     result = hearthlog("record", "-o", tmp_path, "--max-bag-size", "900k")
-    assert (result.returncode, len(result.stderr.splitlines())) == (1, 1)
+    assert (result.returncode, len(result.stderr.splitlines())) == (2, 1)
     assert "max_bag_size: at least 1M" in result.stderr

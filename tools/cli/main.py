@@ -124,10 +124,8 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        from hearthlog.recorder.errors import ConfigurationError
-
         tell(_message(error))
-        return 2 if isinstance(error, ConfigurationError) else 1
+        return error.status if isinstance(error, HearthlogError) else 1
 
 
 def _usage_text(error: typer.TyperException) -> str:
