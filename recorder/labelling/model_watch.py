@@ -18,6 +18,7 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.journal import say
+from hearthlog.recorder.memory import give_back
 
 LOOK_SECONDS = 1.0
 
@@ -127,6 +128,7 @@ class ModelWatch:
             if (changed or requested) and not (nothing_yet or self._closed.is_set()):
                 self._seen = now
                 self._look()
+                give_back()
 
     def _awaited_judgement(self) -> FileIdentity:
         return None if self._awaited is None else file_identity(self._awaited)

@@ -13,6 +13,7 @@ from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.held_messages import Held, HeldMessages
 from hearthlog.recorder.log.rolling_log import RollingLog
+from hearthlog.recorder.memory import give_back
 from hearthlog.recorder.stream.messages import EncodedMessage
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
@@ -135,6 +136,7 @@ class LiveLog:
         """Write what was just held, or all that is held if the disk refused it before."""
         if self._failing and time.monotonic() < self._retry_at:
             return
+        was_failing = self._failing
         try:
             if self._failing:
                 self._check_disk()
@@ -156,6 +158,8 @@ class LiveLog:
                 self._notices.append(Notice(OK, f"{self._root} can be written again"))
                 self._log.complete_what_was_cut()
         self._let_go()
+        if was_failing and not self._failing:
+            give_back()
 
     def _pour(self, items: Sequence[Held]) -> None:
         for is_message, run in groupby(items, lambda item: isinstance(item, EncodedMessage)):
