@@ -35,6 +35,7 @@ from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import Recovered, end_of_sound, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.machine import MachineWatch
+from hearthlog.recorder.memory import keep_one_heap
 from hearthlog.recorder.microphone_stream import MicrophoneStream
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.service_manager import ServiceManager
@@ -122,6 +123,7 @@ def record_microphones(
     ModelError, ConfigurationError
         As `record_files`.
     """
+    keep_one_heap()
     with ExitStack() as stack:
         lock = stack.enter_context(FolderLock(settings.output, settings.node))
         rest = settings.rest()
