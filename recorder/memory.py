@@ -4,12 +4,11 @@ import ctypes
 import gc
 from contextlib import suppress
 
-
 _ARENA_MAX = -8  # of malloc.h
 
 
 def keep_one_heap() -> None:
-    """Let all threads use one heap, where the C library can: those of others are never given back."""
+    """Let all threads use one heap, where the C library can: others are never given back."""
     with suppress(OSError, AttributeError):  # not every C library has it
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
