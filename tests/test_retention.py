@@ -248,7 +248,7 @@ def test_a_dry_run_says_what_would_go_and_why_and_deletes_nothing(logs, hearthlo
 @pytest.mark.parametrize("value", ["much", "-1", "5 apples", "1e9"])
 def test_a_size_that_is_none_is_refused_with_one_line(tmp_path, hearthlog, value):
     result = hearthlog("retain", "-o", tmp_path, f"--max-record-size={value}")
-    assert result.returncode == 1
+    assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert "max_record_size: say how many bytes, such as 500M or 20G" in line
 
