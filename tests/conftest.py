@@ -194,6 +194,18 @@ def real_day(all_household, tmp_path_factory) -> Path:
     return folder / "logs"
 
 
+USUAL_RIGHTS = os.umask(0o022)
+os.umask(USUAL_RIGHTS)
+
+
+@pytest.fixture(autouse=True)
+def usual_rights():
+    """Give files the usual rights again, where a recorder ran in this process."""
+    os.umask(USUAL_RIGHTS)
+    yield
+    os.umask(USUAL_RIGHTS)
+
+
 @pytest.fixture
 def refused(hearthlog):
     """Run a command that must fail with one line on stderr, and return that line."""

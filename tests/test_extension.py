@@ -141,7 +141,7 @@ def test_a_model_for_other_features_than_the_log_is_refused(installed, day, trai
     assert f"has features of set {DEFAULT.name}; model octaves is for octaves" in done.stderr
     asked = {"HEARTHLOG_FEATURE_SET": DEFAULT.name} | installed
     done = command(asked, "record", day, "--model", trained, "-o", tmp_path / "other")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert f"the model is for feature set octaves, not '{DEFAULT.name}'" in done.stderr
 
 

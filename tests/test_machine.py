@@ -34,7 +34,7 @@ def test_the_hottest_part_counts(sys, tmp_path):
     assert health.values["throttled"] == "0x0"
     assert health.values["clock_synchronized"] in {"yes", "no"}
     assert int(health.values["disk_free_bytes"]) > 0
-    assert 1e6 < int(health.values["memory_bytes"]) < 1e9
+    assert int(health.values["memory_bytes"]) > 1e6
 
 
 @pytest.mark.parametrize(
