@@ -100,7 +100,8 @@ def _recorder(folder: Path, lock: Path) -> Iterator[State]:
 def _of_status(status: _Status) -> Iterator[State]:
     advice = ""
     if "device" in status.values and _LEVELS[status.level] == "error":
-        advice = "; look at its cable and power; `hearthlog devices` lists what is there"
+        joint = " " if status.text.endswith("?") else "; "
+        advice = f"{joint}look at its cable and power; `hearthlog devices` lists what is there"
     yield State(_LEVELS[status.level], status.subject, status.text + advice)
     if status.values.get(_NOT_SET[0]) == _NOT_SET[1]:
         text = "is not synchronized: connect the machine to the network, or give it a clock module"
