@@ -116,14 +116,7 @@ def load_model(path: Path) -> Model:
         printed, or if it is made for another feature set, or for a feature set or kind of
         classifier that is not installed.
     """
-    path = _starter(path) or _pointed_to(path)
-    if not path.stem.isprintable():
-        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
-    if path.suffix != SUFFIX and not os.path.lexists(path):
-        raise ModelError(
-            f"{path}: there is no such model file; the starter models are {' and '.join(STARTERS)}"
-        )
-    data = read_whole(path, "model file", _SIZE_LIMIT, ModelError)
+    path, data = _read(path)
     _check_header(path, data)
     try:
         arrays = load(data)
@@ -137,6 +130,35 @@ def load_model(path: Path) -> Model:
     common = {name: arrays.pop(name) for name in _COMMON if name in arrays}
     name, digest = path.stem, hashlib.sha256(data).hexdigest()
     return Model(description, arrays, **common, name=name, sha256=digest)
+
+
+def name_and_digest(path: Path) -> tuple[str, str]:
+    """Return what tells a model from others, `Model.name` and `Model.sha256`, without loading it.
+
+    Parameters
+    ----------
+    path : Path
+        As `load_model` takes it.
+
+    Raises
+    ------
+    ModelError
+        If the file is missing or larger than 64 MiB, or its name cannot be printed.
+    """
+    path, data = _read(path)
+    return path.stem, hashlib.sha256(data).hexdigest()
+
+
+def _read(path: Path) -> tuple[Path, bytes]:
+    """Return the file that is meant, and its content."""
+    path = _starter(path) or _pointed_to(path)
+    if not path.stem.isprintable():
+        raise ModelError(f"{str(path)!a}: give the model a name that can be printed")
+    if path.suffix != SUFFIX and not os.path.lexists(path):
+        raise ModelError(
+            f"{path}: there is no such model file; the starter models are {' and '.join(STARTERS)}"
+        )
+    return path, read_whole(path, "model file", _SIZE_LIMIT, ModelError)
 
 
 def _halved(array: Array) -> Array:

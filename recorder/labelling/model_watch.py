@@ -14,7 +14,7 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.judgement import judgement_path, read_judgement
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile.modelfile import load_model, name_and_digest
 from hearthlog.models.modelfile.registry import DEFAULT_MODEL
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.journal import say
@@ -146,6 +146,8 @@ class ModelWatch:
     def _look(self) -> None:
         self._awaited = self._judged = None
         try:
+            if name_and_digest(self._path) == (self._last.name, self._last.sha256):
+                return  # a second copy of it in memory would not all be given back
             loaded = load_checked(self._path)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the file, the recording goes on
             if file_identity(self._path) == self._seen:  # else it is still being written
@@ -156,8 +158,6 @@ class ModelWatch:
             self._refuse(f"it is for feature set {theirs}, not {ours}; start the recorder anew")
             return
         model = loaded.model
-        if (model.name, model.sha256) == (self._last.name, self._last.sha256):
-            return
         if model.sha256 != self._last.sha256 and (reason := self._unjudged(model)):
             self._refuse(reason, model.name)
             return
