@@ -11,11 +11,16 @@ import pytest
 from conftest import HEARTHLOG
 from logs import features
 
+from hearthlog.models.features.installed import DEFAULT
+from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.follow import follow
+from hearthlog.schemas.logs.follow import follow, follow_messages
 from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.mcap.raw_messages import in_order_of_time
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 
@@ -194,3 +199,47 @@ def test_a_recorder_is_followed_through_files_and_through_being_killed(tmp_path,
     assert recorded.count(0) == 3
     assert len(find_logs(logs)) > 4
     assert not list(logs.rglob("*.active"))
+
+
+def info(writer, time):
+    message = stream_info("mic", f"device at {time}", DEFAULT, None)
+    writer.write("/mic/info", time, message_types.encode(message))
+    writer.flush()
+
+
+def test_a_follower_that_comes_late_is_told_first_of_the_streams(tmp_path):
+    topics = [Topic(TOPIC, message_types.FEATURES), Topic("/mic/info", message_types.STREAM_INFO)]
+    writer = LogWriter(tmp_path / "home.mcap", topics, {})
+    info(writer, 5)
+    for block in range(50):
+        write(writer, 10 + 20 * block)
+    info(writer, 2000)
+    both = ["device at 5", "device at 2000"]
+    for start, devices in ((None, both), (2005, both), (600, both[:1])):
+        _, first = next(follow_messages(tmp_path, start=start, infos=True))
+        (columns,) = decode(first)
+        assert columns.topic == "/mic/info"
+        assert columns["device"].tolist() == devices
+    writer.abandon()
+
+
+def test_messages_of_several_channels_are_put_in_order_of_time(tmp_path):
+    topics = [Topic(f"/{name}/features", message_types.FEATURES) for name in ("one", "two")]
+    writer = LogWriter(tmp_path / "home.mcap", topics, {})
+    for topic, first in ((topics[0], 0), (topics[1], 1)):
+        times = np.arange(first, 200, 2)
+        fields = {
+            "header.stamp": times,
+            "header.frame_id": "mic",
+            "frame": times,
+            "values": np.zeros((100, 3), np.float32),
+        }
+        writer.write_columns([TopicBatch(topic.name, times, fields)])
+    writer.finish()
+    (parts,) = iterate_messages(find_logs(tmp_path))
+    ordered = list(in_order_of_time(parts))
+    assert [int(part.log_times[row]) for part, row in ordered] == list(range(200))
+    part, row = ordered[150]
+    message = message_types.decode(part.payload(row), part.schema.name)
+    assert message.frame == 150
+    assert list(in_order_of_time([])) == []

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from threading import Event
 
@@ -11,7 +11,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunks import read_in_batches
+from hearthlog.schemas.mcap.chunks import read_chunks, read_definitions, read_in_batches
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 
@@ -67,12 +67,14 @@ def _refuse(error: LogError) -> None:
     raise error
 
 
-def follow_messages(
+def follow_messages(  # noqa: PLR0913
     folder: Path,
     topics: Collection[str] | None = None,
     start: int | None = None,
     stop: Event | None = None,
     damaged: Damaged = _refuse,
+    *,
+    infos: bool = False,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     """Read the messages of logs, still encoded, as they are written; as `follow` does.
 
@@ -90,13 +92,16 @@ def follow_messages(
     damaged : callable
         Told the error of a log that is damaged, of which no more is read then; by default it is
         raised.
+    infos : bool
+        Whether the `AudioStreamInfo` messages of the logs that are being written come first, also
+        those that were written before.
 
     Yields
     ------
     path : Path
         A log.
     messages : list of RawMessages
-        What was written to it since the last time.
+        What was written to it since the last time, perhaps nothing.
 
     Raises
     ------
@@ -112,9 +117,10 @@ def follow_messages(
         finished = [path for path in present if not is_active(path)]
         yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if is_active(path) for g in _open(path)]
-    if start is None:
-        for log in growing:
-            log.file.scan_new()  # and forget what was written before
+    for log in growing if start is None else ():
+        log.file.scan_new()  # and forget what was written before
+    for log in growing if infos else ():
+        yield log.file.path, log.infos_before(start, damaged)
     try:
         while not stop.is_set():
             has_news = False
@@ -165,12 +171,31 @@ class _Growing:
             self._is_damaged = True
             damaged(error)
 
+    def infos_before(self, start: int | None, damaged: Damaged) -> list[RawMessages]:
+        """Read the descriptions of the streams that were written before a time, or before now."""
+        messages: list[RawMessages] = []
+        for log in _open(self.file.path):
+            with closing(log.file) as file:
+                try:
+                    messages = _read_infos(file)
+                except LogError as error:
+                    damaged(error)
+        return [m for m in (raw.between(None, start) for raw in messages) if len(m)]
+
     def is_open(self) -> bool:
         """Tell whether more may come; if not, close the log."""
         if self.file.ended or self._replaced or self._is_damaged:
             self.file.close()
             return False
         return True
+
+
+def _read_infos(file: LogFile) -> list[RawMessages]:
+    chunks = file.scan_new()
+    read_definitions(file)
+    topics = {number: channel.topic for number, channel in file.channels.items()}
+    of_infos = {number: name for number, name in topics.items() if name.endswith("/info")}
+    return read_chunks(file, file.with_channels(chunks, of_infos.keys()), of_infos.values())
 
 
 def _names(path: Path) -> tuple[Path, Path]:

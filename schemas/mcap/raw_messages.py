@@ -1,5 +1,6 @@
 """Messages of one channel, still encoded."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,17 @@ class RawMessages:
         """Log times in nanoseconds."""
         return self.heads["log_time"]
 
+    def payload(self, row: int) -> bytes:
+        """Return one message as it was written: CDR, with its header.
+
+        Parameters
+        ----------
+        row : int
+            Place among these messages.
+        """
+        start = int(self.offsets[row])
+        return self.buffer[start : start + int(self.sizes[row])].tobytes()
+
     def between(self, start: int | None, end: int | None) -> "RawMessages":
         """Select the messages with start <= log time < end.
 
@@ -52,6 +64,28 @@ class RawMessages:
         if rows == slice(0, len(self)):
             return self
         return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
+
+
+def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages, int]]:
+    """Go through the messages of several channels in the order of their log times.
+
+    Parameters
+    ----------
+    parts : sequence of RawMessages
+
+    Yields
+    ------
+    part : RawMessages
+        The channel of the next message.
+    row : int
+        Its place there.
+    """
+    times = [part.log_times for part in parts]
+    part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    rows = np.concatenate([np.arange(0), *(np.arange(len(part)) for part in parts)])
+    order = np.argsort(np.concatenate([np.arange(0), *times]), kind="stable")
+    for part, row in zip(part_of[order].tolist(), rows[order].tolist(), strict=True):
+        yield parts[part], row
 
 
 def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
