@@ -15,7 +15,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.review.viewer.process import free_port
+from hearthlog.analyzer.ports import free_port
 from hearthlog.tools.cli.main import app
 from hearthlog.tools.home.simulate import write_day, write_training_set
 

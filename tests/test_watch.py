@@ -22,6 +22,7 @@ from viewers import Window, address_of, display
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.ports import free_port
 from hearthlog.analyzer.review.timeline.live import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline.model import LogLines
 from hearthlog.analyzer.review.timeline.plots import FEATURES, FLOOR, LEVEL, NOVELTY, SHARES, Plot
@@ -33,7 +34,7 @@ from hearthlog.analyzer.review.timeline.state_lanes import (
     StateLane,
 )
 from hearthlog.analyzer.review.viewer.live import LiveServer
-from hearthlog.analyzer.review.viewer.process import ViewerProcess, free_port
+from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

@@ -78,8 +78,8 @@ def watch(
 
 
 def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "LiveServer":
+    from hearthlog.analyzer.ports import free_port, hidden_address
     from hearthlog.analyzer.review.viewer.live import PORT, LiveServer
-    from hearthlog.analyzer.review.viewer.process import free_port, hidden_address
 
     if bind is not None:
         return LiveServer(port or PORT, bind, minutes)

@@ -9,6 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour
+from hearthlog.analyzer.ports import free_port
 from hearthlog.analyzer.review.timeline.home_clock import home_clock
 from hearthlog.analyzer.review.timeline.live import Update
 from hearthlog.analyzer.review.timeline.model import LogLines
@@ -31,7 +32,6 @@ from hearthlog.analyzer.review.viewer.layout import (
     states_view,
     tabs,
 )
-from hearthlog.analyzer.review.viewer.process import free_port
 from hearthlog.schemas.times import NANOSECONDS
 
 PORT = 9876  # where Rerun's viewer looks for a server if it is not told

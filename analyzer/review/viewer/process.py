@@ -1,10 +1,8 @@
 """The program of Rerun's viewer as a process that only this machine reaches, without statistics."""
 
-import errno
 import json
 import os
 import re
-import secrets
 import socket
 import subprocess
 import sys
@@ -18,8 +16,8 @@ from typing import Self
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.ports import free_port, hidden_address
 
-HOST = "127.0.0.1"
 _WAIT_SECONDS = 60
 _STOP_SECONDS = 5
 _GRAPHICS_CARDS = ("dri/renderD*", "nvidia[0-9]*", "dxg")
@@ -42,59 +40,6 @@ def program() -> Path:
     if path is None or not path.exists():
         raise DataError(f"Rerun's viewer is not installed; {remedy('rerun_cli')}")
     return path
-
-
-def free_port(port: int | None = None, bind: str = HOST) -> int:
-    """Return a port on which this machine can listen.
-
-    Parameters
-    ----------
-    port : int, optional
-        The only one that will do; by default any.
-    bind : str, optional
-        Address to listen on, of IPv4 or IPv6.
-
-    Raises
-    ------
-    DataError
-        If nothing can listen there.
-    """
-    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
-    with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((bind, port or 0))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                raise DataError(
-                    f"port {port} is in use, perhaps by another viewer or watcher; choose another "
-                    "one with --port"
-                ) from error
-            raise DataError(
-                f"cannot listen on {bind}, port {port}: {error.strerror or error}"
-            ) from error
-        return int(probe.getsockname()[1])
-
-
-def hidden_address() -> str:
-    """Return an address of this machine that no web page can guess.
-
-    Rerun's servers answer whoever reaches them. A page in a browser reaches all of this machine, by
-    a name that it lets point there, but it would have to try 16 million addresses times some ten
-    thousand ports. Programs of this machine can look the address up.
-
-    Returns
-    -------
-    str
-        In 127.0.0.0/8; 127.0.0.1 on a system that has no other one, such as macOS.
-    """
-    address = ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
-    with socket.socket() as probe:
-        try:
-            probe.bind((address, 0))
-        except OSError:
-            return HOST
-    return address
 
 
 def hidden_options() -> str:

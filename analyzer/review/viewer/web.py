@@ -15,8 +15,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, cast
 
+from hearthlog.analyzer.ports import HOST, free_port
 from hearthlog.analyzer.review.viewer import messages
-from hearthlog.analyzer.review.viewer.process import HOST, ViewerProcess, free_port
+from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
 _POLL_SECONDS = 20.0
