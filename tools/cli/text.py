@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -12,6 +13,7 @@ from hearthlog.schemas.text import printable
 from hearthlog.schemas.times import millisecond_text
 
 _SHOWN = 10  # of a list
+_MOST_TOLD = 100  # that are remembered
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -28,6 +30,22 @@ def print_json(result: dict[str, Any]) -> None:
 def tell(text: str) -> None:
     """Write a line that is no result to standard error."""
     print(f"hearthlog: {printable(text)}", file=sys.stderr)
+
+
+class TellOnce:
+    """Tells what may come again and again, each text once."""
+
+    def __init__(self) -> None:
+        self._told: deque[str] = deque(maxlen=_MOST_TOLD)
+
+    def __call__(self, what: object) -> None:
+        """Tell it, unless it was told of late."""
+        if str(what) not in self._told:
+            self._told.append(str(what))
+            tell(str(what))
+
+    def __bool__(self) -> bool:
+        return bool(self._told)
 
 
 def wrong_use(message: str) -> NoReturn:

@@ -1,7 +1,6 @@
 """`hearthlog watch`: what is heard, live, from the log that a recorder is writing."""
 
 import signal
-from collections import deque
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Event, Thread
@@ -10,15 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hearthlog.tools.cli.browser import show_page
-from hearthlog.tools.cli.options import Timezone
-from hearthlog.tools.cli.text import tell, wrong_use
+from hearthlog.tools.cli.foxglove import show_in_foxglove
+from hearthlog.tools.cli.options import Timezone, parse_span
+from hearthlog.tools.cli.text import TellOnce, tell, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.review.viewer.live import LiveServer
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _POLL_SECONDS = 0.2
-_MOST_TROUBLES = 100  # that are remembered, so that none is said again and again
+_MINUTES = 5
 
 
 def watch(
@@ -28,6 +28,9 @@ def watch(
     serve: Annotated[
         bool, typer.Option("--serve", help="Open no viewer here: wait for those that connect.")
     ] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Wait for Foxglove or Lichtblick instead of Rerun.")
+    ] = False,
     port: Annotated[
         int | None,
         typer.Option(min=1, max=65535, help="Where viewers connect, or, with --web, of the page."),
@@ -35,29 +38,85 @@ def watch(
     bind: Annotated[
         str | None,
         typer.Option(
-            help="With --serve: address of this machine to listen on; by default one of loopback "
-            "that nobody guesses."
+            help="With --serve or --foxglove: address of this machine to listen on; by default one "
+            "of loopback, with --serve one that nobody guesses."
         ),
     ] = None,
-    minutes: Annotated[int, typer.Option(min=1, max=120, help="How much is shown.")] = 5,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            help="With --foxglove: page that may look too, as https://lichtblick.example."
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="With --foxglove: play what was recorded from this log time on, as "
+            "2026-03-01T07:00 (UTC unless it says otherwise)."
+        ),
+    ] = None,
+    end: Annotated[
+        str | None,
+        typer.Option(help="With --foxglove: play what was recorded before this log time."),
+    ] = None,
+    minutes: Annotated[
+        int | None,
+        typer.Option(min=1, max=120, help="How much is shown.", show_default=str(_MINUTES)),
+    ] = None,
     timezone: Timezone = None,
 ) -> None:
-    """Show in Rerun what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.
+    """Show what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.
 
     The recorder takes no notice: only its logs are read. Exit status 3: some could not be read.
     """
     if web and serve:
         wrong_use("--web opens a viewer here, --serve opens none: choose one")
-    if bind is not None and not serve:
-        wrong_use("--bind goes with --serve")
+    if bind is not None and not (serve or foxglove):
+        wrong_use("--bind goes with --serve or --foxglove")
+    if foxglove:
+        _check_given("does not go with", web=web, serve=serve, minutes=minutes, timezone=timezone)
+    else:
+        _check_given("goes with", origin=origin, start=start, end=end)
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
 
-    from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.timeline.live import last_time
 
     newest = last_time(logs)
+    if newest is None and start is None and end is None:
+        tell(f"no log in {logs} yet; waiting for a recorder")
+    if foxglove:
+        span = parse_span(start, end)
+        troubled = show_in_foxglove(logs, port, bind, origin, span, stop)
+    else:
+        shown = (port, bind, minutes or _MINUTES, timezone)
+        troubled = _show_in_rerun(logs, newest, *shown, stop, web=web, serve=serve)
+    if troubled:
+        raise typer.Exit(3)
+
+
+def _check_given(how: str, **options: object) -> None:
+    for name, value in options.items():
+        if value:
+            wrong_use(f"--{name} {how} --foxglove")
+
+
+def _show_in_rerun(
+    logs: Path,
+    newest: int | None,
+    port: int | None,
+    bind: str | None,
+    minutes: int,
+    timezone: str | None,
+    stop: Event,
+    *,
+    web: bool,
+    serve: bool,
+) -> bool:
+    """Draw what is written until it is enough; tell whether something could not be read."""
+    from hearthlog.analyzer.logs.local_time import home_zone
+
     home_zone(timezone)
     with ExitStack() as opened:
         server = opened.enter_context(_server(port, bind, minutes, web=web))
@@ -67,14 +126,11 @@ def watch(
         else:
             viewer = opened.enter_context(_open(server.url, port, web=web))
             Thread(target=_wait_until_closed, args=(viewer, stop), daemon=True).start()
-        if newest is None:
-            tell(f"no log in {logs} yet; waiting for a recorder")
         start = 0 if newest is None else newest - minutes * 60_000_000_000
         troubled = _follow(logs, start, timezone, server, stop)
         if viewer is not None:
             viewer.check()
-    if troubled:
-        raise typer.Exit(3)
+    return troubled
 
 
 def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "LiveServer":
@@ -129,20 +185,14 @@ def _follow(
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 
-    told: deque[str] = deque(maxlen=_MOST_TROUBLES)
-
-    def tell_once(error: LogError) -> None:
-        if str(error) not in told:
-            told.append(str(error))
-            tell(str(error))
-
+    damaged = TellOnce()
     live, zone = LiveTimeline(), None
-    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=tell_once):
+    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=damaged):
         zone = zone or zone_of([logs], timezone)
         try:
             server.show(live.take(path, batch), zone)
         except LogError as error:
-            tell_once(error)
+            damaged(error)
         if stop.is_set():
             break
-    return bool(told)
+    return bool(damaged)

@@ -1,0 +1,152 @@
+"""A gate before a server that answers everybody: who may not look gets nothing of it."""
+
+import asyncio
+import socket
+from asyncio import StreamReader, StreamWriter, Task
+from collections.abc import Callable
+from contextlib import suppress
+from threading import Thread
+from typing import Self
+
+from hearthlog.analyzer.foxglove.admission import Admission, RefusedError
+
+_HEAD_SECONDS, _CLOSE_SECONDS = 5, 1
+_LARGEST_HEAD = 8192  # bytes; also what is read ahead of a slow viewer
+_MOST_ASKING, _MOST_LOOKING = 32, 8  # connections at once
+_BLOCK = 1 << 16  # bytes
+_REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+_GONE_SECONDS = 30  # after which a viewer that answers nothing is given up
+
+Refused = Callable[[RefusedError], None]
+
+
+class Gate:
+    """Takes connections in a thread of its own, and pipes those that are admitted.
+
+    Parameters
+    ----------
+    listener : socket.socket
+        Where viewers connect; closed at the end.
+    behind : (str, int)
+        Address and port of the server.
+    admission : Admission
+    refused : callable
+        Told why somebody was refused, in the thread of the gate.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        behind: tuple[str, int],
+        admission: Admission,
+        refused: Refused,
+    ) -> None:
+        self._listener = listener
+        self._behind = behind
+        self._admission = admission
+        self._refused = refused
+        self._asking: set[Task[None]] = set()
+        self._looking: set[Task[None]] = set()
+        self._loop = asyncio.new_event_loop()
+        self._thread = Thread(target=self._run, name="gate", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        with self._listener:
+            self._listener.setblocking(False)
+            accepting = self._loop.create_task(self._accept())
+            self._loop.run_forever()
+            tasks = {accepting, *self._asking, *self._looking}
+            for task in tasks:
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.close()
+
+    async def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = await self._loop.sock_accept(self._listener)
+            except OSError:  # too many files are open, or it was gone already
+                await asyncio.sleep(1)
+                continue
+            if len(self._asking) >= _MOST_ASKING:
+                connection.close()
+                continue
+            task = self._loop.create_task(self._take(connection))
+            self._asking.add(task)
+            task.add_done_callback(self._asking.discard)
+            task.add_done_callback(self._looking.discard)
+
+    async def _take(self, connection: socket.socket) -> None:
+        """Serve one who connects, from the request to the end."""
+        _give_up_the_gone(connection)
+        reader, writer = await asyncio.open_connection(sock=connection, limit=_LARGEST_HEAD)
+        with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            try:
+                async with asyncio.timeout(_HEAD_SECONDS):
+                    head = await reader.readuntil(b"\r\n\r\n")
+                await self._lead_on(self._admitted(head), reader, writer)
+            except RefusedError as error:
+                self._refused(error)
+                writer.write(_REFUSAL)
+                await _close(writer)
+            finally:
+                writer.transport.abort()
+
+    def _admitted(self, head: bytes) -> bytes:
+        head = self._admission.check(head)
+        if len(self._looking) >= _MOST_LOOKING:
+            raise RefusedError(f"refused: {_MOST_LOOKING} viewers are looking; close one")
+        task = asyncio.current_task()
+        assert task is not None
+        self._looking.add(task)
+        self._asking.discard(task)
+        return head
+
+    async def _lead_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
+        """Pipe between a viewer and the server, until one of them ends."""
+        inner_reader, inner_writer = await asyncio.open_connection(*self._behind)
+        inner_writer.write(head)
+        ways = (_pipe(reader, inner_writer), _pipe(inner_reader, writer))
+        tasks = [self._loop.create_task(way) for way in ways]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            inner_writer.transport.abort()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        await _close(writer)
+
+
+async def _close(writer: StreamWriter) -> None:
+    """End a connection when what was written last is sent."""
+    writer.close()
+    async with asyncio.timeout(_CLOSE_SECONDS):
+        await writer.wait_closed()
+
+
+async def _pipe(reader: StreamReader, writer: StreamWriter) -> None:
+    """Copy until one side ends; who reads slowly lets the other wait, and nothing piles up."""
+    while block := await reader.read(_BLOCK):
+        writer.write(block)
+        await writer.drain()
+
+
+def _give_up_the_gone(connection: socket.socket) -> None:
+    """Let the system end a connection whose other end vanished, such as a laptop that sleeps."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        ("TCP_KEEPIDLE", _GONE_SECONDS),
+        ("TCP_USER_TIMEOUT", _GONE_SECONDS * 1000),
+    ):
+        if hasattr(socket, option):  # not everywhere
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
