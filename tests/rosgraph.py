@@ -1,0 +1,90 @@
+"""A ROS 2 beside the tests: nodes of hearthlog, and others that listen to them."""
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from logreader import LogReader
+
+from hearthlog.schemas.logs.files import find_logs
+
+_ROOT = Path(__file__).parents[1]
+DISTRIBUTIONS = ("jazzy", "kilted")
+LISTEN = _ROOT / "tests" / "ros" / "listen.py"
+
+
+class Ros:
+    """One distribution, in a domain of its own."""
+
+    def __init__(self, distribution, domain):
+        self.setup = _ROOT / "build" / "ros" / distribution / "ros.sh"
+        if not self.setup.exists():
+            if os.environ.get("TESTS_REQUIRE_ROS"):
+                pytest.fail(f"no ROS 2 {distribution}: run .ci/ros {distribution}")
+            pytest.skip(f"needs a ROS 2: .ci/ros {distribution}")
+        self.environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+        self.environment.pop("PYTHONPATH", None)
+
+    def start(self, *command, **options):
+        """Start a command of this ROS."""
+        line = f". {shlex.quote(str(self.setup))} && exec {shlex.join(map(str, command))}"
+        environment = self.environment | options.pop("env", {})
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} | options
+        return subprocess.Popen(["bash", "-c", line], env=environment, text=True, **pipes)
+
+    def node(self, executable, *, remap=(), env=None, **parameters):
+        """Start a node of hearthlog."""
+        place = self.setup.parent / "install" / "hearthlog_ros" / "lib" / "hearthlog_ros"
+        given = [f"{name}:={value}" for name, value in parameters.items()]
+        return self.start(
+            place / executable,
+            "--ros-args",
+            *(word for each in given for word in ("-p", each)),
+            *remap,
+            env=env or {},
+        )
+
+
+def end(process, number=signal.SIGTERM):
+    """Ask a process to end; give what it has printed."""
+    process.send_signal(number)
+    try:
+        return process.communicate(timeout=20)[0]
+    finally:
+        process.kill()
+        process.stdout.close()
+
+
+@contextmanager
+def listener(ros, output, topics, depth="1000"):
+    """Subscribe to topics; `types` of it then has the hashes of their types."""
+    names = [word for pair in topics.items() for word in pair]
+    process = ros.start("python", LISTEN, output, depth, *names)
+    try:
+        assert process.stdout.readline() == "listening\n"
+        yield process
+        process.hashes = json.loads(end(process).splitlines()[-1])
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def arrived(output):
+    """Give rows of topic, monotonic and wall time of arrival, and bytes."""
+    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    return [(topic, mono, wall, bytes.fromhex(data)) for topic, mono, wall, data in rows]
+
+
+def logged(folder):
+    """Give rows of topic, log time and bytes, padded as they are on the wire."""
+    return [
+        (item.topic, item.log_time, item.data + bytes(-len(item.data) % 4))
+        for log in find_logs(folder)
+        for item in LogReader(log).messages()
+    ]

@@ -1,0 +1,165 @@
+"""What a recorder writes is on the graph of ROS 2, as the bytes of its log."""
+
+import os
+import signal
+import subprocess
+import time
+from contextlib import contextmanager
+from itertools import count
+
+import pytest
+from conftest import HEARTHLOG
+from rosgraph import DISTRIBUTIONS, Ros, arrived, end, listener, logged
+
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import type_hash
+
+MESSAGES = "hearthlog_msgs/msg/Audio"
+STEADY = {f"/mic/{kind.lower()}": MESSAGES + kind for kind in ("Features", "Label")}
+TOPICS = STEADY | {
+    "/mic/info": message_types.STREAM_INFO,
+    "/mic/statistics": message_types.STATISTICS,
+    "/mic/segment": message_types.SEGMENT,
+    "/mic/gap": message_types.GAP,
+    "/diagnostics": message_types.DIAGNOSTICS,
+    "/rosout": "rcl_interfaces/msg/Log",
+}
+_domains = count(10 + 40 * (os.getpid() % 4))
+
+
+@pytest.fixture(params=DISTRIBUTIONS)
+def ros(request):
+    return Ros(request.param, next(_domains) % 100)
+
+
+@contextmanager
+def microphone_recorder(labmic, logs, *more, model="general"):
+    """Record a virtual microphone."""
+    command = [*HEARTHLOG, "record", "-o", logs, "--device", labmic.device, "--model", model]
+    command += ["--max-bag-duration", "15", *more]
+    quiet = {"stderr": subprocess.DEVNULL}
+    with subprocess.Popen(list(map(str, command)), env=labmic.env, **quiet) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic, tmp_path):
+    logs, output, at_sensor = tmp_path / "logs", tmp_path / "all", tmp_path / "sensor"
+    labels = {"/mic/label": TOPICS["/mic/label"]}
+    with ros.node("live", folder=logs) as node:
+        with (
+            listener(ros, output, TOPICS) as everything,
+            listener(ros, at_sensor, labels, depth="sensor"),
+        ):
+            assert "is not there yet; waiting for a recorder" in node.stdout.readline()
+            with microphone_recorder(labmic, logs) as recorder:
+                time.sleep(12)
+                labmic.unplug()
+                time.sleep(6)
+                labmic.restore()
+                time.sleep(22)
+                recorder.send_signal(signal.SIGTERM)
+                recorder.wait()
+            time.sleep(2)
+        assert end(node) == ""
+    assert len(list(logs.rglob("*.mcap"))) > 1
+    rows, log = arrived(output), logged(logs)
+    rows = [row for row in rows if b"\0hearthlog_live\0" not in row[-1]]  # its own lines
+    for topic in TOPICS:
+        got = [data for name, _, _, data in rows if name == topic]
+        assert got == [data for name, _, data in log if name == topic], topic
+    assert {name for name, *_ in rows} == TOPICS.keys()
+    expected = {topic: type_hash(name) for topic, name in TOPICS.items()}
+    assert {topic: ends[0][0] for topic, ends in everything.hashes.items()} == expected
+    steady = [mono for name, mono, *_ in arrived(at_sensor)]
+    assert len(steady) == sum(name == "/mic/label" for name, *_ in log)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_path):
+    with microphone_recorder(labmic, tmp_path / "logs"):
+        for seconds in (1.0, 2.0, 4.0):
+            with ros.node("live", folder=tmp_path / "logs", delay=0.0) as node:
+                time.sleep(seconds)
+                said = end(node, number)
+                assert node.returncode == 0, said
+                assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("executable", "parameters", "environment", "line"),
+    [
+        ("live", {"delay": 90.0}, {}, "delay: from 0 to 60 seconds, not 90"),
+        ("live", {}, {"ROS_DOMAIN_ID": "home"}, "ROS_DOMAIN_ID is not an integral number"),
+        ("label", {}, {}, "name a model: --ros-args -p model:=general, or a model file"),
+        ("label", {"model": "no.safetensors"}, {}, "no.safetensors: no such model file"),
+        ("label", {"model": "general", "microphone": "Küche"}, {}, "microphone name 'Küche'"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(ros, executable, parameters, environment, line):
+    with ros.node(executable, env=environment, **parameters) as node:
+        said = node.communicate(timeout=30)[0]
+    assert said.startswith("hearthlog_ros: ")
+    assert line in said
+    assert said.count("\n") == 1
+    assert node.returncode == 1
+
+
+def test_features_of_another_set_are_not_labelled(ros, labmic, tmp_path):
+    (tmp_path / "home.toml").write_text('feature_set = "auros21"\nmodel = "none"\n')
+    more = ["--config", tmp_path / "home.toml"]
+    with (
+        microphone_recorder(labmic, tmp_path / "logs", *more, model="none"),
+        ros.node("live", folder=tmp_path / "logs") as live,
+        ros.node("label", model="general") as label,
+    ):
+        said = label.communicate(timeout=60)[0]
+        end(live)
+    assert "general is for feature set home33; /mic/features has auros21" in said
+    assert label.returncode == 1
+
+
+def test_a_microphone_is_labelled_under_one_name_only_once(ros, labmic, tmp_path):
+    with (
+        microphone_recorder(labmic, tmp_path / "logs"),
+        ros.node("live", folder=tmp_path / "logs") as live,
+        ros.node("label", model="general") as label,
+    ):
+        said = label.communicate(timeout=60)[0]
+        end(live)
+    assert "/mic/label is published by hearthlog_live already" in said
+    assert label.returncode == 1
+
+
+def test_features_are_labelled_elsewhere_on_the_graph_as_the_recorder_labels_them(
+    ros, labmic, tmp_path
+):
+    logs, output = tmp_path / "logs", tmp_path / "labels"
+    topics = {name: TOPICS[name] for name in ("/mic/label", "/mic/segment")}
+    elsewhere = {f"/elsewhere{name}": kind for name, kind in topics.items()}
+    renamed = [word for name in topics for word in ("-r", f"{name}:=/elsewhere{name}")]
+    with (
+        ros.node("live", folder=logs) as live,
+        ros.node("label", model="general", remap=renamed) as label,
+    ):
+        assert "waiting for a recorder" in live.stdout.readline()
+        with listener(ros, output, elsewhere | {"/mic/label_info": TOPICS["/mic/info"]}):
+            with microphone_recorder(labmic, logs) as recorder:
+                time.sleep(10)
+                labmic.unplug()
+                time.sleep(6)
+                labmic.restore()
+                time.sleep(10)
+                recorder.send_signal(signal.SIGTERM)
+                recorder.wait()
+            time.sleep(7)
+        assert (end(label), end(live)) == ("", "")
+    rows, log = arrived(output), logged(logs)
+    for topic in topics:
+        got = [data for name, _, _, data in rows if name == f"/elsewhere{topic}"]
+        assert got == [data for name, _, data in log if name == topic], topic
+        assert got
+    (info,) = [data for name, *_, data in rows if name == "/mic/label_info"]
+    assert message_types.decode(info, message_types.STREAM_INFO).model == "general"
