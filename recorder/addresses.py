@@ -1,11 +1,14 @@
 """Addresses of sound in the network, and the names under which the log has them."""
 
 import re
-from urllib.parse import urlsplit
+from typing import NamedTuple
+from urllib.parse import parse_qsl, urlsplit
 
 from hearthlog.recorder.errors import SourceError
+from hearthlog.schemas.frames import SAMPLE_RATE
 
 _SCHEMES = ("rtsp", "http", "https")
+_TOPIC_SCHEME = "ros2"
 _MOST_CHARACTERS = 2000
 
 
@@ -14,13 +17,59 @@ def is_address(device: str) -> bool:
     return "://" in device
 
 
+class TopicAddress(NamedTuple):
+    """A topic of ROS 2 on which sound is published.
+
+    `rate` (Hz) and `channels` are those of messages that do not say so themselves.
+    """
+
+    topic: str
+    rate: int = SAMPLE_RATE
+    channels: int = 1
+
+    @property
+    def name(self) -> str:
+        """The address, without these."""
+        return f"{_TOPIC_SCHEME}://{self.topic}"
+
+
+def is_topic(device: str) -> bool:
+    """Return whether a device is a topic of ROS 2."""
+    return device.startswith(f"{_TOPIC_SCHEME}://")
+
+
+def read_topic(address: str) -> TopicAddress:
+    """Read the address of a topic.
+
+    Parameters
+    ----------
+    address : str
+        Such as "ros2:///robot/audio?rate=48000&channels=4".
+
+    Raises
+    ------
+    SourceError
+        If it is none.
+    """
+    form = "write it as ros2:///robot/audio, or ros2:///robot/audio?rate=48000&channels=4"
+    topic, _, parameters = address.removeprefix(f"{_TOPIC_SCHEME}://").partition("?")
+    if not re.fullmatch(r"(/[A-Za-z_]\w*)+", topic, re.ASCII) or len(address) > _MOST_CHARACTERS:
+        raise SourceError(f"{address[:80]!r} names no topic of ROS 2; {form}")
+    given = dict(parse_qsl(parameters, keep_blank_values=True))
+    if not given.keys() <= {"rate", "channels"} or not all(
+        re.fullmatch(r"[1-9]\d{0,5}", text, re.ASCII) for text in given.values()
+    ):
+        raise SourceError(f"{address[:80]!r} has other parameters than rate and channels; {form}")
+    return TopicAddress(topic, **{name: int(text) for name, text in given.items()})
+
+
 def check_address(address: str) -> None:
     """Check what can be known of an address without the network.
 
     Parameters
     ----------
     address : str
-        Such as "rtsp://user:password@camera/stream".
+        Such as "rtsp://user:password@camera/stream" or "ros2:///robot/audio".
 
     Raises
     ------
@@ -33,11 +82,14 @@ def check_address(address: str) -> None:
             "the address of a microphone has a space or a line break, or more than "
             f"{_MOST_CHARACTERS} characters; write a space as %20"
         )
+    if is_topic(address):
+        read_topic(address)
+        return
     scheme = address.partition("://")[0]
     if scheme not in _SCHEMES:
         raise SourceError(
             f"{scheme[:16]!r} is no address of sound that is taken; "
-            "such begin with rtsp://, http:// or https://"
+            "such begin with rtsp://, http://, https:// or ros2://"
         )
     if not _has_host(address):
         raise SourceError(
@@ -72,6 +124,8 @@ def public_name(device: str) -> str:
     """
     if not is_address(device):
         return device
+    if is_topic(device):
+        return device.partition("?")[0]
     scheme, _, rest = device.partition("://")
     place = re.split(r"[/?#]", rest, maxsplit=1)[0]
     path = rest.removeprefix(place)

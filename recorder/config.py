@@ -63,8 +63,8 @@ class MicrophoneSettings(BaseModel):
     )
     device: str = Field(
         default="",
-        description="As `hearthlog devices` lists it, or an rtsp:// or http:// address; empty: "
-        "the default one.",
+        description="As `hearthlog devices` lists it, or an rtsp://, http:// or ros2:// address; "
+        "empty: the default one.",
     )
     fallback: str = Field(
         default="", description="A device that is heard while that one is not there; empty: none."

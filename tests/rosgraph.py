@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,14 @@ from logreader import LogReader
 from hearthlog.schemas.logs.files import find_logs
 
 _ROOT = Path(__file__).parents[1]
+_domains = count(10 + 20 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 4))
 DISTRIBUTIONS = ("jazzy", "kilted")
 LISTEN = _ROOT / "tests" / "ros" / "listen.py"
+
+
+def next_domain():
+    """Give a domain in which no other test is."""
+    return next(_domains)
 
 
 class Ros:

@@ -1,15 +1,13 @@
 """What a recorder writes is on the graph of ROS 2, as the bytes of its log."""
 
-import os
 import signal
 import subprocess
 import time
 from contextlib import contextmanager
-from itertools import count
 
 import pytest
 from conftest import HEARTHLOG
-from rosgraph import DISTRIBUTIONS, Ros, arrived, end, listener, logged
+from rosgraph import DISTRIBUTIONS, Ros, arrived, end, listener, logged, next_domain
 
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import type_hash
@@ -24,12 +22,11 @@ TOPICS = STEADY | {
     "/diagnostics": message_types.DIAGNOSTICS,
     "/rosout": "rcl_interfaces/msg/Log",
 }
-_domains = count(10 + 40 * (os.getpid() % 4))
 
 
 @pytest.fixture(params=DISTRIBUTIONS)
 def ros(request):
-    return Ros(request.param, next(_domains) % 100)
+    return Ros(request.param, next_domain())
 
 
 @contextmanager

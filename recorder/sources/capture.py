@@ -39,6 +39,7 @@ class CaptureFormat:
     identity: str  # of the device: what it is asked for by when it is plugged in again
     rate: int
     stale_seconds: float = 3.0  # without a block, after which none will come
+    lost_reason: str = ""  # why samples are in no block; empty: the recorder was too slow
 
 
 def main() -> None:

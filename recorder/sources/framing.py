@@ -83,6 +83,7 @@ class Framer:
         self._steady = 0  # blocks in a row that came when expected
         self._was_steady = False
         self._lost = 0  # samples that the sound card lost, which its driver did not count
+        self._lost_reason = ""
         self._origin = 0  # index of the first sample since the last loss
         self._framed = 0  # samples at 16 kHz that became frames since then
         self._cutter = FrameCutter()
@@ -97,7 +98,7 @@ class Framer:
         """Stamp of the last frame in nanoseconds of UTC; 0 before the first one."""
         return self._last_stamp
 
-    def begin(self, rate: int, wall_offset: int, reason: str) -> None:
+    def begin(self, rate: int, wall_offset: int, reason: str, lost_reason: str = "") -> None:
         """Start anew with another capture process.
 
         Parameters
@@ -108,8 +109,11 @@ class Framer:
             CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
         reason : str
             Why there was no sound in between.
+        lost_reason : str
+            Why blocks may not follow each other; by default the recorder was too slow.
         """
         self._rate = float(rate)
+        self._lost_reason = lost_reason or "the recorder was too slow"
         self._clock = SampleClock(rate)
         self._expected = self._lost = self._steady = 0
         self._restart(0, reason)
@@ -142,7 +146,7 @@ class Framer:
             At most one `Frames`, after the gap before it, if there is one.
         """
         if block.index != self._expected:
-            self._restart(block.index + self._lost, "the recorder was too slow")
+            self._restart(block.index + self._lost, self._lost_reason)
         self._expected = block.index + len(block.samples)
         taken = block.taken_at(self._rate)
         missing = self._missing_before(block, taken)

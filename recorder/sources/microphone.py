@@ -8,13 +8,13 @@ from threading import Event as Flag
 import numpy as np
 
 from hearthlog.models.features.floor import decibels
-from hearthlog.recorder.addresses import check_address, is_address, public_name
+from hearthlog.recorder.addresses import check_address, is_address, is_topic, public_name
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import ERROR, OK, WARNING, Event, Frames, Gap, SourceHealth
 from hearthlog.recorder.rest import Rest
 from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import Framer
-from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess
+from hearthlog.recorder.sources.process import Capture, CaptureProcess, NetworkProcess, check_ros
 from hearthlog.recorder.sources.return_watch import ReturnWatch
 from hearthlog.recorder.sources.sound_cards import cards_change
 from hearthlog.recorder.sources.wall_clock import WallClock
@@ -41,11 +41,14 @@ def check_device(device: str) -> None:
     Raises
     ------
     SourceError
-        If it is an address that cannot be one of sound, or for which ffmpeg is not there.
+        If it is an address that cannot be one of sound, or for which ffmpeg or ROS is not there.
     """
     if is_address(device):
         check_address(device)
-        check_ffmpeg()
+        if is_topic(device):
+            check_ros()
+        else:
+            check_ffmpeg()
 
 
 class MicrophoneSource:
@@ -155,8 +158,9 @@ class MicrophoneSource:
         self, capture: Capture, reason: str, stop: Flag
     ) -> Generator[Event, None, str]:
         """Yield the events of one run of the capture process; return why it ended."""
-        self._framer.begin(capture.format.rate, self._wall_offset, reason)
-        stale = capture.format.stale_seconds
+        form = capture.format
+        self._framer.begin(form.rate, self._wall_offset, reason, form.lost_reason)
+        stale = form.stale_seconds
         last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
             try:

@@ -5,11 +5,14 @@ import json
 import os
 import select
 import subprocess
+import sys
 import time
+from importlib.util import find_spec
 from threading import Event as Flag
 
 import numpy as np
 
+from hearthlog.recorder.addresses import is_topic
 from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.modules import module_command
 from hearthlog.recorder.sources.capture import BLOCK, CaptureFormat
@@ -18,6 +21,7 @@ from hearthlog.recorder.sources.framing import SampleBlock
 
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
 _NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.network_capture")
+_TOPIC_CAPTURE = module_command("hearthlog.recorder.sources.topic_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: how far the recorder may be behind
@@ -51,6 +55,22 @@ def query_devices() -> list[Device]:
     if "error" in devices:
         raise SourceError(devices["error"])
     return [Device(**device) for device in devices]
+
+
+def check_ros() -> None:
+    """Check that there is a ROS 2 for this Python.
+
+    Raises
+    ------
+    SourceError
+        If there is none; it says how to get it.
+    """
+    if find_spec("rclpy") is None:
+        raise SourceError(
+            f"there is no rclpy for {sys.executable}, which hears topics of ROS 2: source "
+            "/opt/ros/jazzy/setup.bash before the start, or that of your ROS 2; a virtual "
+            "environment must be made by the Python of ROS, with --system-site-packages"
+        )
 
 
 class _Process:
@@ -204,8 +224,12 @@ class NetworkProcess(_Process):
 
     def __init__(self, address: str, stop: Flag) -> None:
         pipe = subprocess.PIPE
-        process = subprocess.Popen(  # noqa: S603  our own module
-            _NETWORK_CAPTURE, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0
+        process = subprocess.Popen(  # noqa: S603  our own modules
+            _TOPIC_CAPTURE if is_topic(address) else _NETWORK_CAPTURE,
+            stdin=pipe,
+            stdout=pipe,
+            stderr=pipe,
+            bufsize=0,
         )
         assert process.stdin is not None
         process.stdin.write(address.encode())

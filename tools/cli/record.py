@@ -50,7 +50,8 @@ def record(
     device: Annotated[
         str | None,
         typer.Option(
-            help="Microphone, as `hearthlog devices` lists it, or rtsp:// or http:// address."
+            help="Microphone, as `hearthlog devices` lists it, or an rtsp://, http:// or ros2:// "
+            "address."
         ),
     ] = None,
     name: Annotated[
