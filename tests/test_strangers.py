@@ -45,6 +45,13 @@ async function read(url, mode) {
   } catch (error) { found.error = String(error); }
   return found;
 }
+function look(url) {
+  return new Promise((resolve) => {
+    const socket = new WebSocket(url, ["foxglove.sdk.v1"]);
+    socket.onmessage = ({ data }) => { resolve({ url, text: String(data) }); socket.close(); };
+    socket.onclose = () => resolve({ url, text: "" });
+  }).catch((error) => ({ url, text: "", error: String(error) }));
+}
 </script>"""
 
 
@@ -172,3 +179,25 @@ def test_a_stranger_reads_nothing_of_what_is_watched_in_a_browser(logs, browser)
         patiently(lambda: listening(watcher), lambda places: len(places) == 4)
         check_hidden(browser, watcher, address)
         check_page(browser, address)
+
+
+def look(browser, urls):
+    """Let the page that is open connect as Foxglove does; return what it is told first."""
+    calls = f"Promise.all({json.dumps(urls)}.map(look))"
+    return {found["url"]: found["text"] for found in browser.wait_for(calls)}
+
+
+def test_a_stranger_is_told_nothing_by_the_server_for_foxglove(logs, browser):
+    port = free_port()
+    with watching(logs, "--foxglove", "--port", str(port)) as watcher:
+        address = watcher.stderr.readline().split()[-1]
+        behind = address.rpartition("/")[2]
+        for page in ("https://app.foxglove.dev/", f"http://localhost:{port}/"):
+            browser.open_as(page, SCRIPT)
+            assert '"hearthlog"' in look(browser, [address])[address]
+        ports = {place for _, place in listening(watcher)}
+        assert len(ports) == 2
+        for page in (f"http://{STRANGER}:{port}/", f"https://{STRANGER}/"):
+            browser.open_as(page, SCRIPT)
+            urls = [f"ws://{host}:{each}/{behind}" for host in HOSTS for each in ports]
+            assert set(look(browser, urls).values()) == {""}
