@@ -360,7 +360,7 @@ def test_what_can_be_read_in_two_ways_is_refused(change):
 def test_one_who_does_not_ask_as_a_viewer_gets_nothing(logs):
     with serving(logs) as (watcher, url):
         asked = head(url)
-        for request in (asked[:-2], b"x" * 100_000, asked[:-2] + b"A: " + b"x" * 20_000):
+        for request in (asked[:-2], b"x" * 100_000, asked[:-2] + b"A: " + b"x" * 40_000):
             assert exchange(url, request) == b""
         assert exchange(url, asked[:-2] + b"Ok\r\n\r\n").startswith(b"HTTP/1.1 403 ")
         assert ended(watcher) == 0
@@ -522,8 +522,9 @@ def test_only_what_was_asked_for_is_played(logs):
 
 
 def test_nothing_to_play_is_told(refused, logs):
-    line = refused("watch", logs, "--foxglove", "--start", "2027-01-01")
-    assert "nothing was recorded in this time" in line
+    for span in (("--start", "2027-01-01"), ("--end", "2020-01-01")):
+        line = refused("watch", logs, "--foxglove", *span)
+        assert line == "nothing was recorded in this time; `hearthlog info` tells what was"
 
 
 def test_what_a_later_version_wrote_passes_as_it_is(tmp_path):
@@ -608,6 +609,15 @@ def test_without_the_sdk_it_is_said_what_to_install(logs):
         "hearthlog: foxglove is not installed; try: pip install '.[foxglove]' in a clone of "
         "hearthlog\n"
     )
+
+
+def test_it_listens_by_ipv6_too(logs):
+    with serving(logs, "--bind", "::1") as (watcher, url):
+        assert url.startswith("ws://[::1]:")
+        with Viewer(url) as viewer:
+            viewer.wait_for("serverInfo")
+        assert ended(watcher) == 0
+    assert "ssh -L [::1]:" in "".join(watcher.lines)
 
 
 def test_who_listens_to_the_network_is_warned(logs):

@@ -11,9 +11,12 @@ from typing import Self
 from hearthlog.analyzer.foxglove.admission import Admission, RefusedError
 
 _HEAD_SECONDS, _CLOSE_SECONDS = 5, 1
-_LARGEST_HEAD = 8192  # bytes; also what is read ahead of a slow viewer
+_LARGEST_HEAD = 16384  # bytes: the cookies of all servers of this machine are in it
 _MOST_ASKING, _MOST_LOOKING = 32, 8  # connections at once
 _BLOCK = 1 << 16  # bytes
+_BUFFER = (
+    1 << 17
+)  # bytes that the system holds of what is on its way: seconds of sound, not minutes
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _GONE_SECONDS = 30  # after which a viewer that answers nothing is given up
 
@@ -87,7 +90,7 @@ class Gate:
 
     async def _take(self, connection: socket.socket) -> None:
         """Serve one who connects, from the request to the end."""
-        _give_up_the_gone(connection)
+        _configure(connection)
         reader, writer = await asyncio.open_connection(sock=connection, limit=_LARGEST_HEAD)
         with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             try:
@@ -114,6 +117,7 @@ class Gate:
     async def _lead_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:
         """Pipe between a viewer and the server, until one of them ends."""
         inner_reader, inner_writer = await asyncio.open_connection(*self._behind)
+        _configure(inner_writer.get_extra_info("socket"))
         inner_writer.write(head)
         ways = (_pipe(reader, inner_writer), _pipe(inner_reader, writer))
         tasks = [self._loop.create_task(way) for way in ways]
@@ -141,8 +145,10 @@ async def _pipe(reader: StreamReader, writer: StreamWriter) -> None:
         await writer.drain()
 
 
-def _give_up_the_gone(connection: socket.socket) -> None:
-    """Let the system end a connection whose other end vanished, such as a laptop that sleeps."""
+def _configure(connection: socket.socket) -> None:
+    """Keep little for a slow viewer, and give up one that vanished, as a laptop that sleeps."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (
         ("TCP_KEEPIDLE", _GONE_SECONDS),
