@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import shutil
 import struct
 from functools import partial
 
@@ -20,9 +21,11 @@ from spliced import raw_messages, run, small_disk, write_log
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import header, message, nanoseconds, time_message
+from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
 
 KINDS = ("features", "statistics", "label", "segment", "gap", "info")
@@ -331,6 +334,38 @@ def test_a_rosbag2_folder_is_opened_by_rosbags(recorded, exported):
             assert (time, data) == next(items)
             assert reader.deserialize(data, connection.msgtype).label
     assert next(items, None) is None
+
+
+def test_a_folder_of_logs_is_a_bag_as_it_lies(recorded, hearthlog, tmp_path):
+    logs = tmp_path / "logs"
+    shutil.copytree(recorded, logs)
+    whole = find_logs(logs)
+    cut = whole[0].with_name("home_20300101T000000Z.mcap.active")
+    cut.write_bytes(whole[0].read_bytes()[:-1000])
+    result = hearthlog("export", logs, "--format", "rosbag2", "--in-place")
+    assert (result.returncode, result.stdout) == (3, f"{logs / 'metadata.yaml'}\n")
+    assert result.stderr == f"hearthlog: not in the bag, for it is unfinished: {cut}\n"
+    (day,) = {log.parent for log in whole}
+    cut.unlink()
+    assert not hearthlog("export", day, "--format", "rosbag2", "--in-place").returncode
+    expected = sorted(row for log in whole for row in raw_messages(log))
+    with rosbag2.Reader(day) as bag:
+        assert bag.message_count == len(expected) == len(list(bag.messages()))
+    text = (logs / "metadata.yaml").read_text()
+    bag = json.loads(text.removeprefix("rosbag2_bagfile_information: "))
+    assert [logs / name for name in bag["relative_file_paths"]] == whole
+    assert bag["message_count"] == sum(file["message_count"] for file in bag["files"])
+
+
+def test_topics_that_differ_between_logs_are_no_bag(hearthlog, tmp_path):
+    for number, kind in enumerate((message_types.FEATURES, message_types.LABEL)):
+        writer = LogWriter(tmp_path / f"home_{number}.mcap", [Topic("/mic/a", kind)], {})
+        writer.write("/mic/a", 5, b"")
+        writer.finish()
+    result = hearthlog("export", tmp_path, "--format", "rosbag2", "--in-place")
+    assert result.returncode == 1
+    assert "/mic/a is of different types or qualities of service in home_0.mcap" in result.stderr
+    assert not (tmp_path / "metadata.yaml").exists()
 
 
 def test_a_ros_1_bag_holds_the_same_values(recorded, exported):

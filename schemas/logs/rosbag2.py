@@ -1,8 +1,9 @@
 """What rosbag2 wants to find in an MCAP file."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from hearthlog.schemas.messages.topics import Quality
 
@@ -48,6 +49,24 @@ def channel_metadata(type_hash: str, quality: Quality) -> dict[str, str]:
     return {"offered_qos_profiles": json.dumps([profile]), "topic_type_hash": type_hash}
 
 
+class FileCounts(NamedTuple):
+    """What rosbag2 wants to know of one file of a bag."""
+
+    name: str  # relative to the folder of the bag
+    topics: Mapping[str, TopicCount]
+    span: tuple[int, int]  # first and last log time, in nanoseconds of UTC
+
+    @property
+    def times(self) -> dict[str, object]:
+        """When it begins, how long it lasts, and how many messages it has, in rosbag2's words."""
+        start, end = self.span
+        return {
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "duration": {"nanoseconds": end - start},
+            "message_count": sum(topic.messages for topic in self.topics.values()),
+        }
+
+
 def file_metadata(
     name: str, topics: Mapping[str, TopicCount], span: tuple[int, int]
 ) -> dict[str, str]:
@@ -67,28 +86,44 @@ def file_metadata(
     dict of str to str
         `serialized_metadata`, as JSON.
     """
-    start, end = span
-    times = {
-        "starting_time": {"nanoseconds_since_epoch": start},
-        "duration": {"nanoseconds": end - start},
-        "message_count": sum(topic.messages for topic in topics.values()),
-    }
-    information = {
+    return {"serialized_metadata": json.dumps(_information([FileCounts(name, topics, span)]))}
+
+
+def metadata_yaml(files: Sequence[FileCounts]) -> str:
+    """Return the `metadata.yaml` of a bag of some files.
+
+    Parameters
+    ----------
+    files : sequence of FileCounts
+        In the order of time, at least one; a topic is of one type and quality in all of them.
+    """
+    information = json.dumps(_information(files), ensure_ascii=False)  # JSON, which is YAML too
+    return f"rosbag2_bagfile_information: {information}\n"
+
+
+def _information(files: Sequence[FileCounts]) -> dict[str, object]:
+    topics: dict[str, TopicCount] = {}
+    for file in files:
+        for name, topic in file.topics.items():
+            earlier = topics.get(name)
+            messages = topic.messages + (0 if earlier is None else earlier.messages)
+            topics[name] = replace(topic, messages=messages)
+    start, end = min(file.span[0] for file in files), max(file.span[1] for file in files)
+    return {
         "version": 9,
         "storage_identifier": "mcap",
-        **times,
+        **FileCounts("", topics, (start, end)).times,
         "topics_with_message_count": [
-            {"topic_metadata": _topic_metadata(key, topic), "message_count": topic.messages}
-            for key, topic in topics.items()
+            {"topic_metadata": _topic_metadata(name, topic), "message_count": topic.messages}
+            for name, topic in topics.items()
         ],
         "compression_format": "",
         "compression_mode": "",
-        "relative_file_paths": [name],
-        "files": [{"path": name, **times}],
+        "relative_file_paths": [file.name for file in files],
+        "files": [{"path": file.name, **file.times} for file in files],
         "custom_data": {},
         "ros_distro": "",
     }
-    return {"serialized_metadata": json.dumps(information)}
 
 
 def _topic_metadata(name: str, topic: TopicCount) -> dict[str, object]:

@@ -19,13 +19,13 @@ def export(
     logs: Logs,
     *,
     output: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             "--output",
             "-o",
             help=f"File to make, {listed(_FILES)}; or, with --format, a folder.",
         ),
-    ],
+    ] = None,
     output_format: Annotated[
         str | None,
         typer.Option(
@@ -34,6 +34,14 @@ def export(
             f"{listed(_FOLDERS)}.",
         ),
     ] = None,
+    in_place: Annotated[
+        bool,
+        typer.Option(
+            "--in-place",
+            help="With --format rosbag2: make one bag of a folder of logs as they lie, by a "
+            "metadata.yaml in it.",
+        ),
+    ] = False,
     topics: Topics = None,
     start: Start = None,
     end: End = None,
@@ -47,6 +55,13 @@ def export(
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.tools.cli.progress import share_done
 
+    if in_place:
+        if output_format != "rosbag2" or output or topics or start or end:
+            wrong_use("--in-place goes with --format rosbag2, and with nothing else")
+        _describe_as_bag(logs)
+        return
+    if output is None:
+        wrong_use("name what to make: --output FILE, or --output FOLDER with --format")
     suffix = output.suffix[1:]
     format_ = FORMATS.get(output_format or suffix)
     if format_ is None:
@@ -64,3 +79,16 @@ def export(
         save(selection, output, format_, progress, folder=not one_file)
     print(output)
     end_with_warnings(unfinished_lines(selection.unfinished))
+
+
+def _describe_as_bag(logs: list[Path]) -> None:
+    from hearthlog.analyzer.export.bag_in_place import describe_as_bag
+    from hearthlog.tools.cli.progress import share_done
+
+    if len(logs) != 1:
+        wrong_use("--in-place: name one folder of logs")
+    with share_done("reading") as progress:
+        metadata, unfinished = describe_as_bag(logs[0], progress)
+    print(metadata)
+    names = ", ".join(map(str, unfinished))
+    end_with_warnings([f"not in the bag, for it is unfinished: {names}"] if names else [])

@@ -1,0 +1,106 @@
+"""A folder of logs as one bag of rosbag2: what its `metadata.yaml` says, and no copy."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import find_logs, is_active, is_layer
+from hearthlog.schemas.logs.rosbag2 import FileCounts, TopicCount, metadata_yaml
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.storage.byte_ranges import is_local
+from hearthlog.schemas.storage.new_files import replaced_file
+
+METADATA = "metadata.yaml"
+
+
+def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> tuple[Path, list[Path]]:
+    """Write a `metadata.yaml` that makes one bag of all finished logs of a folder, or replace it.
+
+    Layers are left out: rosbag2 reads one file after the other.
+
+    Parameters
+    ----------
+    folder : Path
+        Logs may lie at any depth.
+    progress : callable
+        Is told the share that is done, 0 to 1.
+
+    Returns
+    -------
+    metadata : Path
+        The file.
+    unfinished : list of Path
+        Logs that were not completed, or have no messages; they are not in the bag.
+
+    Raises
+    ------
+    LogError
+        If there is no folder or no finished log in it, if a log is damaged, if a topic is of
+        different types or qualities of service, or if the file cannot be written.
+    """
+    if not (is_local(folder) and folder.is_dir()):
+        raise LogError(f"{folder}: is no folder of this machine; name that of the logs")
+    logs = [log for log in find_logs(folder) if not is_layer(log)]
+    counts, unfinished = [], []
+    for number, log in enumerate(logs):
+        progress(number / len(logs))
+        counted = None if is_active(log) else _count(log, folder)
+        if counted is None:
+            unfinished.append(log)
+        else:
+            counts.append(counted)
+    if not counts:
+        raise LogError(f"{folder}: no finished log is in this folder")
+    _check_topics(counts)
+    counts.sort(key=lambda file: file.span)
+    path = folder / METADATA
+    with replaced_file(path) as temporary:
+        temporary.write_text(metadata_yaml(counts), "utf-8")
+    return path, unfinished
+
+
+def _count(log: Path, folder: Path) -> FileCounts | None:
+    """Count the messages of a log by its index; None if it was not completed, or has none."""
+    with LogFile(log) as file:
+        statistics = file.statistics
+        if not file.complete or statistics is None or not statistics.message_count:
+            return None
+        topics: dict[str, TopicCount] = {}
+        for number, channel in file.channels.items():
+            schema = file.schemas.get(channel.schema_id)
+            if schema is None or not _is_of_ros(channel.metadata):
+                raise LogError(f"{log}: topic {channel.topic} is not described as rosbag2 needs it")
+            topic = topics.setdefault(channel.topic, TopicCount(schema.name, channel.metadata))
+            topic.messages += statistics.channel_message_counts.get(number, 0)
+        span = statistics.message_start_time, statistics.message_end_time
+        return FileCounts(log.relative_to(folder).as_posix(), topics, span)
+
+
+def _is_of_ros(metadata: dict[str, str]) -> bool:
+    try:
+        offered = json.loads(metadata["offered_qos_profiles"])
+    except (KeyError, ValueError, RecursionError):
+        return False
+    return isinstance(offered, list) and "topic_type_hash" in metadata
+
+
+def _check_topics(files: Sequence[FileCounts]) -> None:
+    """Check that every topic is the same in all files."""
+    known: dict[str, tuple[object, str]] = {}
+    for file in files:
+        for name, identity in _identities(file):
+            other, where = known.setdefault(name, (identity, file.name))
+            if other != identity:
+                raise LogError(
+                    f"{name} is of different types or qualities of service in {where} and "
+                    f"{file.name}, which rosbag2 has no way to say; export with --format rosbag2 "
+                    "and --output a part that is of one"
+                )
+
+
+def _identities(file: FileCounts) -> Iterator[tuple[str, object]]:
+    for name, topic in file.topics.items():
+        about = topic.channel_metadata
+        yield name, (topic.type, about["offered_qos_profiles"], about["topic_type_hash"])
