@@ -25,6 +25,7 @@ from test_interoperability import plain
 from test_typescript import FOLDER, like, need_node
 
 from hearthlog.analyzer.foxglove.admission import Admission, RefusedError
+from hearthlog.analyzer.foxglove.recording import Recording
 from hearthlog.analyzer.ports import free_port
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -519,6 +520,19 @@ def test_only_what_was_asked_for_is_played(logs):
         viewer.wait(lambda: {*own} <= {*viewer.messages()})
     extra = [each for each in viewer.messages() if each not in own]
     assert all(first - SECOND <= stamp < first for topic, stamp, _ in extra if topic != "/mic/info")
+
+
+def test_years_without_a_log_are_passed_over(logs, day, tmp_path):
+    shutil.copy(max(find_logs(logs)), tmp_path / "home_2.mcap")
+    command = [*HEARTHLOG, "record", day, "-o", tmp_path, "--start", "1970-01-01T00:01"]
+    subprocess.run(command, check=True)
+    recording = Recording(find_logs(tmp_path), None, None, pytest.fail)
+    read = []
+    recording._between = lambda *span: read.append(span) or iter(())
+    assert list(recording.messages(recording.start)) == []
+    assert len(read) == 2
+    for start, end in read:
+        assert any(start <= stamp < end for _, stamp, *_ in logged(tmp_path))
 
 
 def test_nothing_to_play_is_told(refused, logs):

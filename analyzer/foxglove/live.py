@@ -11,9 +11,7 @@ from hearthlog.schemas.logs.files import AUDIO_LAYER, log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import in_order_of_time
 
-_SUBSCRIBE_SECONDS = (
-    0.5  # that viewers have to ask for a new topic, or they miss what it says first
-)
+_SUBSCRIBE_SECONDS = 0.5  # that viewers have to ask for a new topic before it speaks
 _HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
 
 

@@ -117,8 +117,12 @@ class Recording:
         list of RawMessages
             Those of the next span of time; none is older than any that was yielded before.
         """
-        for first in range(start, self.end, _WINDOW):
-            yield from self._between(first, min(first + _WINDOW, self.end))
+        while start < self.end:
+            end = min(start + _WINDOW, self.end)
+            yield from self._between(start, end)
+            # Years may lie between two logs: a box without a clock begins in 1970.
+            later = (max(first, end) for first, last, _ in self._spans if last >= end)
+            start = min(later, default=self.end)
 
     def before(self, moment: int) -> list[tuple[RawMessages, int]]:
         """Read what is known at a moment.
