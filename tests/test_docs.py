@@ -35,6 +35,7 @@ CODE = re.compile(r"^(?P<fence>```)(?P<language>\w*)\n(?P<fenced>.*?)^```|`(?P<i
 # Options of dask, rerun, mcap, systemd and podman that pages name alone.
 FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--nthreads"} | {
     "--memory-limit",
+    "--base-paths",
     "--group-add",
     "--volume",
 }

@@ -9,6 +9,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/hearthlog_ros"]),
         ("share/hearthlog_ros", ["package.xml"]),
+        ("share/hearthlog_ros/config", ["config/diagnostics.yaml"]),
         ("share/hearthlog_ros/launch", ["launch/live.launch.py", "launch/label.launch.py"]),
     ],
     entry_points={
