@@ -3,7 +3,7 @@
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 _FOREVER = 9_223_372_036  # seconds: how rosbag2 writes that there is no lifespan
 _LOOK_SECONDS = 0.2
 _CHECK_SECONDS = 2.0
+_ARRIVAL_SECONDS = 0.5
 _BUILD = "colcon build --base-paths tools/ros && source install/setup.bash"
 
 
@@ -127,6 +128,20 @@ def own_hash(node: Node, topic: str) -> str:
         if end.node_name == node.get_name() and end.node_namespace == node.get_namespace():
             return str(end.topic_type_hash)
     return ""
+
+
+def wait_for_subscribers(publishers: Iterable[Any]) -> None:
+    """Wait, half a second at most, until subscribers have all that was published.
+
+    Parameters
+    ----------
+    publishers : iterable of Publisher or None
+    """
+    until = time.monotonic() + _ARRIVAL_SECONDS
+    for publisher in publishers:
+        left = until - time.monotonic()
+        if publisher is not None and left > 0:
+            publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def run(make_node: Callable[[], Any]) -> None:

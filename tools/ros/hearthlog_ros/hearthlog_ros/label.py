@@ -19,7 +19,13 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import encode, nanoseconds
 from hearthlog.schemas.messages.topics import check_microphone_name, topic
-from hearthlog_ros.graph import NodeError, TypeChecks, message_class, run
+from hearthlog_ros.graph import (
+    NodeError,
+    TypeChecks,
+    message_class,
+    run,
+    wait_for_subscribers,
+)
 
 _DEPTH = 1000  # features that wait while this node does not run: 50 seconds
 _CHECK_SECONDS = 2.0
@@ -110,6 +116,7 @@ class Label(Node):
         """End the open segment."""
         self._label(self._waiting)
         self._end_sound()
+        wait_for_subscribers(self._publishers_of.values())
 
     def _check_alone(self) -> None:
         """Check that nobody else labels this microphone under the same name."""

@@ -21,6 +21,7 @@ from hearthlog_ros.graph import (
     offered_profile,
     own_hash,
     run,
+    wait_for_subscribers,
 )
 
 _DELAY_SECONDS = 1.2  # a block of sound, what writing and reading take, and a little more
@@ -61,9 +62,10 @@ class Live(Node):
         return not self._stop.is_set()
 
     def close(self) -> None:
-        """End the publishing."""
+        """End the publishing, once subscribers have what was published."""
         self._stop.set()
         self._thread.join()
+        wait_for_subscribers(self._publishers_of.values())
 
     def _publish_all(self) -> None:
         try:
