@@ -12,6 +12,7 @@ from mcap.records import Channel
 from rclpy.node import Node
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.files import AUDIO_LAYER, log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages, in_order_of_time
 from hearthlog_ros.graph import (
@@ -28,6 +29,7 @@ _DELAY_SECONDS = 1.2  # a block of sound, what writing and reading take, and a l
 _LOOK_SECONDS = 0.5  # for a folder that is not there yet
 _FIND_SECONDS = 3.0  # of patience with subscribers that want another quality of service
 _FIND_LOOK_SECONDS = 0.02
+_HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
 _NANOSECONDS = 1_000_000_000
 
 
@@ -115,8 +117,9 @@ class Live(Node):
             damaged=lambda error: tell(str(error)),
             infos=True,
         )
-        for _, parts in followed:
-            yield parts
+        for path, parts in followed:
+            if log_name(path).layer in _HEARD:
+                yield parts
 
     def _wait_until(self, due: int) -> None:
         """Wait for a time, unless the clock of the log is not that of this machine."""
