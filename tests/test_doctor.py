@@ -910,13 +910,12 @@ FILE = {
 }
 
 
-def channel_in_summary_alone(records):
-    """As writers do of a channel that never spoke."""
+def uncounted_channel_in_summary_alone(records):
+    """As `ros2 bag record` does of a channel that never spoke."""
     place = records.index(nth(records, Opcode.STATISTICS))
     channel = parsed(records[place - 1], Channel)
     channel.id = 99
     records.insert(place, as_raw(channel))
-    altered(Statistics, channel_count=more)(records)
     for raw in records:
         if raw.opcode == Opcode.SUMMARY_OFFSET:
             offset = parsed(raw, SummaryOffset)
@@ -929,8 +928,17 @@ def channel_in_summary_alone(records):
     altered(Footer, summary_offset_start=lambda start: start + length)(records)
 
 
-def test_a_channel_that_is_in_the_summary_alone_is_a_warning(log, tmp_path):
-    path = log.write(tmp_path / NAME, channel_in_summary_alone)
+def counted_channel_in_summary_alone(records):
+    """As other writers do of it."""
+    uncounted_channel_in_summary_alone(records)
+    altered(Statistics, channel_count=more)(records)
+
+
+@pytest.mark.parametrize(
+    "edit", [uncounted_channel_in_summary_alone, counted_channel_in_summary_alone]
+)
+def test_a_channel_that_is_in_the_summary_alone_is_a_warning(log, tmp_path, edit):
+    path = log.write(tmp_path / NAME, edit)
     assert found(path) == {("warning", GAP), ("warning", "summary-only")}
 
 

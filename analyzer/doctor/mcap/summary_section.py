@@ -2,6 +2,7 @@
 
 import zlib
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any
 
 from mcap.opcode import Opcode
@@ -215,12 +216,12 @@ class SummarySection:
     def _check_statistics(self, offset: int, statistics: Statistics) -> None:
         data = self._data
         start, end = data.span or (0, 0)
-        schemas = (data.definitions.schemas.keys() | self._copies[Schema].keys()) - {0}
-        channels = data.definitions.channels.keys() | self._copies[Channel].keys()
         expected: dict[str, Any] = {
             "message_count": sum(data.counts.values()),
-            "schema_count": len(schemas),
-            "channel_count": len(channels),
+            "schema_count": self._count(Schema, data.definitions.schemas, statistics.schema_count),
+            "channel_count": self._count(
+                Channel, data.definitions.channels, statistics.channel_count
+            ),
             "attachment_count": len(data.expected_indexes[Opcode.ATTACHMENT_INDEX]),
             "metadata_count": len(data.expected_indexes[Opcode.METADATA_INDEX]),
             "chunk_count": len(data.expected_indexes[Opcode.CHUNK_INDEX]),
@@ -237,6 +238,13 @@ class SummarySection:
         ]
         if differing:
             self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
+
+    def _count(self, kind: type, defined: Iterable[int], said: int) -> int:
+        """Count definitions; whether those in the summary alone are counted, writers choose."""
+        in_data = set(defined) - {0}
+        if said == len(in_data):  # libmcap leaves them out, and so does `ros2 bag record`
+            return said
+        return len((in_data | self._copies[kind].keys()) - {0})
 
     def _check_offsets(self) -> None:
         for offset, group in self._offsets:
