@@ -410,19 +410,31 @@ def put(log, folder, name):
     (folder / "half").rename(folder / name)
 
 
+def subscribe(log, folder, *viewers):
+    """Let viewers know all topics, by a log that appears, and wait until nothing more comes."""
+    for viewer in viewers:
+        viewer.wait_for("serverInfo")
+    put(log, folder, "home_00.mcap")
+    for viewer in viewers:
+        viewer.wait_for("advertise", count=8)
+    time.sleep(SILENT_SECONDS)
+
+
 def test_a_viewer_that_stands_still_keeps_nobody_waiting_and_takes_little_memory(logs, tmp_path):
     log = max(find_logs(logs))
     newest = logged(log)[-1][1]
     memory = []
     with serving(tmp_path) as (watcher, url), Viewer(url) as still, Viewer(url) as other:
+
+        def times_seen():
+            return sum(stamp == newest for _, stamp, _ in other.messages())
+
+        subscribe(log, tmp_path, still, other)
+        still.stand()
         for number in range(1, 21):
+            before = times_seen()
             put(log, tmp_path, f"home_{number:02}.mcap")
-            other.wait(
-                lambda count=number: (
-                    sum(stamp == newest for topic, stamp, _ in other.messages()) >= count
-                )
-            )
-            still.stand()
+            other.wait(lambda before=before: times_seen() > before)
             memory.append(psutil.Process(watcher.pid).memory_info().rss)
         still.go_on()
         assert ended(watcher) == 0
@@ -580,6 +592,7 @@ def test_a_damaged_log_is_told_and_the_next_one_is_shown_live(logs, tmp_path):
     first, second = find_logs(logs)
     write_damaged(first, tmp_path / "damaged")
     with serving(tmp_path) as (watcher, url), Viewer(url) as viewer:
+        subscribe(first, tmp_path, viewer)
         put(tmp_path / "damaged", tmp_path, "home_1.mcap")
         put(second, tmp_path, "home_2.mcap")
         own = [each[:3] for each in logged(second)]
