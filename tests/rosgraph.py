@@ -5,6 +5,7 @@ import os
 import shlex
 import signal
 import subprocess
+import time
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -55,6 +56,15 @@ class Ros:
             *remap,
             env=env or {},
         )
+
+
+def wait_until_running(process):
+    """Wait until a node has taken the place of the shell that finds it, which loses signals."""
+    deadline = time.monotonic() + 30
+    while Path(f"/proc/{process.pid}/cmdline").read_bytes().startswith(b"bash"):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(1.0)  # until Python has begun
 
 
 def end(process, number=signal.SIGTERM):

@@ -8,7 +8,16 @@ from contextlib import contextmanager
 
 import pytest
 from conftest import HEARTHLOG
-from rosgraph import DISTRIBUTIONS, Ros, arrived, end, listener, logged, next_domain
+from rosgraph import (
+    DISTRIBUTIONS,
+    Ros,
+    arrived,
+    end,
+    listener,
+    logged,
+    next_domain,
+    wait_until_running,
+)
 
 from hearthlog.schemas.logs.files import relabel_path
 from hearthlog.schemas.messages import message_types
@@ -85,8 +94,9 @@ def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic,
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_path):
     with microphone_recorder(labmic, tmp_path / "logs"):
-        for seconds in (1.0, 2.0, 4.0):
+        for seconds in (0.0, 0.5, 1.0, 3.0):
             with ros.node("live", folder=tmp_path / "logs", delay=0.0) as node:
+                wait_until_running(node)
                 time.sleep(seconds)
                 said = end(node, number)
                 assert node.returncode == 0, said

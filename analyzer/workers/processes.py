@@ -19,6 +19,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_reply
+from hearthlog.models.blas import kernel_environment
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogWarning
 
@@ -125,6 +126,7 @@ class _Process:
             stdout=subprocess.PIPE,
             bufsize=0,
             env=dict.fromkeys(_THREADS, "1")
+            | kernel_environment()
             | os.environ
             | {"PYTHONPATH": os.pathsep.join(sys.path)},
             process_group=0,  # Ctrl-C reaches the parent only, which then hangs up

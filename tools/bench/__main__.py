@@ -2,12 +2,15 @@
 
 import os
 
+from hearthlog.models.blas import kernel_environment
+
 # Before numpy is imported: "one core" is to be true for everyone.
 os.environ.update(
     dict.fromkeys(
         ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
     )
 )
+os.environ.update(kernel_environment())
 
 import sys
 import tempfile

@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from hearthlog.analyzer.workers.kernel import kernel_in_use
 from hearthlog.tools.bench.table import Table
 
 _PACKAGES = (
@@ -50,6 +51,7 @@ def record(path: Path, tables: Mapping[str, Table], sound: str) -> None:
         "date": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
         "commit": _commit(),
         "machine": _machine(),
+        "kernel": kernel_in_use(),
         "versions": {"python": platform.python_version()} | dict(_versions()),
         "sound": sound,
         "figures": figures,

@@ -77,9 +77,12 @@ def _print(result: "Relabelled", model: str) -> None:
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:
+    from hearthlog.analyzer.workers.kernel import kernel_in_use
+
     return {
         "model": model,
         "model_sha256": sha256,
+        "kernel": kernel_in_use(),
         "frames": result.frames,
         "layers": [str(layer) for layer in sorted(result.layers)],
         "current": [str(layer) for layer in sorted(result.current)],
