@@ -357,6 +357,19 @@ def test_a_folder_of_logs_is_a_bag_as_it_lies(recorded, hearthlog, tmp_path):
     assert bag["message_count"] == sum(file["message_count"] for file in bag["files"])
 
 
+def test_logs_of_the_same_time_are_said_to_be_played_one_after_the_other(
+    recorded, hearthlog, tmp_path
+):
+    log = find_logs(recorded)[0]
+    for name in (log.name, f"other_{log.name}"):
+        shutil.copy(log, tmp_path / name)
+    result = hearthlog("export", tmp_path, "--format", "rosbag2", "--in-place")
+    assert result.returncode == 3
+    late = tmp_path / f"other_{log.name}"
+    assert result.stderr.startswith(f"hearthlog: {late} begins before another log ends")
+    assert result.stdout == f"{tmp_path / 'metadata.yaml'}\n"
+
+
 def test_topics_that_differ_between_logs_are_no_bag(hearthlog, tmp_path):
     for number, kind in enumerate((message_types.FEATURES, message_types.LABEL)):
         writer = LogWriter(tmp_path / f"home_{number}.mcap", [Topic("/mic/a", kind)], {})

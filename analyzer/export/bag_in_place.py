@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, is_active, is_layer
@@ -15,7 +16,15 @@ from hearthlog.schemas.storage.new_files import replaced_file
 METADATA = "metadata.yaml"
 
 
-def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> tuple[Path, list[Path]]:
+class BagInPlace(NamedTuple):
+    """What was made of a folder of logs."""
+
+    metadata: Path  # the file
+    unfinished: list[Path]  # logs that were not completed, or have no messages; not in the bag
+    overlapping: list[Path]  # logs that begin before an earlier one of the bag ends
+
+
+def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagInPlace:
     """Write a `metadata.yaml` that makes one bag of all finished logs of a folder, or replace it.
 
     Layers are left out: rosbag2 reads one file after the other.
@@ -29,10 +38,7 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> tuple
 
     Returns
     -------
-    metadata : Path
-        The file.
-    unfinished : list of Path
-        Logs that were not completed, or have no messages; they are not in the bag.
+    BagInPlace
 
     Raises
     ------
@@ -58,7 +64,17 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> tuple
     path = folder / METADATA
     with replaced_file(path) as temporary:
         temporary.write_text(metadata_yaml(counts), "utf-8")
-    return path, unfinished
+    return BagInPlace(path, unfinished, [folder / name for name in _overlapping(counts)])
+
+
+def _overlapping(files: Sequence[FileCounts]) -> Iterator[str]:
+    """Give the names of files that begin before an earlier one ends; rosbag2 merges nothing."""
+    latest = 0
+    for file in files:
+        start, end = file.span
+        if start < latest:
+            yield file.name
+        latest = max(latest, end)
 
 
 def _count(log: Path, folder: Path) -> FileCounts | None:

@@ -88,7 +88,15 @@ def _describe_as_bag(logs: list[Path]) -> None:
     if len(logs) != 1:
         wrong_use("--in-place: name one folder of logs")
     with share_done("reading") as progress:
-        metadata, unfinished = describe_as_bag(logs[0], progress)
-    print(metadata)
-    names = ", ".join(map(str, unfinished))
-    end_with_warnings([f"not in the bag, for it is unfinished: {names}"] if names else [])
+        bag = describe_as_bag(logs[0], progress)
+    print(bag.metadata)
+    warnings = []
+    if bag.unfinished:
+        names = ", ".join(map(str, bag.unfinished))
+        warnings.append(f"not in the bag, for it is unfinished: {names}")
+    if bag.overlapping:
+        warnings.append(
+            f"{bag.overlapping[0]} begins before another log ends, and rosbag2 plays one after the "
+            "other; --output BAG instead of --in-place puts all in the order of time"
+        )
+    end_with_warnings(warnings)
