@@ -357,6 +357,31 @@ def test_a_folder_of_logs_is_a_bag_as_it_lies(recorded, hearthlog, tmp_path):
     assert bag["message_count"] == sum(file["message_count"] for file in bag["files"])
 
 
+def test_what_ros2_bag_record_wrote_is_a_bag_with_its_quality_of_service(hearthlog, tmp_path):
+    (tmp_path / "bags").mkdir()
+    block = "- history: unknown\n  depth: 0\n  reliability: reliable\n"
+    block += "  durability: transient_local\n"
+    block += "".join(
+        f"  {name}:\n    sec: 9223372036\n    nsec: 854775807\n"
+        for name in ("deadline", "lifespan", "liveliness_lease_duration")
+    )
+    block += "  liveliness: automatic\n  avoid_ros_namespace_conventions: false"
+    with (tmp_path / "bags" / "run_0.mcap").open("xb") as stream:
+        writer = ChunkWriter(stream)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("my_msgs/msg/Own", "ros2msg", b"uint32 a\n")
+        metadata = {"offered_qos_profiles": block, "topic_type_hash": ""}
+        channel = writer.register_channel("/own", "cdr", schema, metadata)
+        writer.add_message(channel, 1, struct.pack("<4sI", b"\0\1\0\0", 7), 1)
+        writer.finish()
+    result = hearthlog("export", tmp_path / "bags", "--format", "rosbag2", "--in-place")
+    assert (result.returncode, result.stderr) == (0, "")
+    with rosbag2.Reader(tmp_path / "bags") as bag:
+        ((connection, time, _),) = bag.messages()
+    (offered,) = connection.ext.offered_qos_profiles
+    assert (connection.topic, time, offered.durability.name) == ("/own", 1, "TRANSIENT_LOCAL")
+
+
 def test_logs_of_the_same_time_are_said_to_be_played_one_after_the_other(
     recorded, hearthlog, tmp_path
 ):

@@ -1,10 +1,10 @@
 """A folder of logs as one bag of rosbag2: what its `metadata.yaml` says, and no copy."""
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from hearthlog.analyzer.export.merge import bag_metadata
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, is_active, is_layer
 from hearthlog.schemas.logs.rosbag2 import FileCounts, TopicCount, metadata_yaml
@@ -14,6 +14,7 @@ from hearthlog.schemas.storage.byte_ranges import is_local
 from hearthlog.schemas.storage.new_files import replaced_file
 
 METADATA = "metadata.yaml"
+_DESCRIPTION = {"offered_qos_profiles", "topic_type_hash"}
 
 
 class BagInPlace(NamedTuple):
@@ -86,20 +87,13 @@ def _count(log: Path, folder: Path) -> FileCounts | None:
         topics: dict[str, TopicCount] = {}
         for number, channel in file.channels.items():
             schema = file.schemas.get(channel.schema_id)
-            if schema is None or not _is_of_ros(channel.metadata):
+            if schema is None or not channel.metadata.keys() >= _DESCRIPTION:
                 raise LogError(f"{log}: topic {channel.topic} is not described as rosbag2 needs it")
-            topic = topics.setdefault(channel.topic, TopicCount(schema.name, channel.metadata))
+            described = TopicCount(schema.name, bag_metadata(channel))
+            topic = topics.setdefault(channel.topic, described)
             topic.messages += statistics.channel_message_counts.get(number, 0)
         span = statistics.message_start_time, statistics.message_end_time
         return FileCounts(log.relative_to(folder).as_posix(), topics, span)
-
-
-def _is_of_ros(metadata: dict[str, str]) -> bool:
-    try:
-        offered = json.loads(metadata["offered_qos_profiles"])
-    except (KeyError, ValueError, RecursionError):
-        return False
-    return isinstance(offered, list) and "topic_type_hash" in metadata
 
 
 def _check_topics(files: Sequence[FileCounts]) -> None:

@@ -206,10 +206,7 @@ class _Log:
         """Describe the topics for rosbag2; None if it cannot describe them."""
         topics: dict[str, rosbag2.TopicCount] = {}
         for number, (channel, schema) in self._described.items():
-            metadata = {
-                "offered_qos_profiles": json.dumps(_profiles(channel)),
-                "topic_type_hash": channel.metadata.get("topic_type_hash", ""),
-            }
+            metadata = bag_metadata(channel)
             name = "" if schema is None else schema.name
             topic = topics.setdefault(channel.topic, rosbag2.TopicCount(name, metadata))
             same = (topic.type, topic.channel_metadata) == (name, metadata)
@@ -277,6 +274,25 @@ def is_latched(channel: Channel) -> bool:
         profile["durability"] == "transient_local" and not 0 < profile["lifespan"]["sec"] < _FOREVER
         for profile in _profiles(channel)
     )
+
+
+def bag_metadata(channel: Channel) -> dict[str, str]:
+    """Return what rosbag2 wants to know of a channel, as a recorder writes it.
+
+    Parameters
+    ----------
+    channel : Channel
+        Of a recorder, or of `ros2 bag record`, which writes YAML in blocks.
+
+    Returns
+    -------
+    dict of str to str
+        `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty ones if it has none.
+    """
+    return {
+        "offered_qos_profiles": json.dumps(_profiles(channel)),
+        "topic_type_hash": channel.metadata.get("topic_type_hash", ""),
+    }
 
 
 def _profiles(channel: Channel) -> list[Any]:
