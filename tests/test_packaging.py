@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
 DATA = {"py.typed", "page.html"}
-MEASUREMENTS = {("tools", "bench"), ("tools", "month")}
+APART = {("tools", "bench"), ("tools", "month"), ("tools", "ros")}  # measured, or built, by itself
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -26,7 +26,7 @@ PROJECT = CONFIGURATION["project"]
 def installed_as(path):
     """Name what a file of the checkout is in the wheel, or None."""
     path = PurePosixPath(path)
-    if path.parts[0] not in FOLDERS or path.parts[:2] in MEASUREMENTS:
+    if path.parts[0] not in FOLDERS or path.parts[:2] in APART:
         return None
     kept = path.name in DATA or path.is_relative_to(CLIPS) or path.is_relative_to(STARTERS)
     if path.suffix not in {".py", ".msg", ".toml", ".service"} and not kept:
@@ -83,11 +83,12 @@ def files(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_every_folder_with_code_is_a_package_but_the_measurements():
-    folders = {path.parent for name in FOLDERS for path in (ROOT / name).rglob("*.py")}
-    names = {".".join(("hearthlog", *path.relative_to(ROOT).parts)) for path in folders}
-    without = {"hearthlog.tools.bench", "hearthlog.tools.month", "hearthlog.tools.package"}
-    assert set(CONFIGURATION["tool"]["setuptools"]["packages"]) == names - without | {"hearthlog"}
+def test_every_folder_with_code_is_a_package_but_what_stands_apart():
+    every = {path.parent for name in FOLDERS for path in (ROOT / name).rglob("*.py")}
+    folders = {folder.relative_to(ROOT).parts for folder in every}
+    inside = {parts for parts in folders if parts[:2] not in APART | {("tools", "package")}}
+    names = {".".join(("hearthlog", *parts)) for parts in inside} | {"hearthlog"}
+    assert set(CONFIGURATION["tool"]["setuptools"]["packages"]) == names
 
 
 def test_the_sdist_holds_what_its_tests_need_and_no_litter(sdist, tracked):

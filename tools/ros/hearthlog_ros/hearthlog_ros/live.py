@@ -24,12 +24,14 @@ from hearthlog_ros.graph import (
     run,
     wait_for_subscribers,
 )
+from hearthlog_ros.pace import Pace
 
 _DELAY_SECONDS = 1.2  # a block of sound, what writing and reading take, and a little more
 _LOOK_SECONDS = 0.5  # for a folder that is not there yet
 _FIND_SECONDS = 3.0  # of patience with subscribers that want another quality of service
 _FIND_LOOK_SECONDS = 0.02
 _HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
+_EVERY_FRAME = ("/features", "/label")  # others speak now and then, and of what was before
 _NANOSECONDS = 1_000_000_000
 
 
@@ -37,7 +39,8 @@ class Live(Node):
     """Publishes what a recorder writes to its logs, each message a little later than it speaks of.
 
     Parameters of the node: `folder`, of the logs; `topics`, patterns such as `/*/label`; `delay`,
-    in seconds from the log time of a message to its publication, 0 for at once, in bursts.
+    in seconds, at least, from the log time of a message to its publication, 0 for at once, in
+    bursts.
     """
 
     def __init__(self) -> None:
@@ -47,7 +50,7 @@ class Live(Node):
         delay = self.declare_parameter("delay", _DELAY_SECONDS).value
         if not 0 <= delay <= 60:
             raise NodeError(f"delay: from 0 to 60 seconds, not {delay:g}")
-        self._delay = int(delay * _NANOSECONDS)
+        self._pace = Pace(int(delay * _NANOSECONDS))
         self._stop = Event()
         self._error = ""
         self._publishers_of: dict[str, Any] = {}
@@ -73,9 +76,13 @@ class Live(Node):
         try:
             for parts in self._batches():
                 self._announce(parts)
+                frames = [part for part in parts if part.channel.topic.endswith(_EVERY_FRAME)]
+                if frames:
+                    first = min(int(part.log_times[0]) for part in frames)
+                    self._pace.add_block(first, time.time_ns())
                 for part, row in in_order_of_time(parts):
-                    self._wait_until(int(part.log_times[row]) + self._delay)
-                    if self._stop.is_set():
+                    wait = self._pace.wait(int(part.log_times[row]), time.time_ns())
+                    if self._stop.wait(wait / _NANOSECONDS) if wait else self._stop.is_set():
                         return
                     self._publish(part, row)
         except LogError as error:
@@ -120,12 +127,6 @@ class Live(Node):
         for path, parts in followed:
             if log_name(path).layer in _HEARD:
                 yield parts
-
-    def _wait_until(self, due: int) -> None:
-        """Wait for a time, unless the clock of the log is not that of this machine."""
-        wait = due - time.time_ns()
-        if 0 < wait <= self._delay:
-            self._stop.wait(wait / _NANOSECONDS)
 
     def _publish(self, part: RawMessages, row: int) -> None:
         topic = part.channel.topic
