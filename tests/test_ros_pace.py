@@ -52,11 +52,11 @@ def test_blocks_that_always_come_late_become_even_at_their_own_delay():
 
 
 def test_a_delay_that_was_needed_once_is_given_back_without_a_burst():
-    lateness = [300.0] * 20 + [3300.0] + [300.0] * 1000
+    lateness = [300.0] * 20 + [3300.0] + [300.0] * 1500
     delays = published(1200, lateness)
     assert delays.max() == pytest.approx(3850)
     assert set(delays[-500:]) == {1200}
-    assert np.diff(delays).min() >= -3  # after the one before it: 47 ms
+    assert np.diff(delays).min() >= -2  # after the one before it: 48 ms
 
 
 def test_a_log_of_another_clock_is_not_waited_for():

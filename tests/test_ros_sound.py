@@ -80,7 +80,7 @@ def test_a_topic_has_the_features_of_its_sound(ros, case, sound, tmp_path):
     path, logs = sound(), tmp_path / "logs"
     robot = speaking(ros, name, path, milliseconds)
     with robot, topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
-        wait_for_frames(logs, 220)
+        wait_for_frames(logs, 120)
         said = end(recorder)
     assert recorder.returncode == 0, said
     command = [*HEARTHLOG, "record", str(path), "-o", str(tmp_path / "file"), "--model", "none"]
@@ -104,19 +104,19 @@ def test_the_first_channel_of_an_array_is_heard_at_its_own_rate(ros, sound, tmp_
     with speaking(ros, DATA, path):
         address = "ros2:///robot/audio?rate=48000&channels=4"
         with topic_recorder(ros, logs, address) as recorder:
-            wait_for_frames(logs, 200)
+            wait_for_frames(logs, 120)
             end(recorder)
     frames, stamps, values = features(logs)
     assert np.array_equal(frames, np.arange(len(frames)))
     assert (stamps[-1] - stamps[0]) / len(stamps) == pytest.approx(50e6, rel=0.02)
-    assert len(np.unique(values[:, 0])) > 100
+    assert len(np.unique(values[:, 0])) > 60
 
 
 def test_messages_that_are_lost_are_a_gap(ros, sound, tmp_path):
     logs = tmp_path / "logs"
-    robot = speaking(ros, RAW, sound(), 100, left_out=range(50, 57))
+    robot = speaking(ros, RAW, sound(), 100, left_out=range(20, 27))
     with robot, topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
-        wait_for_frames(logs, 200)
+        wait_for_frames(logs, 120)
         end(recorder)
     frames, stamps, _ = features(logs)
     (gap,) = read(logs, "gap")

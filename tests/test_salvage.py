@@ -30,6 +30,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.salvage.recover import NothingWholeError, recover_log
+from hearthlog.schemas.storage.byte_ranges import LocalFile
 
 HEADER, MESSAGE, CHUNK, INDEX, ATTACHMENT, METADATA, DATA_END = 1, 5, 6, 7, 9, 12, 15
 GAPS = "/mic/gap"
@@ -603,6 +604,23 @@ def test_whatever_a_file_claims_memory_is_bounded_and_what_follows_is_saved(tmp_
     messages, megabytes = map(int, result.stdout.split())
     assert messages >= 3
     assert megabytes < 500
+
+
+def test_a_file_of_beginnings_is_not_read_again_and_again(tmp_path, monkeypatch):
+    source = tmp_path / "source.mcap"
+    source.write_bytes(START * 4000)
+    passed, read = 0, LocalFile.read
+
+    def count(file, offset, length):
+        nonlocal passed
+        data = read(file, offset, length)
+        passed += len(data)
+        return data
+
+    monkeypatch.setattr(LocalFile, "read", count)
+    with pytest.raises(NothingWholeError):
+        recover_log(source, tmp_path / "copy.mcap", "copy.mcap")
+    assert passed < 100 * source.stat().st_size
 
 
 # The command.

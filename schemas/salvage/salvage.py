@@ -8,10 +8,11 @@ is read once, and what is read in vain, because it only looks like a record, may
 the bytes passed so far, and `4 * LIMIT` more. Beyond that it is passed unread, and reported.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 from mcap import records
 from mcap.exceptions import McapError
@@ -39,6 +40,14 @@ _WINDOW = 1 << 20
 _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADATA}
 
 Piece = records.Metadata | records.Message | WholeAttachment | WholeChunk
+
+
+class _Places(NamedTuple):
+    """Where in a window of the file records may begin, bytes ascending: chunks, and all of them."""
+
+    window: int
+    chunks: list[int]
+    heads: list[int]
 
 
 class Salvage:
@@ -97,6 +106,7 @@ class Salvage:
         for record in definitions:
             self.definitions.add(record)
         self._next: WholeRecord | None = None  # by the last search
+        self._places = _Places(-1, [], [])  # of the window that was searched last
         self._vain = self._kept = 0
         self._cost = 0  # of what was last read in vain
         self._has_chunks = False
@@ -257,20 +267,30 @@ class Salvage:
         """
         end = self._reader.end if before is None else before
         while start < end:
-            size = min(_WINDOW + CHUNK_HEAD_LIMIT, self._reader.end - start)
-            window = self._file.read(start, size)
-            places = min(_WINDOW, end - start)
-            chunks = {place for place in find_chunk_heads(window) if place < places}
-            heads = find_record_heads(window[: _WINDOW + 8]) if before is None else ()
-            for place in sorted(chunks.union(heads)):
+            window = start // _WINDOW
+            if self._places.window != window:
+                self._places = self._find_places(window)
+            chunks, heads = self._places.chunks, self._places.heads
+            places = heads if before is None else chunks
+            for number in range(bisect_left(places, start), bisect_left(places, end)):
+                place = places[number]
                 try:
-                    self._next = self._at(start + place, searching=True, chunk=place in chunks)
+                    self._next = self._at(place, searching=True, chunk=_is_in(chunks, place))
                 except McapError:
                     self._vain += self._cost
                 else:
-                    return start + place
-            start += _WINDOW
+                    return place
+            start = (window + 1) * _WINDOW
         return end
+
+    def _find_places(self, window: int) -> "_Places":
+        """Look through a window for what may be the head of a record."""
+        start = window * _WINDOW
+        size = min(_WINDOW + CHUNK_HEAD_LIMIT, self._reader.end - start)
+        data = self._file.read(start, size)
+        chunks = {start + place for place in find_chunk_heads(data) if place < _WINDOW}
+        heads = {start + place for place in find_record_heads(data[: _WINDOW + 8])}
+        return _Places(window, sorted(chunks), sorted(chunks | heads))
 
     def _take(self, whole: WholeRecord) -> Iterator[Piece]:
         """Note what a record tells of the file; yield it if the new log will hold it."""
@@ -317,6 +337,11 @@ class Salvage:
             for message in chunk_messages(chunk.stored):
                 if defined[message.channel_id]:
                     yield message
+
+
+def _is_in(ascending: list[int], number: int) -> bool:
+    place = bisect_left(ascending, number)
+    return place < len(ascending) and ascending[place] == number
 
 
 def _size(record: Definition) -> int:

@@ -1,7 +1,7 @@
 """When messages are due that are written in blocks, so that they are published evenly."""
 
 _MOST_LATE = 5_000_000_000  # ns; a log that is further behind is of another clock, or was read late
-_STEP = 3_000_000  # ns by which a block tries whether a shorter delay will do
+_STEP = 2_000_000  # ns by which a block tries whether a shorter delay will do
 
 
 class Pace:
