@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import HEARTHLOG, spread_files
 
-from hearthlog.models import blas
-from hearthlog.models.blas import kernel_environment
+from hearthlog.schemas import blas
+from hearthlog.schemas.blas import kernel_environment
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 

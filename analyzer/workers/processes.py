@@ -19,8 +19,8 @@ from typing import Any, ParamSpec, TypeVar
 
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.workers.pickled_calls import attempt, pack_call, read_reply
-from hearthlog.models.blas import kernel_environment
 from hearthlog.recorder.modules import module_command
+from hearthlog.schemas.blas import kernel_environment
 from hearthlog.schemas.errors import HearthlogWarning
 
 MAX_ATTEMPTS = 3  # of a task whose worker is killed

@@ -2,7 +2,7 @@
 
 import os
 
-from hearthlog.models.blas import kernel_environment
+from hearthlog.schemas.blas import kernel_environment
 
 # Before numpy is imported: "one core" is to be true for everyone.
 os.environ.update(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
-from hearthlog.models.blas import kernel_environment
+from hearthlog.schemas.blas import kernel_environment
 
 # Before numpy is imported: the products here are small, and idle BLAS threads burn a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
