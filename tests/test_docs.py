@@ -17,6 +17,8 @@ import typer
 from spliced import run
 from typer.testing import CliRunner
 
+pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves what developers run out")
+
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import app
 from hearthlog.tools.home.__main__ import home as simulate_home

@@ -8,6 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+pytest.importorskip("hearthlog.tools.month", reason="the wheel leaves the simulated month out")
+
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
