@@ -117,11 +117,11 @@ def follow_messages(  # noqa: PLR0913
         finished = [path for path in present if not is_active(path)]
         yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if is_active(path) for g in _open(path)]
-    for log in growing if start is None else ():
-        log.file.scan_new()  # and forget what was written before
-    for log in growing if infos else ():
-        yield log.file.path, log.infos_before(start, damaged)
     try:
+        for log in growing if start is None else ():
+            log.file.scan_new()  # and forget what was written before
+        for log in growing if infos else ():
+            yield log.file.path, log.infos_before(start, damaged)
         while not stop.is_set():
             has_news = False
             for log in growing:

@@ -32,6 +32,7 @@ _FIND_SECONDS = 3.0  # of patience with subscribers that want another quality of
 _FIND_LOOK_SECONDS = 0.02
 _HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
 _EVERY_FRAME = ("/features", "/label")  # others speak now and then, and of what was before
+_BEFORE = 10_000_000_000  # ns that a recorder's clock may be behind
 _NANOSECONDS = 1_000_000_000
 
 
@@ -110,7 +111,8 @@ class Live(Node):
 
     def _batches(self) -> Iterator[list[RawMessages]]:
         """Follow the folder, once it is there."""
-        start = None if self._folder.is_dir() else 0
+        # What is written before the folder is seen is news too; years of logs on a disk are not.
+        start = None if self._folder.is_dir() else time.time_ns() - _BEFORE
         if start is not None:
             self.get_logger().warning(f"{self._folder} is not there yet; waiting for a recorder")
         while not self._folder.is_dir():
