@@ -738,3 +738,18 @@ def test_an_abandoned_log_gets_its_name_in_place(small, hearthlog, tmp_path):
     path.write_bytes(small[0][:-200])
     assert hearthlog("recover", path, "--in-place").stdout == f"{tmp_path / 'a.mcap'}\n"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.damaged"]
+
+
+def test_a_length_that_swallows_the_records_behind_it_is_no_padding(small, recover):
+    data, records = small
+    swallowed = 0
+    for record, *behind in zip(records, records[1:], records[2:], records[3:], strict=False):
+        if record.opcode == CHUNK or record.start > max(r.start for r in records if r.messages):
+            continue
+        for end in [r.end for r in behind]:
+            damaged = bytearray(data)
+            struct.pack_into("<Q", damaged, record.start + 1, end - record.start - 9)
+            for ending in (bytes(damaged), bytes(damaged[: records[-3].start])):  # and unfinished
+                assert recover(ending).messages == messages_of(records), (record, end)
+            swallowed += 1
+    assert swallowed > 10

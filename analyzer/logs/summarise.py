@@ -122,11 +122,12 @@ def _name(file: LogFile, location: RecordLocation) -> str:
 
 
 def _is_counted(file: LogFile) -> bool:
-    """Tell whether the file says how many messages each of its channels has."""
-    counts = file.statistics
-    return (
-        counts is not None and sum(counts.channel_message_counts.values()) == counts.message_count
-    )
+    """Tell whether the index says how many messages each channel has, and which these are."""
+    if file.statistics is None:
+        return False
+    counts = file.statistics.channel_message_counts
+    is_whole = sum(counts.values()) == file.statistics.message_count
+    return is_whole and counts.keys() <= file.channels.keys()
 
 
 def _count_by_index(file: LogFile, summary: Summary) -> None:

@@ -145,12 +145,14 @@ class DamageList:
 
 
 class Index(NamedTuple):
-    """The index of a file, whose checksum is right.
+    """The index of a file, whose checksum is right if it has one.
 
     Attributes
     ----------
     reader : RecordVerifier
         Of the whole file.
+    messages : dict of int to int, or None
+        How many messages each channel has; None if the index does not say so.
     chunks : np.ndarray [shape=(n, 6)], int64
         Offset, length, length of the message indexes, first and last log time of each chunk, and
         the byte at which its record in the index begins; in the order of the file.
@@ -159,7 +161,7 @@ class Index(NamedTuple):
     reader: RecordVerifier
     start: int  # byte at which it begins
     definitions: list[Definition]
-    messages: dict[int, int]  # by channel
+    messages: dict[int, int] | None
     chunks: NDArray[np.int64]
     names: dict[int, str]  # of metadata records and attachments, by offset
 
@@ -208,20 +210,22 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     Returns
     -------
     Index or None
-        None if the file has no index, if it is larger than the limit, or if it may be damaged.
+        None if the file is not finished, or if its index is damaged or larger than the limit. That
+        of a finished file may be empty.
     """
     end = reader.end - FOOTER_SIZE
     tail = reader.read(max(end, 0), FOOTER_SIZE)
     footer = read_footer(tail)
     if footer is None:
         return None
-    start = footer.summary_start
-    if not len(MAGIC) <= start < end or end - start > limit:
+    start = footer.summary_start or end
+    if not len(MAGIC) <= start <= end or end - start > limit:
         return None
     crc = 0
     for place in range(start, end, _BLOCK):
         crc = zlib.crc32(reader.read(place, min(_BLOCK, end - place)), crc)
-    if zlib.crc32(tail[: HEAD.size + FOOTER.size], crc) != footer.summary_crc:
+    crc = zlib.crc32(tail[: HEAD.size + FOOTER.size], crc)
+    if footer.summary_crc not in {0, crc}:
         return None
     with suppress(McapError, UnicodeDecodeError, OverflowError):
         return _records_of_index(reader, start, end)
@@ -231,7 +235,7 @@ def read_index(reader: RecordVerifier, limit: int) -> Index | None:
 def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
     definitions: list[Definition] = []
     names: dict[int, str] = {}
-    messages: dict[int, int] = {}
+    messages: dict[int, int] | None = None
     chunks = array("q")
     offset = start
     while offset < end:
@@ -278,10 +282,12 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
     others = tuple(
         name for offset, name in index.names.items() if damaged.start <= offset < damaged.end
     )
+    if not len(index.chunks):
+        lost = _loss_by_neighbours(reader, damaged)
+        return lost._replace(others=others or lost.others)
     first, last = np.searchsorted(index.chunks[:, 0], [damaged.start, damaged.end])
     if first == last:
-        exact = bool(len(index.chunks)) or damaged.end - damaged.start < MESSAGE.size
-        return Loss({}, exact, None, others)
+        return Loss({}, True, None, others)
     chunks = index.chunks[first:last]
     messages: Counter[int] = Counter()
     for place in chunks[:, 5].tolist():

@@ -1,7 +1,7 @@
 """Whether a whole record begins at a certain byte of a file that may be damaged anywhere.
 
 What has a checksum is compared with it. What has none is believed if the lengths inside a record
-add up to the length before it.
+add up to the length before it, or to less: the format allows that records grow at their end.
 """
 
 import struct
@@ -20,6 +20,8 @@ from hearthlog.schemas.salvage import whole_records
 from hearthlog.schemas.salvage.record_sizes import FIELDS, LARGEST, SHORTEST, UNKNOWN
 from hearthlog.schemas.salvage.whole_records import WholeChunk, WholeRecord
 from hearthlog.schemas.storage.byte_ranges import LocalFile
+
+_LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format may add
 
 
 class RecordVerifier:
@@ -186,7 +188,8 @@ class RecordVerifier:
         if opcode == Opcode.MESSAGE:
             return self._message(offset, chained)
         outer, inner = self.ends(offset)
-        wrong = "" if inner == outer else "the length of a record"
+        end = outer if self._is_padded(inner, outer) else inner
+        wrong = "" if end == outer else "the length of a record"
         if inner - offset > LARGEST[opcode]:
             raise McapError("a record claims to be too large")
         if inner > self.end:
@@ -194,13 +197,13 @@ class RecordVerifier:
         if wrong and not self.plausible(inner):
             raise McapError("a record has another length than it claims")
         if opcode == Opcode.MESSAGE_INDEX:  # it is made anew
-            return WholeRecord(offset, inner, None, wrong)
+            return WholeRecord(offset, end, None, wrong)
         raw = self.read(offset, inner - offset)
-        if wrong:
+        if inner != outer:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         if opcode == Opcode.ATTACHMENT:
-            return WholeRecord(offset, inner, whole_records.read_attachment(raw), wrong)
-        return WholeRecord(offset, inner, parse(opcode, raw[HEAD.size :]), wrong)
+            return WholeRecord(offset, end, whole_records.read_attachment(raw), wrong)
+        return WholeRecord(offset, end, parse(opcode, raw[HEAD.size :]), wrong)
 
     def chunk(self, offset: int) -> WholeRecord:
         """Read a chunk whose content is proved, whatever its head says.
@@ -232,7 +235,9 @@ class RecordVerifier:
         except struct.error as error:
             raise McapError("the head of a chunk is damaged") from error
         first += UINT64.size
-        exact = (opcode, length) == (Opcode.CHUNK, first + stored - HEAD.size)
+        outer, inner = offset + HEAD.size + length, offset + first + stored
+        padded = opcode == Opcode.CHUNK and self._is_padded(inner, outer)
+        exact = padded or (opcode == Opcode.CHUNK and inner == outer)
         if not crc and not exact:
             raise McapError("the head of a chunk is damaged")
         if size > LIMIT:
@@ -260,7 +265,22 @@ class RecordVerifier:
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
         whole = WholeChunk(chunk, definitions, leading)
-        return WholeRecord(offset, offset + first + number, whole, wrong)
+        return WholeRecord(offset, outer if padded else offset + first + number, whole, wrong)
+
+    def _is_padded(self, inner: int, outer: int) -> bool:
+        """Tell whether a record holds more than this version of the format knows.
+
+        Else its length may be wrong: what seems to be in it are then the records behind it.
+        """
+        if not inner < outer <= min(inner + _LONGEST_PADDING, self.end):
+            return False
+        return self.plausible(outer) and not self._are_records(inner, outer)
+
+    def _are_records(self, start: int, end: int) -> bool:
+        """Tell whether the bytes from a start to an end could be whole records."""
+        while start + HEAD.size <= end and self.plausible(start):
+            start += HEAD.size + self.head(start)[1]
+        return start == end
 
     def _data(self, offset: int, length: int) -> memoryview:
         """Read the data of a chunk, of which there may be any length."""
@@ -323,11 +343,12 @@ class RecordVerifier:
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")
         outer, inner = self.ends(offset)
-        if outer != inner or inner > self.end or inner - offset > LIMIT:
+        exact = outer == inner or self._is_padded(inner, outer)
+        if not exact or outer > self.end or outer - offset > LIMIT:
             raise McapError("a message index is damaged")
         raw = self.read(offset, inner - offset)
         channel, _ = MESSAGE_INDEX.unpack_from(raw, HEAD.size)
         entries = raw[HEAD.size + MESSAGE_INDEX.size :]
         if len(entries) % INDEX_ENTRIES.itemsize:
             raise McapError("a message index is damaged")
-        return channel, np.frombuffer(entries, INDEX_ENTRIES), inner
+        return channel, np.frombuffer(entries, INDEX_ENTRIES), outer

@@ -74,11 +74,11 @@ def recover_log(
             *salvage.definitions.channels.values(),
         ]
         profile = attempt.profile()
-    if not attempt.pieces:
+    recovery = attempt.recovery()
+    if not attempt.pieces and (recovery.damages or not recovery.complete):
         if not salvage.is_mcap:
             raise NothingWholeError(f"{source}: is no MCAP file, and holds no whole piece of one")
         raise NothingWholeError(f"{source}: holds nothing that could be saved")
-    recovery = attempt.recovery()
     check_copy(copy, recovery.topics)
     return recovery
 
