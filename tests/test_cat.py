@@ -8,6 +8,7 @@ import os
 import subprocess
 from decimal import Decimal
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from conftest import HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
 from logreader import LogReader
+from mcap.writer import Writer
 from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
@@ -29,6 +31,7 @@ from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.messages.message_types import (
     FEATURES,
     decode,
+    definition,
     duration_message,
     header,
     message,
@@ -427,3 +430,39 @@ def test_printing_needs_nothing_but_the_recorder(long):
         command = [HEARTHLOG[0], "-c", code, "cat", str(long), "--format", form]
         result = subprocess.run(command, capture_output=True, check=True, env=os.environ)
         assert result.stdout
+
+
+@pytest.fixture
+def mixed(tmp_path) -> Path:
+    """A log with messages of ROS 2, and some as JSON."""
+    path = tmp_path / "mixed.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        json_schema = writer.register_schema("state", "jsonschema", b"{}")
+        header = writer.register_schema(
+            "std_msgs/msg/Header", "ros2msg", definition("std_msgs/msg/Header").encode()
+        )
+        state = writer.register_channel("/state", "json", json_schema)
+        place = writer.register_channel("/place", "cdr", header)
+        writer.add_message(state, 1, b"{}", 1)
+        writer.add_message(place, 2, b"\0\1\0\0" + bytes(8) + b"\4\0\0\0mic\0", 2)
+        writer.finish()
+    return path
+
+
+def test_messages_of_other_encodings_are_left_out_and_named(hearthlog, mixed, tmp_path):
+    done = hearthlog("cat", mixed)
+    assert done.returncode == 3
+    assert done.stdout.splitlines() == [
+        "1970-01-01T00:00:00.000Z /place stamp=1970-01-01T00:00:00.000Z frame_id=mic"
+    ]
+    warning = "hearthlog: /state: holds no ROS 2 messages ('json')"
+    assert done.stderr == f"{warning}: left out\n"
+
+    done = hearthlog("export", mixed, "--output", tmp_path / "tables", "--format", "csv")
+    assert (done.returncode, done.stderr) == (3, f"{warning}: left out\n")
+    assert [path.name for path in (tmp_path / "tables").iterdir()] == ["place.csv"]
+
+    done = hearthlog("cat", mixed, "--topics", "/state")
+    assert (done.returncode, done.stderr) == (1, f"{warning}\n")

@@ -154,6 +154,47 @@ def test_a_definition_from_a_file_is_read_as_well_as_one_that_is_known():
     }
 
 
+def test_idl_files_that_are_joined_as_the_registry_of_mcap_says_are_read():
+    line = "=" * 80
+    text = f"""{line}
+IDL: demo/msg/Whole
+// generated from rosidl_adapter/resource/msg.idl.em
+// with input from demo/msg/Whole.msg
+
+#include "demo/msg/Part.idl"
+
+module demo {{
+  module msg {{
+    @verbatim (language="comment", text=
+      "What it is" "\\n"
+      "# and more")
+    struct Whole {{
+      @unit (value="m")
+      demo::msg::Part part;
+      string<10> name;
+    }};
+  }};
+}};
+
+{line}
+IDL: demo/msg/Part
+module demo {{
+  module msg {{
+    struct Part {{
+      double value;
+    }};
+  }};
+}};
+"""
+    kind = message_type("demo/msg/Whole", "ros2idl", text.encode())
+    payload = b"\0\1\0\0" + struct.pack("<dI4s", 1.5, 4, b"abc\0")
+    rows = decode_rows(kind, np.frombuffer(payload, np.uint8), np.array([0]), np.array([20]))
+    assert {path: values.tolist() for path, values in rows.items()} == {
+        "part.value": [1.5],
+        "name": ["abc"],
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [

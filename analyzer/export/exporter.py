@@ -120,6 +120,7 @@ def write_topics(
         If a log is damaged, if there is no message, or one that the format has no place for.
     """
     selection.verify()
+    selection = selection.decodable()
     writers: dict[str, TopicWriter] = {}
     with ExitStack() as stack:
         for batch in selection.messages(progress):

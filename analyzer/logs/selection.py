@@ -1,5 +1,6 @@
 """Topics, by name or by pattern, and a span of time of some logs."""
 
+import warnings
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -11,8 +12,9 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from hearthlog.analyzer.logs.typed_columns import is_compatible
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.files import CATALOG, find_logs
+from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
@@ -115,6 +117,29 @@ class Selection:
         """
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
+
+    def decodable(self) -> "Selection":
+        """Return the selection without topics whose messages are not of ROS 2, each with a warning.
+
+        Raises
+        ------
+        LogError
+            If no topic is left.
+        """
+        others = {
+            topic: channel.message_encoding
+            for topic, channels in self.channels.items()
+            for channel, schema in channels
+            if schema is None or channel.message_encoding != ENCODING
+        }
+        if not others:
+            return self
+        texts = {topic: f"holds no ROS 2 messages ({form!r})" for topic, form in others.items()}
+        if texts.keys() == self.channels.keys():
+            raise LogError("; ".join(f"{topic}: {text}" for topic, text in texts.items()))
+        for topic, text in texts.items():
+            warnings.warn(HearthlogWarning(f"{text}: left out", topic), stacklevel=2)
+        return self.only(self.channels.keys() - texts.keys())
 
     def no_messages(self) -> list[RawMessages]:
         """Return zero messages of each channel, of which a decoder makes columns without rows."""

@@ -1,5 +1,6 @@
 """Message types as files define them, and how their messages are laid out."""
 
+import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
@@ -22,6 +23,9 @@ from hearthlog.schemas.messages.versions import APPENDED
 _MESSAGE_LIMIT = 100 << 20  # bytes
 _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
+# How MCAP's registry joins the files of a type, and lines of them that rosbags does not read.
+_IDL_FILE = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
+_INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
 
 
 class MessageType:
@@ -162,7 +166,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         if encoding == "ros2msg":
             types = get_types_from_msg(text.decode(), name)
         elif encoding == "ros2idl":
-            types = get_types_from_idl(text.decode())
+            types = _types_from_idl(text.decode())
         else:
             raise LogError(f"{name} is defined as {encoding!r}, not as a ROS 2 message")
     except (TypesysError, UnicodeDecodeError, RecursionError, ValueError) as error:
@@ -174,6 +178,14 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
     }
     return MessageType(name, ours | theirs, growth)
+
+
+def _types_from_idl(text: str) -> dict[str, Any]:
+    types: dict[str, Any] = {}
+    for file in _IDL_FILE.split(text):
+        if file.strip():
+            types |= get_types_from_idl(_INCLUDE.sub("", file))
+    return types
 
 
 def _growth(name: str, theirs: Sequence[Any], ours: Sequence[Any]) -> Growth:

@@ -30,7 +30,7 @@ def cat(
     from hearthlog.analyzer.logs.selection import select
     from hearthlog.analyzer.logs.typed_columns import decode_all
 
-    selection = select(logs, topics or [], *parse_span(start, end))
+    selection = select(logs, topics or [], *parse_span(start, end)).decodable()
     if output_format == "csv" and len(selection.channels) > 1:
         names = ", ".join(sorted(selection.channels))
         wrong_use(f"csv is for one topic: choose one with --topics ({names})")
