@@ -121,7 +121,7 @@ class LogReader:
         """Read the messages of some topics, or of all."""
         with LogFile(self.path) as file:
             for chunk in np.sort(file.chunks, order="offset"):
-                found = read_chunks(file, np.array([chunk]), topics, check=True)
+                found = read_chunks(file, np.array([chunk]), topics)
                 self.channels.update({c.topic: c for c in file.channels.values()})
                 yield from _as_written(found)
 

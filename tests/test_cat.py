@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import subprocess
 from decimal import Decimal
 from functools import partial
@@ -401,15 +402,33 @@ def test_a_reader_who_has_seen_enough_ends_it_quietly(long):
             assert process.wait(60) == 0
 
 
-def test_a_damaged_log_is_one_line(recorded, hearthlog, tmp_path):
-    data = bytearray(find_logs(recorded)[0].read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 4096] = bytes(4096)
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(data)
-    result = hearthlog("cat", damaged)
-    assert result.returncode == 1
-    assert result.stderr.startswith(f"hearthlog: {damaged}: damaged at byte ")
-    assert result.stderr.count("\n") == 1
+def test_of_many_logs_the_damaged_ones_are_named_and_the_rest_is_printed(
+    recorded, hearthlog, tmp_path
+):
+    logs = [tmp_path / log.name for log in find_logs(recorded)]
+    for log in find_logs(recorded):
+        shutil.copy(log, tmp_path)
+    whole = hearthlog("cat", tmp_path).stdout.splitlines()
+    first, last = (hearthlog("cat", log).stdout.splitlines() for log in (logs[0], logs[-1]))
+    data = bytearray(logs[0].read_bytes())
+    data[len(data) // 2] ^= 1
+    logs[0].write_bytes(data)  # in a chunk
+    data = logs[-1].read_bytes()
+    logs[-1].write_bytes(b"\0" + data[1:])  # no log any more
+
+    done = hearthlog("cat", tmp_path)
+    assert done.returncode == 3
+    told = sorted(done.stderr.splitlines())
+    assert len(told) == 2
+    assert told[0].startswith(f"hearthlog: {logs[0]}: damaged at byte ")
+    assert told[1] == f"hearthlog: {logs[-1]}: is no MCAP file"
+    printed = done.stdout.splitlines()
+    others = set(whole) - set(first) - set(last)
+    assert others <= set(printed) <= set(whole) - set(last)
+    assert len(first) // 2 < len(set(first) & set(printed)) < len(first)
+
+    alone = hearthlog("cat", logs[-1])
+    assert (alone.returncode, alone.stderr) == (1, f"hearthlog: {logs[-1]}: is no MCAP file\n")
 
 
 def test_messages_that_are_not_of_ros_2_are_refused(hearthlog, tmp_path):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import random
 import struct
 import subprocess
 import sys
@@ -379,6 +380,27 @@ def test_an_index_that_does_not_belong_to_its_chunk_is_damage(log, tmp_path):
         path.write_bytes(data)
         with pytest.raises(LogError, match="the index of a chunk does not belong to it"):
             read_columns([path])
+
+
+def test_no_changed_byte_becomes_another_value_without_a_word(log, tmp_path):
+    expected_columns = read_columns([log])
+    path = tmp_path / "changed.mcap"
+    rng = random.Random(7)
+    data = log.read_bytes()
+    refused = 0
+    for _ in range(150):
+        changed = bytearray(data)
+        changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        path.write_bytes(changed)
+        try:
+            columns = read_columns([path])
+        except LogError:
+            refused += 1
+            continue
+        for topic, same in expected_columns.items():
+            for field, values in same.fields.items():
+                np.testing.assert_array_equal(columns[topic][field], values)
+    assert 75 < refused < 150
 
 
 def test_a_summary_that_is_damaged_is_done_without(log, tmp_path):

@@ -195,7 +195,7 @@ def messages_of(path):
     """All messages, by topic and in the order of time."""
     found = []
     with LogFile(path) as file:
-        for raw in read_chunks(file, file.chunks, check=True):
+        for raw in read_chunks(file, file.chunks):
             heads = raw.heads
             found += [
                 (raw.channel.topic, time, sent, sequence, raw.buffer[o : o + size].tobytes())

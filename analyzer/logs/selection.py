@@ -1,12 +1,12 @@
 """Topics, by name or by pattern, and a span of time of some logs."""
 
 import warnings
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog.catalog import Catalog
 
 _LAST = (1 << 63) - 1  # log time
+Result = TypeVar("Result")
 Described = tuple[Channel, Schema | None]
 
 
@@ -58,21 +59,30 @@ class Selection:
         Yields
         ------
         list of RawMessages
-            As `iterate_messages` yields them; checksums are not compared.
+            As `iterate_messages` yields them; what is damaged is left out, with a warning for each
+            log.
 
         Raises
         ------
         LogError
-            If a log is damaged.
+            If a log cannot be read any more.
         """
         first, last = self.span
-        for batch in iterate_messages(self.logs, self.topics, self.start, self.end):
+        damaged: set[Path] = set()
+
+        def leave_out(path: Path, error: LogError) -> None:
+            if path not in damaged:
+                damaged.add(path)
+                _warn(path, error)
+
+        chosen = self.topics, self.start, self.end
+        for batch in iterate_messages(self.logs, *chosen, on_damage=leave_out):
             yield batch
             now = max(int(messages.log_times[-1]) for messages in batch)
             progress((now - first) / max(last - first, 1))
 
     def verify(self) -> None:
-        """Compare the chunks with their checksums, which `messages` does not.
+        """Compare all chunks with their checksums, before a first message is read.
 
         Raises
         ------
@@ -161,6 +171,8 @@ def select(
 ) -> Selection:
     """Find the logs that have messages in a span of time, and their topics of some names.
 
+    A log that is damaged is left out, with a warning, unless there is no other.
+
     Parameters
     ----------
     paths : iterable of Path
@@ -174,19 +186,37 @@ def select(
     Raises
     ------
     LogError
-        If there is no such log, if one is damaged, or if a pattern fits no topic.
+        If there is no such log, if none of them is sound, or if a pattern fits no topic.
     """
     catalogs: dict[Path, Catalog | None] = {}
     for each in paths:
         catalogs |= dict.fromkeys(find_logs(each), _catalog(each))
     files = {path.resolve(): path for path in catalogs}
-    spans = time_spans(files.values(), lambda path: _span(path, catalogs[path]))
+    damages: dict[Path, LogError] = {}
+
+    def sound(function: Callable[[Path], Result]) -> Callable[[Path], Result | None]:
+        def result(path: Path) -> Result | None:
+            try:
+                return function(path)
+            except LogError as error:
+                damages[path] = error
+                return None
+
+        return result
+
+    spans = time_spans(files.values(), sound(lambda path: _span(path, catalogs[path])))
     chosen = [
         (first, last, path)
         for first, last, path in spans
         if (start is None or last >= start) and (end is None or first < end)
     ]
-    contents = list(map_logs(_Content, [path for _, _, path in chosen]))
+    read = map_logs(sound(_Content), [path for _, _, path in chosen])
+    contents = [content for content in read if content is not None]
+    for path, error in damages.items():
+        if not contents:
+            raise error
+        _warn(path, error)
+    chosen = [row for row in chosen if row[2] not in damages]
     channels = _by_topic(channel for content in contents for channel in content.channels)
     topics = _matching(patterns, channels) if patterns and contents else None
     metadata: list[Mapping[str, str]] = []
@@ -207,6 +237,11 @@ def select(
             max((last for _, last, _ in chosen), default=0),
         ),
     )
+
+
+def _warn(path: Path, error: LogError) -> None:
+    text = str(error).removeprefix(f"{path}: ")
+    warnings.warn(HearthlogWarning(text, path), stacklevel=3)
 
 
 def _catalog(folder: Path) -> "Catalog | None":

@@ -145,7 +145,7 @@ def _read_through(file: LogFile, summary: Summary) -> None:
     for channel in _channels(file):
         _topic(summary, *channel)
     frames: dict[str, Counter[str]] = {}
-    for batch in read_in_batches(file, file.chunks, check=True):
+    for batch in read_in_batches(file, file.chunks):
         for raw in batch:
             times = raw.log_times
             topic = _topic(summary, raw.channel, raw.schema)

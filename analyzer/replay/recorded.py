@@ -89,7 +89,7 @@ def read_recorded(
     topics = {topic(info.microphone, kind): type_ for kind, type_ in kinds.items()}
     if not sound_only:
         topics[DIAGNOSTICS] = message_types.DIAGNOSTICS
-    for batch in iterate_messages([info.path], topics, start, end, check=sound_only):
+    for batch in iterate_messages([info.path], topics, start, end):
         by_type: _RawByType = {type_: [] for type_ in (*_TYPES.values(), message_types.DIAGNOSTICS)}
         for raw in batch:
             type_ = topics[raw.channel.topic]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, Protocol, Self, TypeVar
@@ -9,6 +10,7 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -104,8 +106,8 @@ class _Query(NamedTuple):
     topics: Collection[str] | None
     start: int
     end: int
-    check: bool = False
     every: int = 1
+    on_damage: Callable[[Path, LogError], None] | None = None
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a message of the query."""
@@ -120,9 +122,20 @@ class _Query(NamedTuple):
         """Read the messages of a batch that the query asks for."""
         messages: list[RawMessages] = []
         for file, chunks in batch.parts:
-            read = read_chunks(file, chunks, self.topics, check=self.check)
-            messages += _between(read, self.start, self.end)
+            messages += _between(self._messages(file, chunks), self.start, self.end)
         return messages
+
+    def _messages(self, file: LogFile, chunks: NDArray[np.void]) -> list[RawMessages]:
+        if self.on_damage is None:
+            return read_chunks(file, chunks, self.topics)
+        try:
+            return read_chunks(file, chunks, self.topics)
+        except LogError as error:
+            if len(chunks) == 1:
+                self.on_damage(file.path, error)
+                return []
+        each = (self._messages(file, chunks[i : i + 1]) for i in range(len(chunks)))
+        return list(chain.from_iterable(each))
 
 
 class _Batch(NamedTuple):
@@ -139,7 +152,7 @@ def iterate_messages(
     start: int | None = None,
     end: int | None = None,
     *,
-    check: bool = False,
+    on_damage: Callable[[Path, LogError], None] | None = None,
 ) -> Iterator[list[RawMessages]]:
     """Read the messages of some logs, still encoded.
 
@@ -150,8 +163,9 @@ def iterate_messages(
         Names of the topics; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-    check : bool
-        Whether to compare chunks with their checksums.
+    on_damage : callable, optional
+        Told of a log, and of a chunk of it that is damaged and left out, from the threads that
+        read. By default the error is raised.
 
     Yields
     ------
@@ -164,7 +178,7 @@ def iterate_messages(
     LogError
         If a log cannot be read, is no MCAP file, or is damaged.
     """
-    return _iterate(logs, _query(topics, start, end)._replace(check=check), list)
+    return _iterate(logs, _query(topics, start, end)._replace(on_damage=on_damage), list)
 
 
 def iterate_pieces(  # noqa: PLR0913

@@ -31,8 +31,6 @@ def read_chunks(
     file: LogFile,
     chunks: NDArray[np.void],
     topics: Collection[str] | None = None,
-    *,
-    check: bool = False,
 ) -> list[RawMessages]:
     """Read the messages of some topics, or of all, from some chunks of a log.
 
@@ -44,8 +42,6 @@ def read_chunks(
         Rows of `file.chunks`.
     topics : collection of str, optional
         Topics to read: all of them if None; none if empty, which only adds definitions.
-    check : bool
-        Whether to compare chunks with their checksums, which takes longer than to decompress.
 
     Returns
     -------
@@ -60,7 +56,7 @@ def read_chunks(
     """
     if not len(chunks):
         return []
-    batch = _read(file, chunks, check=check)
+    batch = _read(file, chunks)
     indices = batch.indices(_other_channels(file, topics))
     if not indices.keys() <= file.channels.keys():
         _define(file, indices.keys())
@@ -74,8 +70,6 @@ def read_in_batches(
     file: LogFile,
     chunks: NDArray[np.void],
     topics: Collection[str] | None = None,
-    *,
-    check: bool = False,
 ) -> Iterator[list[RawMessages]]:
     """Read chunks as `read_chunks` does, a few megabytes at a time.
 
@@ -87,8 +81,6 @@ def read_in_batches(
         Rows of `file.chunks`.
     topics : collection of str, optional
         Topics to read: all of them if None; none if empty, which only adds definitions.
-    check : bool
-        Whether to compare chunks with their checksums, which takes longer than to decompress.
 
     Yields
     ------
@@ -103,7 +95,7 @@ def read_in_batches(
     """
     batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
-        yield read_chunks(file, batch, topics, check=check)
+        yield read_chunks(file, batch, topics)
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
@@ -121,7 +113,7 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
     LogError
         If the log cannot be read, a chunk is damaged, or what follows one is no message index.
     """
-    for _ in read_in_batches(file, chunks, topics=(), check=True):
+    for _ in read_in_batches(file, chunks, topics=()):
         pass
 
 
@@ -151,8 +143,8 @@ def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:
     return [number for number, channel in file.channels.items() if channel.topic not in topics]
 
 
-def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
-    """Read and decompress chunks."""
+def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
+    """Read and decompress chunks, and compare them with their checksums."""
     raw, starts = _read_stored(file, chunks)
     lengths, indexed = chunks["length"], chunks["index_length"] >= 0
     records: list[tuple[ChunkHead | None, memoryview]] = []
@@ -173,7 +165,7 @@ def _read(file: LogFile, chunks: NDArray[np.void], *, check: bool) -> "_Batch":
             buffer[first:end] = record
             continue
         try:
-            decompress_into(buffer[first:end].data, head, record, check=check)
+            decompress_into(buffer[first:end].data, head, record)
         except McapError as error:
             raise file.damaged(int(chunks["offset"][number]), error) from error
     return _Batch(file, chunks, sizes, buffer, raw, starts)
@@ -226,7 +218,7 @@ def _define(file: LogFile, identities: AbstractSet[int]) -> None:
     damage = None
     for chunk in file.chunks[np.argsort(file.chunks["offset"])]:
         try:
-            _read(file, np.array([chunk]), check=False).index_records()
+            _read(file, np.array([chunk])).index_records()
         except LogError as error:  # another chunk may define them
             damage = damage or error
         if identities <= file.channels.keys():

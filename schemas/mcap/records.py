@@ -152,16 +152,14 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
     return ChunkHead(start, end, size, crc, compression, slice(first, first + stored))
 
 
-def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = False) -> bytes:
-    """Decompress the records of a chunk.
+def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
+    """Decompress the records of a chunk, and compare them with its checksum.
 
     Parameters
     ----------
     head : ChunkHead
     content : bytes-like
         The chunk's record, without opcode and length.
-    check : bool
-        Whether to compare with the checksum, which takes longer than to decompress.
 
     Returns
     -------
@@ -174,14 +172,12 @@ def decompress(head: ChunkHead, content: bytes | memoryview, *, check: bool = Fa
         If the compression is unknown, or the data are damaged.
     """
     out = bytearray(head.size)
-    decompress_into(memoryview(out), head, content, check=check)
+    decompress_into(memoryview(out), head, content)
     return bytes(out)
 
 
-def decompress_into(
-    out: memoryview, head: ChunkHead, content: bytes | memoryview, *, check: bool = False
-) -> None:
-    """Decompress the records of a chunk into a buffer.
+def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryview) -> None:
+    """Decompress the records of a chunk into a buffer, and compare them with its checksum.
 
     Parameters
     ----------
@@ -190,8 +186,6 @@ def decompress_into(
     head : ChunkHead
     content : bytes-like
         The chunk's record, without opcode and length.
-    check : bool
-        Whether to compare with the checksum, which takes longer than to decompress.
 
     Raises
     ------
@@ -206,7 +200,7 @@ def decompress_into(
         raise McapError(f"a chunk cannot be decompressed ({error})") from error
     if size != head.size:
         raise McapError("a chunk has another size than it claims")
-    if check and head.crc and zlib.crc32(out) != head.crc:
+    if head.crc and zlib.crc32(out) != head.crc:
         raise McapError("a chunk has another checksum than it claims")
 
 

@@ -243,14 +243,14 @@ class RecordVerifier:
         if size > LIMIT:
             raise McapError("a chunk claims to be too large")
         compression = head[name : first - UINT64.size]
-        claim = ChunkHead(start, end, size, crc, compression, slice(None))
+        claim = ChunkHead(start, end, size, 0, compression, slice(None))
         # One of two lengths may be wrong. Decompressors overlook what follows their data, so the
         # shorter one comes first: if it is enough it is right.
         lengths = sorted({stored, length + HEAD.size - first})
         for number in lengths:
             try:
                 data = self._data(offset + first, number)
-                content, checksum = self._prove(claim, data)
+                content, checksum = self._prove(claim, data, crc)
             except McapError:
                 if number == lengths[-1]:
                     raise
@@ -290,12 +290,12 @@ class RecordVerifier:
             raise McapError("a chunk claims to be longer than the file")
         return memoryview(self.read(offset, length))
 
-    def _prove(self, head: ChunkHead, data: memoryview) -> tuple[bytes, int]:
-        """Decompress a chunk; return its content and its checksum."""
+    def _prove(self, head: ChunkHead, data: memoryview, crc: int) -> tuple[bytes, int]:
+        """Decompress a chunk; return its content and its checksum, which `crc` is, or 0."""
         self.work += head.size
         content = decompress(head, data)
         checksum = zlib.crc32(content)
-        if head.crc not in {0, checksum}:
+        if crc not in {0, checksum}:
             raise McapError("a chunk has another checksum than it claims")
         return content, checksum
 

@@ -49,7 +49,8 @@ class Chunk:
         self._index_length = 0
         try:
             self._head = chunk_head(record.content)
-            self._records = decompress(self._head, record.content)
+            unchecked = self._head._replace(crc=0)  # a wrong checksum has a rule of its own
+            self._records = decompress(unchecked, record.content)
         except McapError as error:
             self._error("chunk-data", str(error))
             return

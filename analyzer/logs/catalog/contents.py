@@ -126,7 +126,7 @@ class _Reading:
         topics = None
         if self._file.statistics is not None:
             topics = {self._file.channels[i].topic for i in self.channels_of(types)}
-        for batch in read_in_batches(self._file, chunks, topics, check=True):
+        for batch in read_in_batches(self._file, chunks, topics):
             for columns in decode_types(self._file.path, batch, types):
                 self._note(columns)
 
