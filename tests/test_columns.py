@@ -229,6 +229,14 @@ def test_a_log_that_is_being_written_is_read_up_to_its_last_flush(tmp_path):
     assert columns["frame"].tolist() == list(range(15))
 
 
+def test_a_log_that_is_finished_after_its_name_was_found_is_read(tmp_path):
+    log = written(tmp_path / "home_20260301T070000Z.mcap", "/mic/label", np.arange(5))
+    columns = read_columns([active_path(log)])["/mic/label"]
+    assert columns["frame"].tolist() == [0, 1, 2, 3, 4]
+    with pytest.raises(LogError, match=r"none\.mcap\.active: cannot be read"):
+        read_columns([tmp_path / "none.mcap.active"])
+
+
 def test_files_that_overlap_and_layers_come_as_one_series_in_the_order_of_time(tmp_path):
     first = written(tmp_path / "a.mcap", "/mic/label", np.arange(0, 40_000, 2))
     second = written(tmp_path / "b.mcap", "/mic/label", np.arange(1, 30_001, 2))

@@ -7,7 +7,6 @@ from mcap import records
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.logs.files import SUFFIX, is_active, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -40,7 +39,7 @@ def channels_of(log: Path) -> list[ChannelType]:
     LogError
         If it cannot be read, is no MCAP file, or is damaged.
     """
-    with LogFile(_named_now(log)) as file:
+    with LogFile(log) as file:
         read_definitions(file)
         return [(each, file.schemas.get(each.schema_id)) for each in file.channels.values()]
 
@@ -155,8 +154,8 @@ class Recording:
         self, start: int, end: int, topics: Collection[str] | None = None
     ) -> Generator[list[RawMessages], None, None]:
         """Read all logs together; without those that turn out to be damaged."""
-        found = [_named_now(path) for a, b, path in self._spans if a < end and b >= start]
-        logs = [path for path in found if path not in self._passed_over]
+        spans = [path for a, b, path in self._spans if a < end and b >= start]
+        logs = [path for path in spans if path not in self._passed_over]
         try:
             for batch in iterate_messages(logs, topics, start, end):
                 start = 1 + max(int(part.log_times[-1]) for part in batch)
@@ -167,12 +166,6 @@ class Recording:
             self._passed_over |= damaged
             if damaged:
                 yield from self._between(start, end, topics)
-
-
-def _named_now(log: Path) -> Path:
-    """Return the name of a log that was perhaps finished since it was found."""
-    finished = log.with_name(stem(log) + SUFFIX)
-    return finished if is_active(log) and finished.exists() else log
 
 
 def _is_sound(log: Path, start: int, end: int) -> bool:

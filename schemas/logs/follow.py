@@ -205,10 +205,9 @@ def _names(path: Path) -> tuple[Path, Path]:
 
 def _open(path: Path) -> Iterator[_Growing]:
     """Open a log that may get its final name at any moment."""
-    for name in _names(path):
-        with suppress(LogError):
-            yield _Growing(LogFile(name, indexed=False))
-            return
+    active, _ = _names(path)
+    with suppress(LogError):
+        yield _Growing(LogFile(active, indexed=False))
 
 
 class _Folder:

@@ -27,7 +27,7 @@ from hearthlog.schemas.mcap.chunk_table import (
 )
 from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
-from hearthlog.schemas.storage.byte_ranges import Section, open_file
+from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
 
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 
@@ -38,12 +38,15 @@ class LogFile:
     Parameters
     ----------
     path : Path
-        On this machine, or a `upath.UPath` of a store, which is read by ranges.
+        On this machine, or a `upath.UPath` of a store, which is read by ranges. One that was
+        finished since its name was found is opened by its final name.
     indexed : bool
         Whether to look for the chunks at once; without that, `scan_new` finds them.
 
     Attributes
     ----------
+    path : Path
+        Name by which it was opened.
     complete : bool
         Whether the file was finished.
     ended : bool
@@ -68,7 +71,7 @@ class LogFile:
     """
 
     def __init__(self, path: Path, *, indexed: bool = True) -> None:
-        self.path = path
+        self.path, self._file = open_log(path)
         self.complete = False
         self.ended = False
         self.header: records.Header | None = None
@@ -79,7 +82,6 @@ class LogFile:
         self.channel_sets: list[frozenset[int]] = []
         self.chunks = np.empty(0, CHUNKS)
         self._end = len(MAGIC)  # of the records that were scanned
-        self._file = open_file(path)
         self._sets: dict[frozenset[int], int] = {}
         try:
             self._check_magic()
@@ -366,3 +368,32 @@ class LogFile:
         self.channel_sets.clear()
         self._sets.clear()
         self.statistics = None
+
+
+def open_log(path: Path) -> tuple[Path, LocalFile | StoredFile]:
+    """Open the file of a log by its name, or by the final name that it has got since.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Returns
+    -------
+    path : Path
+        Name by which it was opened.
+    file : LocalFile or StoredFile
+        For the caller to close.
+
+    Raises
+    ------
+    LogError
+        If it cannot be opened.
+    """
+    try:
+        return path, open_file(path)
+    except LogError:
+        final = path.with_suffix("")
+        if not path.name.endswith(ACTIVE_SUFFIX) or not final.exists():
+            raise
+        return final, open_file(final)

@@ -13,9 +13,9 @@ from mcap.records import McapRecord
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import iterate_records
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, SUMMARY_OFFSET
-from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.logfile import LogFile, open_log
 from hearthlog.schemas.mcap.records import parse, read_footer
-from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile, open_file
+from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile
 
 _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
 
@@ -39,7 +39,8 @@ def time_span(path: Path) -> tuple[int, int] | None:
         If it cannot be read, is no MCAP file, or is damaged.
     """
     try:
-        with closing(open_file(path)) as file:
+        _, opened = open_log(path)
+        with closing(opened) as file:
             statistics = _statistics(file)
     except (McapError, UnicodeDecodeError, struct.error):
         statistics = None
@@ -67,16 +68,15 @@ def topic_counts(path: Path) -> Counter[str]:
         Nothing is counted if the log has no statistics, they are damaged, or it cannot be read.
     """
     topics: Counter[str] = Counter()
-    with (
-        suppress(LogError, McapError, UnicodeDecodeError, struct.error),
-        closing(open_file(path)) as file,
-    ):
-        statistics = _statistics(file)
-        counts = {} if statistics is None else statistics.channel_message_counts
-        for channel in _summary_group(file, Opcode.CHANNEL):
-            if isinstance(channel, records.Channel):
-                most = file.size  # a message takes more than a byte
-                topics[channel.topic] += min(counts.get(channel.id, 0), most)
+    with suppress(LogError, McapError, UnicodeDecodeError, struct.error):
+        _, opened = open_log(path)
+        with closing(opened) as file:
+            statistics = _statistics(file)
+            counts = {} if statistics is None else statistics.channel_message_counts
+            for channel in _summary_group(file, Opcode.CHANNEL):
+                if isinstance(channel, records.Channel):
+                    most = file.size  # a message takes more than a byte
+                    topics[channel.topic] += min(counts.get(channel.id, 0), most)
     return topics
 
 
