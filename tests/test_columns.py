@@ -17,6 +17,7 @@ import pytest
 import zstandard
 from logreader import LogReader
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -30,8 +31,10 @@ from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.mcap import chunks as chunk_reading
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.records import encode as encode_record
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
@@ -409,6 +412,50 @@ def test_no_changed_byte_becomes_another_value_without_a_word(log, tmp_path):
             for field, values in same.fields.items():
                 np.testing.assert_array_equal(columns[topic][field], values)
     assert 75 < refused < 150
+
+
+def test_chunks_read_together_are_what_each_of_them_holds(log, tmp_path, monkeypatch):
+    rng = random.Random(8)
+    data = log.read_bytes()
+    with LogFile(log) as file:
+        first, chunk = file.chunks[0], file.chunks[3]
+    heads = range(int(chunk["offset"]), int(chunk["offset"]) + 60)
+    changes = [(place, 1 << rng.randrange(8)) for place in [0, *heads]]
+    changes += [(rng.randrange(int(first["offset"]), len(data)), 1) for _ in range(30)]
+    path = tmp_path / "changed.mcap"
+    for place, bits in changes:
+        changed = bytearray(data)
+        changed[place] ^= bits if place else 0
+        path.write_bytes(changed)
+        together = outcome(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(chunk_reading, "decompress_together", lambda *_: None)
+            each = outcome(path)
+        assert together == each
+
+
+def test_an_index_record_that_is_too_short_is_damage(tmp_path):
+    path = written(tmp_path / "home_20260301T070000Z.mcap", "/mic/label", np.arange(5))
+    with LogFile(path) as file:
+        end = int(file.chunks["offset"][0] + file.chunks["length"][0])
+    cut = tmp_path / "cut.mcap"
+    index = HEAD.pack(Opcode.MESSAGE_INDEX, 1) + b"\0"
+    cut.write_bytes(path.read_bytes()[:end] + index + HEAD.pack(0x80, 0))
+    with pytest.raises(LogError, match="a message index is cut"):
+        read_columns([cut])
+
+
+def outcome(path):
+    """Bytes of the columns of a log, or what is wrong with it."""
+    try:
+        columns = read_columns([path])
+    except LogError as error:
+        return str(error)
+    return {
+        (topic, field): values.tobytes() if values.dtype != object else values.tolist()
+        for topic, one in columns.items()
+        for field, values in {"": one.log_times, **one.fields}.items()
+    }
 
 
 def test_a_summary_that_is_damaged_is_done_without(log, tmp_path):

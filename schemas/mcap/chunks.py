@@ -15,6 +15,7 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
+from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
@@ -24,7 +25,7 @@ _WRONG_INDEX = "the index of a chunk does not belong to it"
 _CHANNELS_LIMIT = 1 << 16
 _BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
-Entries = tuple[int, bytes | memoryview]  # of the index of a chunk, and which chunk that is
+Entries = tuple[Int64, NDArray[np.void]]  # which chunk, and the entry of its index, in each row
 
 
 def read_chunks(
@@ -146,6 +147,18 @@ def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:
 def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
     """Read and decompress chunks, and compare them with their checksums."""
     raw, starts = _read_stored(file, chunks)
+    limit = int(np.clip(chunks["size"], 0, LIMIT).sum()) + LIMIT
+    read = None
+    if (chunks["index_length"] >= 0).all():
+        read = decompress_together(raw, starts, chunks["length"], limit)
+    buffer, sizes = read or _decompress_each(file, chunks, raw, starts, limit)
+    return _Batch(file, chunks, sizes, buffer, raw, starts)
+
+
+def _decompress_each(
+    file: LogFile, chunks: NDArray[np.void], raw: Bytes, starts: Int64, limit: int
+) -> tuple[Bytes, Int64]:
+    """Decompress chunks one by one, and find the one that is damaged."""
     lengths, indexed = chunks["length"], chunks["index_length"] >= 0
     records: list[tuple[ChunkHead | None, memoryview]] = []
     for number, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
@@ -155,7 +168,7 @@ def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
         except McapError as error:
             raise file.damaged(int(chunks["offset"][number]), error) from error
     sizes = np.array([len(record) if head is None else head.size for head, record in records], int)
-    if sizes.sum() > np.clip(chunks["size"], 0, LIMIT).sum() + LIMIT:
+    if sizes.sum() > limit:
         raise file.damaged(int(chunks["offset"][0]), "chunks are larger than their index claims")
     buffer = np.empty(sizes.sum(), np.uint8)
     end = 0
@@ -168,7 +181,7 @@ def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
             decompress_into(buffer[first:end].data, head, record)
         except McapError as error:
             raise file.damaged(int(chunks["offset"][number]), error) from error
-    return _Batch(file, chunks, sizes, buffer, raw, starts)
+    return buffer, sizes
 
 
 def _read_stored(file: LogFile, chunks: NDArray[np.void]) -> tuple[Bytes, Int64]:
@@ -198,7 +211,7 @@ def _chunk(record: memoryview) -> tuple[ChunkHead, memoryview]:
     return chunk_head(content), content
 
 
-def _index_records(file: LogFile, content: memoryview) -> dict[int, bytes]:
+def _index_records(file: LogFile, content: memoryview) -> dict[int, NDArray[np.void]]:
     """Go through the records of a chunk: add its definitions to the file, make its index."""
     starts: list[int] = []
     for opcode, start, end in iterate_records(content):
@@ -210,7 +223,8 @@ def _index_records(file: LogFile, content: memoryview) -> dict[int, bytes]:
                 file.schemas.setdefault(record.id, record)
             elif isinstance(record, records.Channel):
                 file.channels.setdefault(record.id, record)
-    return index_messages(content, np.array(starts, np.int64))
+    made = index_messages(content, np.array(starts, np.int64))
+    return {channel: np.frombuffer(rows, formats.INDEX_ENTRIES) for channel, rows in made.items()}
 
 
 def _define(file: LogFile, identities: AbstractSet[int]) -> None:
@@ -242,16 +256,28 @@ class _Batch(NamedTuple):
         ends = self.starts + self.chunks["length"]
         parts = self._index_parts(ends, ends + np.maximum(self.chunks["index_length"], 0))
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
-        entries_of: dict[int, list[Entries]] = {}
-        for number, identity, first, size in parts[~np.isin(parts[:, 1], others)].tolist():
-            part = self.raw[first : first + size].data
-            entries_of.setdefault(identity, []).append((number, part))
+        parts = parts[~np.isin(parts[:, 1], others)]
+        identities, firsts = np.unique(parts[:, 1], return_index=True)
+        entries_of = {
+            identity: [self._entries(parts[parts[:, 1] == identity])]
+            for identity in identities[np.argsort(firsts)].tolist()
+        }
         unknown = not entries_of.keys() <= self.file.channels.keys()
         for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
             made = self.index_records(number)
             for identity, entries in made.items() if without[number] else ():
-                entries_of.setdefault(identity, []).append((number, entries))
+                of_chunk = np.full(len(entries), number)
+                entries_of.setdefault(identity, []).append((of_chunk, entries))
         return entries_of
+
+    def _entries(self, parts: Int64) -> Entries:
+        """Collect the index entries of some parts, as `_index_parts` gives them."""
+        width = formats.INDEX_ENTRIES.itemsize
+        counts = parts[:, 3] // width
+        before = np.cumsum(counts) - counts
+        places = np.repeat(parts[:, 2] - width * before, counts) + width * np.arange(counts.sum())
+        entries = gather(self.raw, places, width).view(formats.INDEX_ENTRIES)
+        return np.repeat(parts[:, 0], counts), entries
 
     def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
         """Go through the message indexes behind all chunks, one of each chunk at a time.
@@ -288,7 +314,7 @@ class _Batch(NamedTuple):
             numbers, starts, ends = numbers[going], starts[going], ends[going]
         return np.concatenate(parts)
 
-    def index_records(self, number: int = 0) -> dict[int, bytes]:
+    def index_records(self, number: int = 0) -> dict[int, NDArray[np.void]]:
         """Go through the records of a chunk: note its channels, make the index it should have."""
         end = int(self.sizes[: number + 1].sum())
         content = self.buffer[end - int(self.sizes[number]) : end].data
@@ -299,9 +325,8 @@ class _Batch(NamedTuple):
 
     def messages(self, identity: int, parts: Sequence[Entries]) -> RawMessages:
         """Follow the index entries of a channel to its messages, and check every one of them."""
-        entries = np.frombuffer(b"".join(part for _, part in parts), formats.INDEX_ENTRIES)
-        counts = [len(part) // formats.INDEX_ENTRIES.itemsize for _, part in parts]
-        number = np.repeat([number for number, _ in parts], counts)
+        number = np.concatenate([numbers for numbers, _ in parts])
+        entries = np.concatenate([entries for _, entries in parts])
         channel = self.file.channels.get(identity)
         if channel is None:
             raise self._damaged(number[0], "a message of a channel that is not defined")

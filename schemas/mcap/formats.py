@@ -27,6 +27,19 @@ MESSAGE_HEAD = np.dtype(
 # First and last log time, size and CRC uncompressed, length of the compression's name; that name,
 # length of the data (UINT64), data.
 CHUNK = struct.Struct("<QQQII")
+ZSTD_CHUNK_HEAD = np.dtype(  # of a chunk whose compression's name has four letters
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("start", "<i8"),
+        ("end", "<i8"),
+        ("size", "<i8"),
+        ("crc", "<u4"),
+        ("name_length", "<u4"),
+        ("name", "S4"),
+        ("stored", "<i8"),
+    ]
+)
 MESSAGE_INDEX = struct.Struct("<HI")  # channel, bytes of the entries; entries
 MESSAGE_INDEX_HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")]

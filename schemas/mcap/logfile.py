@@ -30,6 +30,10 @@ from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
 
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
+_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
+_CHANNEL_END = HEAD.size + UINT16.size
+_WINDOW = 1 << 14  # bytes
+_ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 
 class LogFile:
@@ -280,15 +284,14 @@ class LogFile:
         """
         rows = array("q")
         row: ChunkRow | None = None
-        for location in self._new_records(self.size):
-            if location.opcode == Opcode.MESSAGE_INDEX and row is not None:
-                row.index_length += location.length
-                row.channels.update(
-                    UINT16.unpack(self.read(location.offset + HEAD.size, UINT16.size))
-                )
+        for opcode, offset, length, head in self._new_records(self.size):
+            if opcode == Opcode.MESSAGE_INDEX and row is not None:
+                row.index_length += length
+                row.channels.add(int.from_bytes(head[HEAD.size : _CHANNEL_END], "little"))
                 continue
-            chunk = self._chunk_row(location)
-            if location.opcode == Opcode.MESSAGE and row is not None and row.continues(location):
+            location = RecordLocation(opcode, offset, length)
+            chunk = self._chunk_row(location, head)
+            if opcode == Opcode.MESSAGE and row is not None and row.continues(location):
                 assert chunk is not None
                 row.extend(chunk)
                 continue
@@ -314,28 +317,38 @@ class LogFile:
         elif location.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
             self._add(self.record(location))
 
-    def _new_records(self, size: int) -> Iterator[RecordLocation]:
-        """Go from record to record, up to where the file ends or is cut."""
+    def _new_records(self, size: int) -> Iterator[tuple[int, int, int, bytes]]:
+        """Go from record to record, up to where the file ends or is cut.
+
+        Yields
+        ------
+        tuple of (int, int, int, bytes)
+            Opcode, offset and length of the record, and its first bytes, heads included.
+        """
+        window, first = b"", 0  # of the file, for there are half a million records an hour
         while True:
-            head = self.read(self._end, HEAD.size)
+            start = self._end - first
+            if not 0 <= start <= len(window) - _RECORD_HEAD:
+                window, first, start = self.read(self._end, _WINDOW), self._end, 0
+            head = window[start : start + _RECORD_HEAD]
             if len(head) < HEAD.size and not self.complete:
                 return
-            opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
-            if opcode in {Opcode.DATA_END, Opcode.FOOTER}:
+            opcode, length = HEAD.unpack_from(head) if len(head) >= HEAD.size else (0, 0)
+            if opcode in _ENDS:
                 self.ended = True
                 return
-            if opcode == 0 or self._end + HEAD.size + length > size:
+            length += HEAD.size
+            if opcode == 0 or self._end + length > size:
                 if self.complete:
                     raise self.damaged(self._end, "a record claims to be longer than the file")
                 return
-            yield RecordLocation(opcode, self._end, HEAD.size + length)
-            self._end += HEAD.size + length
+            yield opcode, self._end, length, head[:length]
+            self._end += length
 
-    def _chunk_row(self, location: RecordLocation) -> ChunkRow | None:
+    def _chunk_row(self, location: RecordLocation, head: bytes) -> ChunkRow | None:
         """Describe a chunk, or a message outside of one; None if the record is neither."""
         if location.opcode not in {Opcode.CHUNK, Opcode.MESSAGE}:
             return None
-        head = self.read(location.offset, min(location.length, HEAD.size + CHUNK.size))
         try:
             return read_chunk_row(location, head)
         except McapError as error:

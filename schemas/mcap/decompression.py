@@ -1,0 +1,83 @@
+"""Many chunks decompressed at once, without Python between one and the next."""
+
+import threading
+import zlib
+from itertools import pairwise
+
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+
+from hearthlog.schemas.arrays import Bytes, Int64, gather
+from hearthlog.schemas.mcap.formats import HEAD, ZSTD_CHUNK_HEAD
+from hearthlog.schemas.mcap.records import LIMIT
+
+_IS_POSSIBLE = "multi_decompress_to_buffer" in zstandard.backend_features
+
+
+def decompress_together(
+    raw: Bytes, starts: Int64, lengths: Int64, limit: int
+) -> tuple[Bytes, Int64] | None:
+    """Decompress chunks, and compare them with their checksums, if all are sound and of zstd.
+
+    Parameters
+    ----------
+    raw : np.ndarray [shape=(b,)], uint8
+        Holds the records of the chunks.
+    starts, lengths : np.ndarray [shape=(n,)], int64
+        Where each record begins, with its opcode, and its bytes, heads included.
+    limit : int
+        Bytes, uncompressed, that the chunks may have in all.
+
+    Returns
+    -------
+    buffer : np.ndarray [shape=(c,)], uint8
+        The records of all chunks, uncompressed, one behind the other.
+    sizes : np.ndarray [shape=(n,)], int64
+        Bytes of each chunk, uncompressed.
+
+    None is returned in place of both if any chunk is damaged, of another compression, or empty: one
+    by one, `decompress_into` says which, and what is wrong.
+    """
+    fixed = ZSTD_CHUNK_HEAD.itemsize
+    if not _IS_POSSIBLE or (lengths < fixed).any():
+        return None
+    heads = gather(raw, starts, fixed).view(ZSTD_CHUNK_HEAD)
+    sizes, stored = heads["size"], heads["stored"]
+    simple = (
+        (heads["opcode"] == Opcode.CHUNK)
+        & (heads["length"] == lengths - HEAD.size)
+        & (heads["name_length"] == len(b"zstd"))
+        & (heads["name"] == b"zstd")
+        & (stored > 0)
+        & (stored <= lengths - fixed)
+        & (sizes > 0)
+        & (sizes <= LIMIT)
+    )
+    if not simple.all() or sizes.sum() > limit:
+        return None
+    frames = np.stack([starts + fixed, stored], axis=1).astype(np.uint64)
+    try:
+        chunks = _LOCAL.zstd.multi_decompress_to_buffer(
+            zstandard.BufferWithSegments(raw.data, frames.tobytes()),
+            decompressed_sizes=sizes.astype(np.uint64).tobytes(),
+            threads=1,  # whoever reads has threads of its own
+        )
+    except zstandard.ZstdError:
+        return None
+    buffer = np.frombuffer(b"".join(chunks), np.uint8)  # type: ignore[arg-type]  # of buffers
+    ends = [0, *np.cumsum(sizes).tolist()]
+    sums = [zlib.crc32(buffer[start:end].data) for start, end in pairwise(ends)]
+    if ((heads["crc"] != sums) & (heads["crc"] != 0)).any():
+        return None
+    return buffer, sizes.astype(np.int64)
+
+
+class _Local(threading.local):
+    """Decompressors are dear to make and must not be shared between threads."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_LOCAL = _Local()
