@@ -420,6 +420,14 @@ def test_without_an_output_what_came_of_it_is_told(folder, model_file, hearthlog
     assert found["compared"]["bit_for_bit"] is True
 
 
+def test_a_starter_model_is_found_where_it_was_recorded_with(day, hearthlog, tmp_path):
+    logs = tmp_path / "logs"
+    assert hearthlog("record", day, "--model", "general", "-o", logs).returncode == 0
+    replayed = hearthlog("replay", logs)
+    assert (replayed.returncode, replayed.stderr) == (0, "")
+    assert "bit for bit" in replayed.stdout
+
+
 def test_the_recorded_model_is_found_beside_the_logs_and_asked_for_by_name_if_not(
     folder, model_file, other_model, hearthlog, tmp_path
 ):

@@ -42,8 +42,9 @@ def replay(
         Path | None,
         typer.Option(
             help="Model file, the one that was recorded with or another. Without it the one that "
-            "was recorded with is looked for in the current folder, in models, and beside the "
-            "logs; if it is not there, there are statistics but no labels (exit status 3)."
+            "was recorded with is looked for in the current folder, in models, beside the logs, "
+            "and among those that come with hearthlog; if it is not there, there are statistics "
+            "but no labels (exit status 3)."
         ),
     ] = None,
     microphone: Microphone = None,
@@ -70,6 +71,7 @@ def replay(
     """
     from hearthlog.analyzer.replay.log_set import LogSet
     from hearthlog.analyzer.replay.options import ReplayOptions
+    from hearthlog.models.starter import GENERAL, starter_file
     from hearthlog.schemas.logs.files import find_logs
 
     _check_span(start_offset, playback_duration)
@@ -85,7 +87,8 @@ def replay(
     )
     _check_output(output, path)
     logs = LogSet(find_logs(path), options.kind, microphone)
-    models = _Models(model, (Path(), Path("models"), path if path.is_dir() else path.parent))
+    beside = path if path.is_dir() else path.parent
+    models = _Models(model, (Path(), Path("models"), beside, starter_file(GENERAL).parent))
     models.report(logs.chosen(options))
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):
