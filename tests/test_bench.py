@@ -39,7 +39,7 @@ def bench(*arguments):
         [sys.executable, "-m", "hearthlog.tools.bench", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=400,
         check=False,
     )
 

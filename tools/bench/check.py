@@ -13,7 +13,7 @@ from hearthlog.tools.bench.timing import BenchError, best_of
 from hearthlog.tools.bench.workload import Workload
 
 MINUTES, CLIPS = 5.0, 8  # of a workload that is made in seconds
-_TURNS = 4
+_TURNS, _TURN_SECONDS = 6, 0.1
 _TOLERANCE = 0.3  # of a ratio
 
 Contest = tuple[Callable[[], object], Callable[[], object]]
@@ -37,7 +37,7 @@ def measure_ratios(work: Workload) -> dict[str, float]:
 
 
 def _ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> float:
-    best = best_of({"ours": ours, "theirs": theirs}, _TURNS)
+    best = best_of({"ours": ours, "theirs": theirs}, _TURNS, _TURN_SECONDS)
     return best["theirs"].cpu / best["ours"].cpu
 
 

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Event, Frames
-from hearthlog.recorder.log.finishing import finish_log
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.logs.files import active_path
+from hearthlog.schemas.salvage.recover import recover_log
 from hearthlog.schemas.times import NANOSECONDS
 
 _MIDNIGHT = 1_772_323_200 * NANOSECONDS
@@ -69,12 +68,11 @@ def record_as_live(folder: Path, sound: Path, model: Path) -> LiveLogs:
         Files.
     """
     places = [folder / name for name in LiveLogs._fields]
-    source = _Blocks(FileSource([sound], _MIDNIGHT), places[1], places[0])
-    settings = Settings(output=places[1], model=model, timezone="UTC")
-    (completed,) = record(settings, source, Flag()).logs
+    source = _Blocks(FileSource([sound], _MIDNIGHT), places[2], places[0])
+    settings = Settings(output=places[2], model=model, timezone="UTC")
+    (finished,) = record(settings, source, Flag()).logs
     (unfinished,) = places[0].iterdir()
-    finished = places[2] / completed.relative_to(places[1])
-    finished.parent.mkdir(parents=True)
-    shutil.copy(unfinished, active_path(finished))
-    finish_log(active_path(finished))
+    completed = places[1] / finished.relative_to(places[2])
+    completed.parent.mkdir(parents=True)
+    recover_log(unfinished, completed, completed.name)
     return LiveLogs(unfinished, completed, finished)

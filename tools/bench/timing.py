@@ -38,24 +38,27 @@ class Seconds(NamedTuple):
 _FOREVER = Seconds(float("inf"), float("inf"))
 
 
-def best_of(runs: Mapping[str, Callable[[], object]], turns: int = 5) -> dict[str, Seconds]:
+def best_of(
+    runs: Mapping[str, Callable[[], object]], turns: int = 5, least: float | None = None
+) -> dict[str, Seconds]:
     """Measure the time of each run, in its best turn.
 
-    Others on the machine disturb CPU time less than elapsed time. Turns last at least half a
-    second, because a long run meets other people's work more often than a short one, and come one
-    after the other, because what slows the core slows all alike.
+    Others on the machine disturb CPU time less than elapsed time. Turns last at least `least`
+    seconds, half a one by default, because a long run meets other people's work more often than a
+    short one, and come one after the other, because what slows the core slows all alike.
     """
+    seconds = _TURN_SECONDS if least is None else least
     best = dict.fromkeys(runs, _FOREVER)
     for _ in range(turns):
         for name, run in runs.items():
-            best[name] = best[name].or_less(_mean_time(run))
+            best[name] = best[name].or_less(_mean_time(run, seconds))
     return best
 
 
-def _mean_time(run: Callable[[], object]) -> Seconds:
+def _mean_time(run: Callable[[], object], least: float) -> Seconds:
     began, used = time.perf_counter(), time.process_time()
     count, cpu = 0, 0.0
-    while cpu < _TURN_SECONDS:
+    while cpu < least:
         run()
         count += 1
         cpu = time.process_time() - used
