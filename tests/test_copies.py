@@ -199,14 +199,17 @@ def test_what_cannot_be_copied_is_refused_in_one_line(recording, tmp_path):
     shutil.copy(logs_in(recording)[0], named / "hour.mcap")
     with pytest.raises(LogError, match="has no time in its name"):
         copy_logs(named, tmp_path / "logs", 2)
-    damaged = part(recording, tmp_path / "damaged", (0,))
-    (log,) = logs_in(damaged)
+    damaged = part(recording, tmp_path / "damaged", (0, 1, 2))
+    log = logs_in(damaged)[1]
     content = bytearray(log.read_bytes())
     with LogFile(log) as file:
         content[file.chunks["offset"][1] + 100] ^= 1
     log.write_bytes(content)
-    with pytest.raises(LogError, match="damaged"):
+    with pytest.raises(LogError, match="is damaged, and not copied"):
         copy_logs(damaged, tmp_path / "broken", 2)
+    assert not (tmp_path / "broken").exists()
+    with pytest.raises(LogError, match="is one file; name the folder"):
+        copy_logs(log, tmp_path / "broken", 2)
     done = subprocess.run(
         [sys.executable, "-m", "hearthlog.tools.home.copies", recording, "2", "-o", tmp_path],
         capture_output=True,

@@ -70,7 +70,9 @@ def record_as_live(folder: Path, sound: Path, model: Path) -> LiveLogs:
     places = [folder / name for name in LiveLogs._fields]
     source = _Blocks(FileSource([sound], _MIDNIGHT), places[2], places[0])
     settings = Settings(output=places[2], model=model, timezone="UTC")
-    (finished,) = record(settings, source, Flag()).logs
+    finished, *later = record(settings, source, Flag()).logs
+    for log in later:  # the end of the last segment, if that is that of the hour
+        log.unlink()
     (unfinished,) = places[0].iterdir()
     completed = places[1] / finished.relative_to(places[2])
     completed.parent.mkdir(parents=True)

@@ -2,8 +2,10 @@
 
 import json
 import re
+import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -114,23 +116,36 @@ def copy_logs(
     recordings = [_recording(chain, period) for chain in _chains(logs)]
     jobs = [(recording, log) for recording in recordings for log in recording.logs]
     written: list[Path] = []
-    try:
-        output.mkdir(parents=True)
+    with _new_folder(output):
         for done, (recording, log) in enumerate(jobs):
             files = [(path, ShiftedLog(path)) for path in find_with_layers([log])]
             write = partial(_write_copy, logs, output, recording, files)
             for paths in prefetch(write, [_Copy(i, count, period) for i in range(count)], _THREADS):
                 written += paths
             progress((done + 1) / len(jobs))
+    return written
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[None]:
+    """Make a folder, and delete it if what it is for fails."""
+    try:
+        folder.mkdir(parents=True)
+        try:
+            yield
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
     except FileExistsError as error:
         raise LogError(f"{error.filename}: exists already; name a new folder") from error
     except OSError as error:
-        raise LogError(f"{output}: cannot be written ({error.strerror})") from error
-    return written
+        raise LogError(f"{folder}: cannot be written ({error.strerror})") from error
 
 
 def _chains(folder: Path) -> list[list[Path]]:
     """List the logs of each node of each home, in the order of time."""
+    if folder.is_file():
+        raise LogError(f"{folder}: is one file; name the folder of the logs")
     chains: dict[tuple[Path, str], list[Path]] = {}
     for log in find_logs(folder):
         if not is_layer(log):
@@ -147,11 +162,18 @@ def _recording(logs: Sequence[Path], period: int) -> _Recording:
         raise LogError(
             f"{logs[0].parent}: these logs span more than {period} s, after which they come again"
         )
-    with LogFile(logs[0]) as file:
+    heard: dict[str, list[Path]] = {}
+    for log in logs:
+        for microphone in _microphones(log):
+            heard.setdefault(microphone, []).append(log)
+    return _Recording(logs, {name: _frames(own, name, period) for name, own in heard.items()})
+
+
+def _microphones(log: Path) -> list[str]:
+    with LogFile(log) as file:
         read_definitions(file)
         names = [parse_topic(channel.topic) for channel in file.channels.values()]
-    microphones = {n.microphone for n in names if n and (n.labelling, n.kind) == (LIVE, "features")}
-    return _Recording(logs, {name: _frames(logs, name, period) for name in sorted(microphones)})
+    return [n.microphone for n in names if n and (n.labelling, n.kind) == (LIVE, "features")]
 
 
 def _frames(logs: Sequence[Path], microphone: str, period: int) -> int:
@@ -238,28 +260,25 @@ class _Edit:
 
     def __call__(self, record: Metadata) -> dict[str, str]:
         """Edit one record."""
-        if record.name == rosbag2.METADATA:
-            return self._rosbag2(record.metadata)
-        if record.name == provenance.METADATA:
-            return self._provenance(dict(record.metadata))
-        return dict(record.metadata)
+        edits = {rosbag2.METADATA: self._rosbag2, provenance.METADATA: self._provenance}
+        edit: Callable[[Mapping[str, str]], dict[str, str]] = edits.get(record.name, dict)
+        try:
+            return edit(record.metadata)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise LogError(f"{self._path}: its record {record.name!r} is not ours") from error
 
     def _rosbag2(self, record: Mapping[str, str]) -> dict[str, str]:
-        key = "serialized_metadata"
-        try:
-            information = json.loads(record[key])
-            for times in (information, *information["files"]):
-                times["starting_time"]["nanoseconds_since_epoch"] += (
-                    self._copy.seconds * NANOSECONDS
-                )
-            for file in information["files"]:
-                file["path"] = self._copy.moved(file["path"])
-            information["relative_file_paths"] = [f["path"] for f in information["files"]]
-        except (ValueError, KeyError, TypeError) as error:
-            raise LogError(f"{self._path}: its record `rosbag2` is not ours") from error
+        key, time = "serialized_metadata", self._copy.seconds * NANOSECONDS
+        information = json.loads(record[key])
+        for times in (information, *information["files"]):
+            times["starting_time"]["nanoseconds_since_epoch"] += time
+        for file in information["files"]:
+            file["path"] = self._copy.moved(file["path"])
+        information["relative_file_paths"] = [file["path"] for file in information["files"]]
         return {**record, key: json.dumps(information)}
 
-    def _provenance(self, record: dict[str, str]) -> dict[str, str]:
+    def _provenance(self, metadata: Mapping[str, str]) -> dict[str, str]:
+        record = dict(metadata)
         copy, logs = self._copy, self._recording.logs
         for key in record.keys() & {"log", "before", "behind"}:
             record[key] = copy.moved(record[key])

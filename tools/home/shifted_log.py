@@ -29,6 +29,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 _TIME = "builtin_interfaces/msg/Time"
 _SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration
+_MOST_BYTES = 1 << 30  # of one log, uncompressed
 _FRAMED = {message_types.FEATURES, message_types.STATISTICS, message_types.LABEL}
 
 Edit = Callable[[Metadata], dict[str, str]]  # what a metadata record says in the copy
@@ -187,6 +188,8 @@ class ShiftedLog:
                 rows.append(entries)
                 offsets = np.frombuffer(entries, INDEX_ENTRIES)["offset"]
                 starts[channel].append(offsets + base)
+            if base + stored.size > _MOST_BYTES:
+                raise LogError(f"{path}: is too large to be copied; a day has 24 logs")
             contents.append(stored.content())
             self._chunks.append((stored._replace(data=b"", entries={}), base, places))
             self._pieces[number] = piece._replace(stored=stored._replace(data=b""))
