@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping
 from itertools import chain
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from hearthlog.tools.bench import features, inference, reading, writing
@@ -13,7 +14,7 @@ from hearthlog.tools.bench.timing import BenchError, best_of
 from hearthlog.tools.bench.workload import Workload
 
 MINUTES, CLIPS = 5.0, 8  # of a workload that is made in seconds
-_TURNS, _TURN_SECONDS = 6, 0.1
+_TURNS, _TURN_SECONDS = 7, 0.1
 _TOLERANCE = 0.3  # of a ratio
 
 Contest = tuple[Callable[[], object], Callable[[], object]]
@@ -37,8 +38,9 @@ def measure_ratios(work: Workload) -> dict[str, float]:
 
 
 def _ratio(ours: Callable[[], object], theirs: Callable[[], object]) -> float:
-    best = best_of({"ours": ours, "theirs": theirs}, _TURNS, _TURN_SECONDS)
-    return best["theirs"].cpu / best["ours"].cpu
+    """Return the median ratio of turns that follow each other: what slows one slows the other."""
+    pairs = [best_of({"ours": ours, "theirs": theirs}, 1, _TURN_SECONDS) for _ in range(_TURNS)]
+    return median(pair["theirs"].cpu / pair["ours"].cpu for pair in pairs)
 
 
 def last_run(path: Path) -> dict[str, Any]:
