@@ -205,6 +205,7 @@ def test_figures_with_a_target_are_kept_run_by_run_and_drawn(tmp_path):
     drawn = picture.read_bytes()
     history.draw(runs, picture)
     assert drawn.startswith(b"<?xml")
+    assert drawn.count(b'<g id="axes_') == 4  # three figures, and the ratio
     assert picture.read_bytes() == drawn
 
 

@@ -87,7 +87,7 @@ def draw(path: Path, picture: Path) -> None:
     import matplotlib as mpl  # noqa: PLC0415  recording does without
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    runs = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    runs = [_with_ratios(json.loads(line)) for line in path.read_text("utf-8").splitlines()]
     names = sorted({name for run in runs for name in run["figures"]})
     rows = max(-(-len(names) // _COLUMNS), 1)
     width, height = _PANEL_INCHES
@@ -100,6 +100,15 @@ def draw(path: Path, picture: Path) -> None:
         figure.savefig(picture, format="svg", metadata={"Date": None})
 
 
+def _with_ratios(run: dict[str, Any]) -> dict[str, Any]:
+    """Count the ratios of a run among its figures; they have no target."""
+    ratios = {
+        f"check, {name}": {"value": ratio, "unit": "x"}
+        for name, ratio in run.get("ratios", {}).items()
+    }
+    return {**run, "figures": run["figures"] | ratios}
+
+
 def _draw_panel(axes: Any, name: str, runs: Sequence[Mapping[str, Any]]) -> None:
     from matplotlib.dates import ConciseDateFormatter  # noqa: PLC0415
 
@@ -110,8 +119,11 @@ def _draw_panel(axes: Any, name: str, runs: Sequence[Mapping[str, Any]]) -> None
         dates = [datetime.fromisoformat(run["date"]) for run in same]
         axes.plot(dates, values, "o-", markersize=3, label=machine)
     last = measured[-1]["figures"][name]
-    axes.axhline(last["limit"], color="grey", linestyle="--", linewidth=1)
-    axes.set_title(f"{name} ({'≤' if last['at_most'] else '≥'} {last['limit']:g})", fontsize=7)
+    title = name
+    if "limit" in last:
+        axes.axhline(last["limit"], color="grey", linestyle="--", linewidth=1)
+        title += f" ({'≤' if last['at_most'] else '≥'} {last['limit']:g})"
+    axes.set_title(title, fontsize=7)
     axes.set_ylabel(last["unit"], fontsize=7)
     axes.set_ylim(bottom=0)
     axes.tick_params(labelsize=6)
