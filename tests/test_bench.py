@@ -249,7 +249,7 @@ def test_a_ratio_that_fell_is_told_from_one_that_noise_moved(tmp_path):
     )
     run = check.last_run(path)
     assert run["ratios"] == {"writing: mcap": 10.0}
-    for ratio, verdict in ((30.0, "met"), (8.0, "met"), (5.0, "MISSED")):
+    for ratio, verdict in ((30.0, "met"), (6.0, "met"), (4.0, "MISSED")):
         table = check.compare({"writing: mcap": ratio, "reading: new": 1.0}, run)
         assert [row.verdict for row in table.rows] == [verdict, ""]
     other = recorded_ratios(tmp_path / "other.jsonl", ("another machine", {"writing: mcap": 50.0}))

@@ -15,7 +15,7 @@ from hearthlog.tools.bench.workload import Workload
 
 MINUTES, CLIPS = 5.0, 8  # of a workload that is made in seconds
 _TURNS, _TURN_SECONDS = 7, 0.1
-_TOLERANCE = 0.3  # of a ratio
+_TOLERANCE = 0.5  # of a ratio: other work on the machine moves that of reading by 0.4
 
 Contest = tuple[Callable[[], object], Callable[[], object]]
 
