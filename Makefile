@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .PHONY: install demo test test-fast test-wheel test-lowest test-3.13 test-ros check docs bench bench-history \
-	starter dist clean
+	bench-check starter dist clean
 
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
@@ -81,6 +81,10 @@ bench: $(VENV)/.dev
 bench-history: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.bench --record docs/benchmarks.jsonl
 	$(BIN)/python -m hearthlog.tools.bench.history docs/benchmarks.jsonl docs/benchmarks.svg
+
+# What is quick, compared with the last run that was kept: fails where speed was lost.
+bench-check: $(VENV)/.dev
+	$(BIN)/python -m hearthlog.tools.bench --check docs/benchmarks.jsonl
 
 # The models that come with hearthlog, learned anew: make starter DATA="a/manifest.csv b/manifest.csv"
 starter: $(VENV)/.dev

@@ -14,7 +14,19 @@ pytest.importorskip("hearthlog.tools.bench", reason="the wheel leaves the benchm
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.bench import features, history, queue, reading, timing, writing
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.times import NANOSECONDS
+from hearthlog.tools.bench import (
+    check,
+    features,
+    history,
+    queue,
+    reading,
+    timing,
+    workload,
+    writing,
+)
 from hearthlog.tools.bench.labmic import make_microphone
 from hearthlog.tools.bench.table import Row, Table, Target
 from hearthlog.tools.bench.workload import Workload
@@ -27,7 +39,7 @@ def bench(*arguments):
         [sys.executable, "-m", "hearthlog.tools.bench", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=400,
         check=False,
     )
 
@@ -135,16 +147,33 @@ def test_a_folder_without_sound_is_one_clear_line(tmp_path):
 
 def test_the_readers_agree_and_each_gets_a_time_and_a_ratio(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
-    monkeypatch.setattr(reading, "_DAY", 60)
+    monkeypatch.setattr(workload, "_DAY", 120)
     rows = reading.measure(Workload(tmp_path, minutes=1.0)).rows
     assert all(math.isfinite(row.value) and row.value >= 0 for row in rows)
-    assert sum(row.ratio is not None for row in rows) == 3
+    assert sum(row.ratio is not None for row in rows) == 6
+    assert all(row.elapsed > 0 for row in rows if row.unit in {"s", "ms"})
+
+
+def test_logs_are_measured_in_the_states_in_which_the_live_recorder_leaves_them(tmp_path):
+    live = Workload(tmp_path, minutes=0.5, clips_per_class=3).live
+    read = {}
+    for state, log in live._asdict().items():
+        with LogFile(log) as file:
+            assert file.complete == (state != "unfinished")
+            spans = (file.chunks["end"] - file.chunks["start"]) / NANOSECONDS
+            longest = 10 if state == "finished" else 0.5
+            assert longest / 2 < spans.max() <= longest + 0.2
+        read[state] = read_columns([log], ["/mic/features"])["/mic/features"]["values"]
+    assert len(read["finished"]) == 600
+    assert np.array_equal(read["finished"], read["completed"])
+    assert np.array_equal(read["finished"], read["unfinished"])
 
 
 def test_columns_and_messages_are_written_at_a_speed(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
     columns, single = writing.measure(Workload(tmp_path, minutes=0.2)).rows
     assert single.ratio == pytest.approx(columns.value / single.value)
+    assert columns.elapsed > 0
 
 
 def test_figures_with_a_target_are_kept_run_by_run_and_drawn(tmp_path):
@@ -152,24 +181,31 @@ def test_figures_with_a_target_are_kept_run_by_run_and_drawn(tmp_path):
     for value in (12.0, 15.0):
         rows = [
             Row("hearthlog, in one call", 700.0, "x real time"),
-            Row("librosa 0.11.0", 60.0, "x real time", value, Target(10.0)),
+            Row("librosa 0.11.0", 60.0, "x real time", value, Target(10.0), elapsed=50.0),
             Row("opensmile", None, target=Target(2.0), note="not installed"),
             Row("memory", 80.0, "MB", target=Target(100.0, at_most=True)),
+            Row("a minute", 20.0, "ms", target=Target(50.0, at_most=True), elapsed=25.0),
         ]
-        history.record(runs, {"features": Table("", rows)}, "the simulated home")
+        tables = {"features": Table("", rows)}
+        history.record(runs, "abc", "the simulated home", tables, {"writing: mcap": 8.5})
 
     (first, last) = map(json.loads, runs.read_text("utf-8").splitlines())
-    assert set(first["figures"]) == {"features: librosa", "features: memory"}
+    named = {"features: librosa", "features: memory", "features: a minute"}
+    assert set(first["figures"]) == named
+    assert first["figures"]["features: a minute"]["elapsed"] == 25.0
+    assert first["ratios"] == {"writing: mcap": 8.5}
     librosa = {"value": 15.0, "unit": "x", "limit": 10.0, "at_most": False}
     assert last["figures"]["features: librosa"] == librosa
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", first["date"])
-    assert {"commit", "machine", "sound"} <= set(first)
+    assert (first["commit"], first["sound"]) == ("abc", "the simulated home")
+    assert {"machine", "system", "kernel", "load"} <= set(first)
     assert {"hearthlog", "numpy", "python"} <= set(first["versions"])
 
     history.draw(runs, picture)
     drawn = picture.read_bytes()
     history.draw(runs, picture)
     assert drawn.startswith(b"<?xml")
+    assert drawn.count(b'<g id="axes_') == 4  # three figures, and the ratio
     assert picture.read_bytes() == drawn
 
 
@@ -187,6 +223,46 @@ def test_a_run_is_recorded_where_it_is_asked_for(tmp_path):
     (run,) = map(json.loads, runs.read_text("utf-8").splitlines())
     assert run["sound"] == "sound"
     assert run["figures"]["recording: hearthlog record"]["value"] > 0
+
+
+def recorded_ratios(path, *runs):
+    lines = [{"date": str(n), "machine": m, "ratios": r} for n, (m, r) in enumerate(runs)]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def test_every_contest_gives_a_ratio_of_cpu_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "_TURN_SECONDS", 1e-6)
+    ratios = check.measure_ratios(Workload(tmp_path, minutes=0.5, clips_per_class=3))
+    assert [name.partition(":")[0] for name in ratios] == [
+        *("features", "inference", "reading, finished", "reading, chunks of 0.5 s", "writing")
+    ]
+    assert all(math.isfinite(ratio) and ratio > 0 for ratio in ratios.values())
+
+
+def test_a_ratio_that_fell_is_told_from_one_that_noise_moved(tmp_path):
+    here = history.machine()
+    path = recorded_ratios(
+        tmp_path / "runs.jsonl",
+        *((here, {"writing: mcap": 100.0}), (here, {"writing: mcap": 10.0}), (here, {})),
+        ("another machine", {"writing: mcap": 50.0}),
+    )
+    run = check.last_run(path)
+    assert run["ratios"] == {"writing: mcap": 10.0}
+    for ratio, verdict in ((30.0, "met"), (6.0, "met"), (4.0, "MISSED")):
+        table = check.compare({"writing: mcap": ratio, "reading: new": 1.0}, run)
+        assert [row.verdict for row in table.rows] == [verdict, ""]
+    other = recorded_ratios(tmp_path / "other.jsonl", ("another machine", {"writing: mcap": 50.0}))
+    assert check.last_run(other)["ratios"] == {"writing: mcap": 50.0}
+
+
+@pytest.mark.parametrize("text", ['{"date": "1"}\n', "no JSON\n", "1\n"])
+def test_without_a_recorded_run_the_check_says_so_before_it_measures(tmp_path, text):
+    (tmp_path / "runs.jsonl").write_text(text)
+    done = bench("--check", tmp_path / "runs.jsonl")
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"hearthlog bench: {tmp_path / 'runs.jsonl'}: ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_the_queue_is_compared_with_chance_run_by_run():

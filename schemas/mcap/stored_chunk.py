@@ -26,7 +26,9 @@ class StoredChunk(NamedTuple):
     crc: int  # CRC-32 of the same
     start: int  # log time of the first message, in nanoseconds
     end: int  # and of the last
-    entries: Mapping[int, bytes | bytearray]  # the message index, `INDEX_ENTRIES` by channel
+    entries: Mapping[
+        int, bytes | bytearray | memoryview
+    ]  # the message index, `INDEX_ENTRIES` by channel
 
     def times(self, channel: int) -> Int64:
         """Return the log times of a channel's messages, as the message index has them."""
@@ -139,6 +141,24 @@ class ChunkBuilder:
 
     def compress(self) -> StoredChunk:
         """Compress the records; return the chunk as a file will hold it."""
-        data, crc = _LOCAL.zstd.compress(self.content), zlib.crc32(self.content)
-        span = self.start, self.end
-        return StoredChunk(b"zstd", data, len(self.content), crc, *span, self.entries)
+        return compress_chunk(self.content, (self.start, self.end), self.entries)
+
+
+def compress_chunk(
+    content: bytearray | memoryview,
+    span: tuple[int, int],
+    entries: Mapping[int, bytes | bytearray | memoryview],
+) -> StoredChunk:
+    """Compress the records of a chunk; return it as a file will hold it.
+
+    Parameters
+    ----------
+    content : bytes-like
+        The records, one behind the other.
+    span : (int, int)
+        First and last log time of its messages, in nanoseconds.
+    entries : mapping of int to bytes-like
+        Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
+    """
+    data, crc = _LOCAL.zstd.compress(content), zlib.crc32(content)
+    return StoredChunk(b"zstd", data, len(content), crc, *span, entries)

@@ -212,16 +212,47 @@ def decode_rows(
     LogError
         If a payload is not of this type, or a string in it is not UTF-8.
     """
-    parts: list[tuple[Indices, Fields]] = []
-    for size, rows in _by_size(sizes):
-        payloads = gather(buffer, offsets[rows], size)
-        for layout, same in _by_layout(kind, payloads):
-            block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
-            parts.append((rows[same], _decode(layout.leaves, block, fields)))
+    parts = [
+        (rows, _decode(layout.leaves, block, fields))
+        for layout, rows, block in rows_by_layout(kind, buffer, offsets, sizes)
+    ]
     if not parts:
         layout = kind.layout_for(defaultdict(int))
         return _decode(layout.leaves, np.empty(0, layout.dtype), fields)
     return _scattered(parts, len(sizes))
+
+
+def rows_by_layout(
+    kind: MessageType, buffer: Bytes, offsets: Int64, sizes: Int64
+) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
+    """Group messages of one type by where their fields lie.
+
+    Parameters
+    ----------
+    kind : MessageType
+    buffer : np.ndarray [shape=(b,)], uint8
+        Bytes that contain the payloads.
+    offsets, sizes : np.ndarray [shape=(n,)], int64
+        First byte of each payload in the buffer, and its number of bytes.
+
+    Yields
+    ------
+    layout : Layout
+    rows : np.ndarray [shape=(m,)], intp
+        Which messages have it.
+    payloads : np.ndarray [shape=(m,)], of the dtype of the layout
+        A copy of them.
+
+    Raises
+    ------
+    LogError
+        If a payload is not of this type.
+    """
+    for size, rows in _by_size(sizes):
+        payloads = gather(buffer, offsets[rows], size)
+        for layout, same in _by_layout(kind, payloads):
+            block = (payloads if len(same) == len(payloads) else payloads[same]).view(layout.dtype)
+            yield layout, rows[same], block
 
 
 def _by_size(sizes: Int64) -> list[tuple[int, Indices]]:

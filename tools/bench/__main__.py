@@ -21,6 +21,9 @@ import typer
 
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.bench import (
+    check as checks,
+)
+from hearthlog.tools.bench import (
     features,
     history,
     inference,
@@ -52,15 +55,26 @@ def bench(
     record: Annotated[
         Path | None, typer.Option(help="File to append the figures to, as a line of JSON.")
     ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(help="Such a file: measure what is quick, and compare with its last run."),
+    ] = None,
 ) -> None:
     """Measure hearthlog against its peers and its targets.
 
-    Exit status 3: something could not be measured; the tables say why.
+    Exit status 3: something could not be measured; the tables say why. With --check 1: hearthlog
+    lost speed against a peer.
     """
+    if check is not None:
+        recorded = checks.last_run(check)
+        table = checks.compare(_ratios(), recorded)
+        print(table)
+        raise typer.Exit(int(any(row.verdict == "MISSED" for row in table.rows)))
     chosen = names or list(MEASUREMENTS)
     if unknown := [name for name in chosen if name not in MEASUREMENTS]:
         raise typer.BadParameter(f"{unknown[0]}: known are {', '.join(MEASUREMENTS)}")
     tables: dict[str, Table] = {}
+    commit = history.commit()
     source = "the simulated home" if audio is None else audio.name
     with tempfile.TemporaryDirectory(prefix="hearthlog-bench-") as folder:
         work = Workload(Path(folder), audio)
@@ -70,11 +84,18 @@ def bench(
             tables[name] = MEASUREMENTS[name](work)
             print(f"{tables[name]}\n", flush=True)
     if record is not None:
-        history.record(record, tables, source)
+        typer.echo("hearthlog bench: ratios for --check ...", err=True)
+        history.record(record, commit, source, tables, _ratios())
     missing = [f"{what} ({name})" for name, table in tables.items() for what in table.missing]
     if missing:
         typer.echo(f"hearthlog bench: not measured: {'; '.join(missing)}", err=True)
         raise typer.Exit(3)
+
+
+def _ratios() -> dict[str, float]:
+    with tempfile.TemporaryDirectory(prefix="hearthlog-bench-") as folder:
+        work = Workload(Path(folder), minutes=checks.MINUTES, clips_per_class=checks.CLIPS)
+        return checks.measure_ratios(work)
 
 
 if __name__ == "__main__":

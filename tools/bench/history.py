@@ -24,17 +24,27 @@ _COLUMNS = 3
 _PANEL_INCHES = (3.6, 1.7)
 
 
-def record(path: Path, tables: Mapping[str, Table], sound: str) -> None:
+def record(
+    path: Path,
+    commit: str,
+    sound: str,
+    tables: Mapping[str, Table],
+    ratios: Mapping[str, float],
+) -> None:
     """Append a run: of the figures those that have a target.
 
     Parameters
     ----------
     path : Path
         File of JSON lines; made where there is none.
-    tables : mapping of str to Table
-        By the name of the measurement.
+    commit : str
+        Of the code, as `commit` has returned it before.
     sound : str
         What it was measured on.
+    tables : mapping of str to Table
+        By the name of the measurement.
+    ratios : mapping of str to float
+        What later runs are checked against.
     """
     figures = {
         f"{name}: {_VERSION.sub('', row.what.strip())}": {
@@ -43,18 +53,22 @@ def record(path: Path, tables: Mapping[str, Table], sound: str) -> None:
             "limit": row.target.limit,
             "at_most": row.target.at_most,
         }
+        | ({} if row.elapsed is None or row.ratio is not None else {"elapsed": row.elapsed})
         for name, table in tables.items()
         for row in table.rows
         if row.target is not None and row.value is not None
     }
     run = {
         "date": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "commit": _commit(),
-        "machine": _machine(),
+        "commit": commit,
+        "machine": machine(),
+        "system": f"{platform.system()} {platform.release()}",
+        "load": round(os.getloadavg()[1], 1),  # of the last five minutes
         "kernel": kernel_in_use(),
         "versions": {"python": platform.python_version()} | dict(_versions()),
         "sound": sound,
         "figures": figures,
+        "ratios": dict(ratios),
     }
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(run) + "\n")
@@ -73,7 +87,7 @@ def draw(path: Path, picture: Path) -> None:
     import matplotlib as mpl  # noqa: PLC0415  recording does without
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    runs = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    runs = [_with_ratios(json.loads(line)) for line in path.read_text("utf-8").splitlines()]
     names = sorted({name for run in runs for name in run["figures"]})
     rows = max(-(-len(names) // _COLUMNS), 1)
     width, height = _PANEL_INCHES
@@ -86,6 +100,15 @@ def draw(path: Path, picture: Path) -> None:
         figure.savefig(picture, format="svg", metadata={"Date": None})
 
 
+def _with_ratios(run: dict[str, Any]) -> dict[str, Any]:
+    """Count the ratios of a run among its figures; they have no target."""
+    ratios = {
+        f"check, {name}": {"value": ratio, "unit": "x"}
+        for name, ratio in run.get("ratios", {}).items()
+    }
+    return {**run, "figures": run["figures"] | ratios}
+
+
 def _draw_panel(axes: Any, name: str, runs: Sequence[Mapping[str, Any]]) -> None:
     from matplotlib.dates import ConciseDateFormatter  # noqa: PLC0415
 
@@ -96,15 +119,19 @@ def _draw_panel(axes: Any, name: str, runs: Sequence[Mapping[str, Any]]) -> None
         dates = [datetime.fromisoformat(run["date"]) for run in same]
         axes.plot(dates, values, "o-", markersize=3, label=machine)
     last = measured[-1]["figures"][name]
-    axes.axhline(last["limit"], color="grey", linestyle="--", linewidth=1)
-    axes.set_title(f"{name} ({'≤' if last['at_most'] else '≥'} {last['limit']:g})", fontsize=7)
+    title = name
+    if "limit" in last:
+        axes.axhline(last["limit"], color="grey", linestyle="--", linewidth=1)
+        title += f" ({'≤' if last['at_most'] else '≥'} {last['limit']:g})"
+    axes.set_title(title, fontsize=7)
     axes.set_ylabel(last["unit"], fontsize=7)
     axes.set_ylim(bottom=0)
     axes.tick_params(labelsize=6)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(axes.xaxis.get_major_locator()))
 
 
-def _commit() -> str:
+def commit() -> str:
+    """Name the commit of the code; empty if it is not known."""
     command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     try:
         done = subprocess.run(  # noqa: S603  git, as the user has it
@@ -115,7 +142,8 @@ def _commit() -> str:
     return done.stdout.strip()
 
 
-def _machine() -> str:
+def machine() -> str:
+    """Name the processor, and how many cores there are."""
     cpus = Path("/proc/cpuinfo")
     text = cpus.read_text("utf-8") if cpus.exists() else ""
     model = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", text, re.MULTILINE)

@@ -1,9 +1,8 @@
-"""A day's features to arrays: ours, its peers, and the decompressor alone."""
+"""Features from logs to arrays: ours, its peers, and the decompressor alone."""
 
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,20 +16,20 @@ from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.schemas.logs.columns import Columns, iterate_columns, read_columns
+from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.records import chunk_head
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.tools.bench.table import Row, Table, Target
-from hearthlog.tools.bench.timing import BenchError, best_of, hearthlog
+from hearthlog.tools.bench.timing import BenchError, Seconds, best_of
 from hearthlog.tools.bench.workload import Workload
 
-_DAY = 86_400
-_MIDNIGHT = "2026-03-01T00:00"  # so that it becomes one file
 _TOPIC = "/mic/features"
 _TWICE = Target(2, at_most=True)
+_MINUTE_MILLISECONDS = Target(50, at_most=True)
+_MINUTE = 60_000_000_000
 _PEAK_MEGABYTES = Target(100, at_most=True)
 _PEAK = """
 from pathlib import Path
@@ -39,7 +38,7 @@ from hearthlog.schemas.logs.columns import iterate_columns
 def peak():  # of this process; what getrusage says begins with that of the one before it
     return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0])
 before = peak()
-for batch in iterate_columns([Path({log!r})]):
+for batch in iterate_columns([Path(log) for log in {logs!r}]):
     del batch
 print((peak() - before) / 1024)
 """
@@ -48,74 +47,83 @@ Read = tuple[NDArray[np.int64], NDArray[np.uint64], NDArray[np.float32]]
 
 
 def measure(work: Workload) -> Table:
-    """Measure reading the log of a day that `hearthlog record` writes."""
-    log = _day(work)
-    stamps, frames, values = _ours(log)
-    best = best_of(
-        {
-            "read": lambda: _columns(log),
-            "decompress": lambda: _decompress(log),
-            "iterate": lambda: _iterate(log),
-        },
-        3,
-        time.perf_counter,
-    )
-    rows = [
-        Row("hearthlog, to arrays", best["read"], "s"),
-        Row("hearthlog, batch by batch", best["iterate"], "s"),
-        Row("its chunks decompressed, nothing else", best["decompress"], "s"),
-        Row("to arrays / decompressed", best["read"] / best["decompress"], "", target=_TWICE),
+    """Measure reading what the live recorder leaves: an hour beside the peers, and a day alone.
+
+    The peers read the whole hour, of the same file; none of them reads an unfinished one.
+    """
+    live = work.live
+    hours = {"finished": live.finished, "chunks of 0.5 s": live.completed}
+    rows = [row for name, log in hours.items() for row in _beside_peers(name, log)]
+    rows += _alone("unfinished", [live.unfinished])
+    days = {"a day finished": work.day, "a day, chunks of 0.5 s": work.completed_day}
+    for name, folder in days.items():
+        logs = find_logs(folder)
+        rows += _alone(name, logs)
+        rows.append(_minute(name, logs))
+    peak = _peak(find_logs(work.day))
+    rows.append(Row("a day finished: peak memory", peak, "MB", target=_PEAK_MEGABYTES))
+    frames = len(_columns([live.finished]))
+    return Table(f"reading: features of {frames:,} frames a log, CPU time", rows)
+
+
+def _alone(name: str, logs: Sequence[Path]) -> list[Row]:
+    best = best_of({"read": lambda: _columns(logs), "bare": lambda: _decompress(logs)}, 3)
+    return _rows_of_ours(name, best)
+
+
+def _rows_of_ours(name: str, best: Mapping[str, Seconds]) -> list[Row]:
+    read, bare = best["read"], best["bare"]
+    return [
+        Row(f"{name}: to arrays", read.cpu, "s", elapsed=read.elapsed),
+        Row(f"{name}: decompressed, nothing else", bare.cpu, "s", elapsed=bare.elapsed),
+        Row(f"{name}: to arrays / decompressed", read.cpu / bare.cpu, "", target=_TWICE),
     ]
-    for name, read, target in _PEERS:
-        seconds = best_of({name: partial(read, log, len(frames))}, 1, time.perf_counter)[name]
-        rows.append(Row(name, seconds, "s", seconds / best["read"], target))
-    for peer in (_rosbags, _mcap_ros2):
-        _check((stamps, frames, values), peer(log, 1000))
-    rows.append(Row("peak memory, batch by batch", _peak(log), "MB", target=_PEAK_MEGABYTES))
-    size = log.stat().st_size / 1e6
-    return Table(f"reading: features of {len(frames):,} frames from {size:.0f} MB, elapsed", rows)
 
 
-def _day(work: Workload) -> Path:
-    folder = work.folder / "logs-day"
-    sound = [work.wav] * max(round(_DAY / work.seconds), 1)
-    hearthlog(
-        [
-            "record",
-            *sound,
-            "--model",
-            work.model_file,
-            "-o",
-            folder,
-            "-d",
-            str(_DAY),
-            "--start",
-            _MIDNIGHT,
-        ]
-    )
-    return find_logs(folder)[0]
+def _beside_peers(name: str, log: Path) -> list[Row]:
+    ours = _ours(log)
+    count = len(ours[0])
+    best = best_of({"read": lambda: _columns([log]), "bare": lambda: _decompress([log])}, 3)
+    rows = _rows_of_ours(name, best)
+    for peer, read_all, target in _PEERS:
+        theirs = best_of({peer: partial(read_all, log, count)}, 1)[peer]
+        ratio = theirs.cpu / best["read"].cpu
+        rows.append(Row(f"{name}: {peer}", theirs.cpu, "s", ratio, target, elapsed=theirs.elapsed))
+    for read_some in (_rosbags, _mcap_ros2):
+        _check(ours, read_some(log, min(count, 1000)))
+    return rows
 
 
-def _columns(log: Path) -> Columns:
-    return read_columns([log], [_TOPIC])[_TOPIC]
+def _minute(name: str, logs: Sequence[Path]) -> Row:
+    """Measure reading a minute in the middle of some logs."""
+    with LogFile(logs[len(logs) // 2]) as file:
+        start = int(file.chunks["start"][0])
+
+    def read() -> int:
+        return len(read_columns(logs, [_TOPIC], start=start, end=start + _MINUTE)[_TOPIC])
+
+    best = best_of({"minute": read}, 3)["minute"] / 1e-3
+    what = f"{name}: a minute of it"
+    return Row(what, best.cpu, "ms", target=_MINUTE_MILLISECONDS, elapsed=best.elapsed)
+
+
+def _columns(logs: Sequence[Path]) -> Columns:
+    return read_columns(logs, [_TOPIC])[_TOPIC]
 
 
 def _ours(log: Path) -> Read:
-    columns = _columns(log)
+    columns = _columns([log])
     return columns["header.stamp"], columns["frame"], columns["values"]
 
 
-def _iterate(log: Path) -> int:
-    return sum(len(c) for batch in iterate_columns([log], [_TOPIC]) for c in batch)
-
-
-def _decompress(log: Path) -> None:
+def _decompress(logs: Sequence[Path]) -> None:
     decompressor = zstandard.ZstdDecompressor()
-    with LogFile(log) as file:
-        for offset, length, *_ in file.chunks.tolist():
-            record = memoryview(file.read(offset, length))[HEAD.size :]
-            head = chunk_head(record)
-            decompressor.decompress(record[head.data], max_output_size=head.size)
+    for log in logs:
+        with LogFile(log) as file:
+            for offset, length, *_ in file.chunks.tolist():
+                record = memoryview(file.read(offset, length))[HEAD.size :]
+                head = chunk_head(record)
+                decompressor.decompress(record[head.data], max_output_size=head.size)
 
 
 def _rosbags(log: Path, count: int) -> Read:
@@ -154,8 +162,8 @@ def _check(ours: Read, theirs: Read) -> None:
         raise BenchError("two readers read different values")
 
 
-def _peak(log: Path) -> float:
-    code = _PEAK.format(log=str(log))
+def _peak(logs: Sequence[Path]) -> float:
+    code = _PEAK.format(logs=[str(log) for log in logs])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603  ours
     return float(done.stdout)
 
@@ -165,3 +173,15 @@ _PEERS: tuple[tuple[str, Callable[[Path, int], Any], Target | None], ...] = (
     ("mcap-ros2-support", _mcap_ros2, Target(100)),
     ("Rerun McapReader, to Arrow", _rerun, None),
 )
+
+
+def contests(work: Workload) -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
+    """Return ours and a peer's way to read the same logs."""
+    hours = {"finished": work.live.finished, "chunks of 0.5 s": work.live.completed}
+    return {
+        f"reading, {name}: rosbags": (
+            partial(_columns, [log]),
+            partial(_rosbags, log, len(_columns([log]))),
+        )
+        for name, log in hours.items()
+    }

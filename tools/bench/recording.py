@@ -8,21 +8,27 @@ from hearthlog.tools.bench.timing import best_of_processes
 from hearthlog.tools.bench.workload import Workload
 
 _REPEATS = 3
-_FAST = Target(1_000)
+_FAST = Target(1_500)
 
 
 def measure(work: Workload) -> Table:
     """Measure `hearthlog record FILE` on one core."""
     second = work.write_wav("second.wav", 1.0)
-    elapsed, cpu = best_of_processes([_record(work, work.wav, i) for i in range(_REPEATS)])
-    started, _ = best_of_processes([_record(work, second, i) for i in range(_REPEATS)])
+    whole = best_of_processes([_record(work, work.wav, i) for i in range(_REPEATS)])
+    start = best_of_processes([_record(work, second, i) for i in range(_REPEATS)])
+    speed = work.seconds / whole.cpu, work.seconds / whole.elapsed
     size = SVM_RBF.summary(work.model)
     return Table(
         f"recording: {work.seconds:.0f} s of WAV to a labelled log on one core, {size}",
         [
-            Row("hearthlog record", work.seconds / elapsed, "x real time", target=_FAST),
-            Row("the same by CPU time", work.seconds / cpu, "x real time"),
-            Row("from start to end, a second of sound", started, "s", note="part of the above"),
+            Row("hearthlog record", speed[0], "x real time", target=_FAST, elapsed=speed[1]),
+            Row(
+                "from start to end, a second of sound",
+                start.cpu,
+                "s",
+                note="part of the above",
+                elapsed=start.elapsed,
+            ),
         ],
     )
 

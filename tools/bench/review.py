@@ -13,12 +13,11 @@ from hearthlog.analyzer.review.viewer.window import open_hidden
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.bench.table import Row, Table, Target
-from hearthlog.tools.bench.timing import BenchError, hearthlog
+from hearthlog.tools.bench.timing import BenchError
 from hearthlog.tools.bench.workload import Workload
 
-_HOURS, _DAYS = 24, 31
+_DAYS = 31
 _DYING_SECONDS = 2.0  # from the last answer of a viewer to its end, which says why
-_MIDNIGHT = "2026-03-01T00:00"
 _TITLE = "review: from logs to a picture of them, elapsed"
 _DAY = Row("a day", None, "s", target=Target(5, at_most=True))
 _MONTH = Row("a month, a sample of it", None, "s", target=Target(15, at_most=True))
@@ -52,9 +51,7 @@ def measure(work: Workload) -> Table:
         _check_viewer()
     except (HearthlogError, OSError) as error:
         return Table(_TITLE, [replace(row, note=str(error)) for row in (_DAY, _MONTH)])
-    logs, month = work.folder / "review", work.folder / "month"
-    sound = [work.wav] * round(_HOURS * 3600 / work.seconds)
-    hearthlog(["record", *sound, "-o", logs, "--model", work.model_file, "--start", _MIDNIGHT])
+    logs, month = work.day, work.folder / "month"
     for number in range(_DAYS):  # they take as long to read as if they were of other days
         (month / str(number)).mkdir(parents=True)
         for log in find_logs(logs):

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-_HEAD = ("", "measured", "", "ours/peer", "target", "", "")
-_TO_THE_RIGHT = (1, 3, 4)
+_HEAD = ("", "measured", "", "elapsed", "ours/peer", "target", "", "")
+_TO_THE_RIGHT = (1, 3, 4, 5)
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,16 @@ class Row:
     ----------
     what : str
     value : float or None
-        None if it could not be measured; the note then says why.
+        None if it could not be measured; the note then says why. Times are of CPU, over all
+        threads and processes, unless `what` says otherwise.
     unit : str
     ratio : float or None
         How many times as fast as this peer we are.
     target : Target or None
         Of the ratio where there is one, else of the value.
     note : str
+    elapsed : float or None
+        Of a time of CPU the elapsed one, and of a speed the one by elapsed time; in the same unit.
     """
 
     what: str
@@ -41,6 +44,7 @@ class Row:
     ratio: float | None = None
     target: Target | None = None
     note: str = ""
+    elapsed: float | None = None
 
     @property
     def verdict(self) -> str:
@@ -77,9 +81,9 @@ def _padded(cell: str, width: int, column: int) -> str:
 
 def _cells(row: Row) -> tuple[str, ...]:
     target = "" if row.target is None else f"{'≤≥'[not row.target.at_most]} {row.target.limit:,g}"
-    ratio = "" if row.ratio is None else _number(row.ratio)
+    ratio, elapsed = ("" if n is None else _number(n) for n in (row.ratio, row.elapsed))
     value = "-" if row.value is None else _number(row.value)
-    return row.what, value, row.unit, ratio, target, row.verdict, row.note
+    return row.what, value, row.unit, elapsed, ratio, target, row.verdict, row.note
 
 
 def _number(value: float) -> str:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from hearthlog.recorder.modules import module_command
 from hearthlog.schemas.errors import HearthlogError
@@ -20,42 +21,57 @@ class BenchError(HearthlogError):
     """A measurement cannot be made."""
 
 
-def best_of(
-    runs: Mapping[str, Callable[[], object]],
-    turns: int = 5,
-    clock: Callable[[], float] = time.process_time,
-) -> dict[str, float]:
-    """Measure the time of each run in seconds, in its best turn.
+class Seconds(NamedTuple):
+    """How long something took: of CPU over all threads or processes, and by the clock."""
 
-    By default CPU time over all threads, which others on the machine disturb less than elapsed
-    time; that is for what uses several cores. Turns last at least half a second, because a long
-    run meets other people's work more often than a short one, and come one after the other,
-    because what slows the core slows all alike.
+    cpu: float
+    elapsed: float
+
+    def __truediv__(self, count: float) -> "Seconds":
+        return Seconds(self.cpu / count, self.elapsed / count)
+
+    def or_less(self, other: "Seconds") -> "Seconds":
+        """Return the lower of each."""
+        return Seconds(min(self.cpu, other.cpu), min(self.elapsed, other.elapsed))
+
+
+_FOREVER = Seconds(float("inf"), float("inf"))
+
+
+def best_of(
+    runs: Mapping[str, Callable[[], object]], turns: int = 5, least: float | None = None
+) -> dict[str, Seconds]:
+    """Measure the time of each run, in its best turn.
+
+    Others on the machine disturb CPU time less than elapsed time. Turns last at least `least`
+    seconds, half a one by default, because a long run meets other people's work more often than a
+    short one, and come one after the other, because what slows the core slows all alike.
     """
-    best = dict.fromkeys(runs, float("inf"))
+    seconds = _TURN_SECONDS if least is None else least
+    best = dict.fromkeys(runs, _FOREVER)
     for _ in range(turns):
         for name, run in runs.items():
-            best[name] = min(best[name], _mean_time(run, clock))
+            best[name] = best[name].or_less(_mean_time(run, seconds))
     return best
 
 
-def _mean_time(run: Callable[[], object], clock: Callable[[], float]) -> float:
-    began = clock()
-    count, used = 0, 0.0
-    while used < _TURN_SECONDS:
+def _mean_time(run: Callable[[], object], least: float) -> Seconds:
+    began, used = time.perf_counter(), time.process_time()
+    count, cpu = 0, 0.0
+    while cpu < least:
         run()
         count += 1
-        used = clock() - began
-    return used / count
+        cpu = time.process_time() - used
+    return Seconds(cpu, time.perf_counter() - began) / count
 
 
-def best_of_processes(commands: Sequence[Sequence[str | Path]]) -> tuple[float, float]:
+def best_of_processes(commands: Sequence[Sequence[str | Path]]) -> Seconds:
     """Run `hearthlog` with each of these arguments, each time on one core, and on the next one.
 
     Returns
     -------
-    elapsed, cpu : float
-        Seconds of the quickest run by each clock, from its start to its end.
+    Seconds
+        Of the quickest run by each clock, from its start to its end.
 
     Raises
     ------
@@ -63,14 +79,14 @@ def best_of_processes(commands: Sequence[Sequence[str | Path]]) -> tuple[float, 
         If the command fails, with what it said.
     """
     cores = itertools.cycle(sorted(os.sched_getaffinity(0)))
-    elapsed = cpu = float("inf")
+    best = _FOREVER
     for arguments, core in zip(commands, cores, strict=False):
         with _on_core(core):
             began, used = time.perf_counter(), _cpu_of_children()
             hearthlog(arguments)
-            elapsed = min(elapsed, time.perf_counter() - began)
-            cpu = min(cpu, _cpu_of_children() - used)
-    return elapsed, cpu
+            cpu = _cpu_of_children() - used
+            best = best.or_less(Seconds(cpu, time.perf_counter() - began))
+    return best
 
 
 def hearthlog(arguments: Sequence[str | Path]) -> None:

@@ -1,6 +1,7 @@
 """The sound and the model that the measurements share; each is made when first asked for."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,11 +20,14 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.bench.live_logs import LiveLogs, record_as_live
 from hearthlog.tools.bench.timing import BenchError
+from hearthlog.tools.home.copies import copy_logs
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
 
 _MOST_SECONDS = 3600
+_DAY = 86_400
 _SEED = 1
 # Simulated sounds hardly overlap, and would need a third of the support vectors that real ones do.
 _OVERLAP = 0.75  # standard deviations
@@ -124,6 +128,28 @@ class Workload:
         path = self.folder / "bench.safetensors"
         save_model(self.model, path)
         return path
+
+    @cached_property
+    def live(self) -> LiveLogs:
+        """The sound, labelled by the model, as logs that the live recorder leaves."""
+        return record_as_live(self.folder / "live", self.wav, self.model_file)
+
+    @cached_property
+    def day(self) -> Path:
+        """A folder of a day of finished logs: the sound as often as it takes."""
+        return self._copies("finished")
+
+    @cached_property
+    def completed_day(self) -> Path:
+        """The same of logs with chunks of half a second."""
+        return self._copies("completed")
+
+    def _copies(self, state: str) -> Path:
+        """Copy the logs of a folder of `live` until they are a day."""
+        logs, day = self.live.finished.parents[4] / state, self.folder / f"day-{state}"
+        period = math.ceil(self.seconds)
+        copy_logs(logs, day, max(round(_DAY / period), 1), period)
+        return day
 
 
 def _recordings(folder: Path) -> NDArray[np.int16]:

@@ -1,0 +1,287 @@
+"""A log moved in time: its stamps, log times and frame numbers, all at once."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+
+from hearthlog.schemas.arrays import Bytes, Int64, scatter
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
+from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.mcap.formats import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD
+from hearthlog.schemas.mcap.raw_messages import gather_heads
+from hearthlog.schemas.mcap.records import parse
+from hearthlog.schemas.mcap.stored_chunk import StoredChunk, compress_chunk
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import rows_by_layout
+from hearthlog.schemas.messages.topics import REVIEW, parse_topic
+from hearthlog.schemas.messages.type_definitions import MessageType, message_type
+from hearthlog.schemas.salvage.salvage import Salvage
+from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
+from hearthlog.schemas.times import NANOSECONDS
+
+_TIME = "builtin_interfaces/msg/Time"
+_SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration
+_MOST_BYTES = 1 << 30  # of one log, uncompressed
+_FRAMED = {message_types.FEATURES, message_types.STATISTICS, message_types.LABEL}
+
+Edit = Callable[[Metadata], dict[str, str]]  # what a metadata record says in the copy
+
+
+class Shift(NamedTuple):
+    """By how much a log is moved.
+
+    Attributes
+    ----------
+    seconds : int
+    frames : mapping of str to int
+        By microphone: what is added to frame numbers.
+    not_before : mapping of str to int
+        By topic of segments: nanoseconds of UTC before which none begins in the copy.
+    """
+
+    seconds: int
+    frames: Mapping[str, int]
+    not_before: Mapping[str, int]
+
+
+class _Numbers(NamedTuple):
+    """Numbers of one dtype, and the bytes of a buffer at which they lie."""
+
+    offsets: Int64
+    values: NDArray[Any]
+
+    def put(self, values: NDArray[Any], buffer: Bytes) -> None:
+        """Write other numbers to the same places."""
+        rows = values.astype(self.values.dtype).view(f"V{self.values.dtype.itemsize}")
+        scatter(rows, buffer, self.offsets)
+
+
+class _Segments(NamedTuple):
+    """Segments of one topic: places and values of their starts and durations (`_SPAN`)."""
+
+    topic: str
+    starts: _Numbers
+    durations: _Numbers
+
+    def put(self, shift: Shift, buffer: Bytes) -> None:
+        """Move the segments, and cut off what lies before the time that the shift names."""
+        starts, durations = (_nanoseconds(each.values) for each in (self.starts, self.durations))
+        starts = starts + shift.seconds * NANOSECONDS
+        begins = np.maximum(starts, shift.not_before.get(self.topic, 0))
+        self.starts.put(_spans(begins), buffer)
+        self.durations.put(_spans(durations + starts - begins), buffer)
+
+
+class ShiftedLog:
+    """A log or a layer, read whole, of which copies at other times are written.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine; unfinished copies are made of an unfinished log.
+
+    Attributes
+    ----------
+    first_starts : dict of str to int
+        By topic of segments, a review's left out: start of the first, in nanoseconds of UTC.
+
+    Raises
+    ------
+    LogError
+        If it is damaged, or is none that hearthlog writes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with Salvage(path) as salvage:
+            self._pieces = list(salvage.pieces())
+            self._complete = salvage.complete
+            self._definitions = salvage.definitions
+            header = salvage.header
+            if salvage.damages():
+                raise LogError(f"{path}: is damaged, and not copied; see `hearthlog recover`")
+        self._library = "hearthlog" if header is None else header.library
+        self._profile = PROFILE if header is None else header.profile
+        self._times: list[_Numbers] = []  # log and publish times, in nanoseconds
+        self._stamps: list[_Numbers] = []  # their seconds
+        self._frames: list[tuple[str, _Numbers]] = []  # by microphone
+        self._segments: list[_Segments] = []
+        self._read_chunks(path)
+        for number, channel in self._definitions.channels.items():
+            self._find_numbers(path, number, channel)
+        del self._starts
+        self.first_starts: dict[str, int] = {}
+        for topic, starts, _ in self._segments:
+            first = int(_nanoseconds(starts.values).min())
+            self.first_starts[topic] = min(first, self.first_starts.get(topic, first))
+
+    def write(self, path: Path, shift: Shift, edit: Edit) -> None:
+        """Write a copy.
+
+        Parameters
+        ----------
+        path : Path
+            Must not exist.
+        shift : Shift
+        edit : callable
+            Told a metadata record; returns what it says in the copy.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        buffer, time = self._buffer.copy(), shift.seconds * NANOSECONDS
+        for numbers in self._times:
+            numbers.put(numbers.values + time, buffer)
+        for numbers in self._stamps:
+            numbers.put(numbers.values + shift.seconds, buffer)
+        for microphone, numbers in self._frames:
+            numbers.put(numbers.values + shift.frames.get(microphone, 0), buffer)
+        for segments in self._segments:
+            segments.put(shift, buffer)
+        entries = self._entries.copy()
+        entries["time"] += time
+        chunks = self._moved_chunks(buffer, entries.view(np.uint8).data, time)
+        with path.open("xb") as stream:
+            writer = ChunkWriter(stream)
+            writer.start(self._profile, self._library)
+            defined: set[tuple[type, int]] = set()
+            for piece in self._pieces:
+                if isinstance(piece, WholeChunk):
+                    self._define(writer, piece, defined)
+                    writer.copy_chunk(next(chunks))
+                elif isinstance(piece, Metadata):
+                    writer.add_metadata(piece.name, edit(piece))
+                elif isinstance(piece, WholeAttachment):
+                    _copy_attachment(writer, piece, time)
+            if self._complete:
+                definitions = self._definitions
+                writer.define(
+                    list(definitions.schemas.values()), list(definitions.channels.values())
+                )
+                writer.finish()
+
+    def _read_chunks(self, path: Path) -> None:
+        """Decompress all chunks into one buffer, and join their message indexes."""
+        contents: list[bytes] = []
+        rows: list[bytes | bytearray | memoryview] = []
+        starts: defaultdict[int, list[Int64]] = defaultdict(list)
+        self._chunks: list[tuple[StoredChunk, int, dict[int, tuple[int, int]]]] = []
+        base = end = 0
+        for number, piece in enumerate(self._pieces):
+            if not isinstance(piece, WholeChunk):
+                if not isinstance(piece, Metadata | WholeAttachment):
+                    raise LogError(f"{path}: has messages outside of chunks, and is not copied")
+                continue
+            stored, places = piece.stored, {}
+            for channel, entries in stored.entries.items():
+                places[channel] = end, end + len(entries)
+                end += len(entries)
+                rows.append(entries)
+                offsets = np.frombuffer(entries, INDEX_ENTRIES)["offset"]
+                starts[channel].append(offsets + base)
+            if base + stored.size > _MOST_BYTES:
+                raise LogError(f"{path}: is too large to be copied; a day has 24 logs")
+            contents.append(stored.content())
+            self._chunks.append((stored._replace(data=b"", entries={}), base, places))
+            self._pieces[number] = piece._replace(stored=stored._replace(data=b""))
+            base += stored.size
+        self._buffer = np.frombuffer(b"".join(contents), np.uint8)
+        self._entries = np.frombuffer(b"".join(rows), INDEX_ENTRIES)
+        self._starts = {channel: np.concatenate(parts) for channel, parts in starts.items()}
+
+    def _find_numbers(self, path: Path, number: int, channel: Channel) -> None:
+        """Note where the times and frame numbers of a channel lie."""
+        starts = self._starts.get(number)
+        if starts is None:
+            return
+        schema = self._definitions.schemas.get(channel.schema_id)
+        if schema is None or channel.message_encoding != ENCODING:
+            raise LogError(f"{path}: {channel.topic} is no topic of ROS 2, and not copied")
+        heads = gather_heads(self._buffer, starts)
+        for name in ("log_time", "publish_time"):
+            place = _place(MESSAGE_HEAD, name)
+            self._times.append(_Numbers(starts + place, heads[name].copy()))
+        offsets, sizes = starts + MESSAGE_HEAD.itemsize, heads["length"] - MESSAGE_FIXED
+        kind = message_type(schema.name, schema.encoding, schema.data)
+        parts = parse_topic(channel.topic)
+        if schema.name == message_types.SEGMENT and parts and parts.labelling != REVIEW:
+            names = ("header.stamp", "duration")
+            spans = zip(*(self._numbers(kind, offsets, sizes, name) for name in names), strict=True)
+            self._segments += (_Segments(channel.topic, *span) for span in spans)
+            return
+        for name in _time_fields(kind.types, kind.name):
+            for numbers in self._numbers(kind, offsets, sizes, name):
+                known = _nanoseconds(numbers.values) != 0  # 0: nobody knows
+                seconds = numbers.values["sec"][known]
+                self._stamps.append(_Numbers(numbers.offsets[known], seconds))
+        if schema.name in _FRAMED and parts:
+            for numbers in self._numbers(kind, offsets, sizes, "frame"):
+                self._frames.append((parts.microphone, numbers))
+
+    def _numbers(
+        self, kind: MessageType, offsets: Int64, sizes: Int64, name: str
+    ) -> Iterator[_Numbers]:
+        """Find a field in messages, and read it."""
+        for layout, rows, block in rows_by_layout(kind, self._buffer, offsets, sizes):
+            yield _Numbers(offsets[rows] + _place(layout.dtype, name), block[name].copy())
+
+    def _moved_chunks(self, buffer: Bytes, entries: memoryview, time: int) -> Iterator[StoredChunk]:
+        content = buffer.data
+        for stored, base, places in self._chunks:
+            index = {channel: entries[first:last] for channel, (first, last) in places.items()}
+            span = stored.start + time, stored.end + time
+            yield compress_chunk(content[base : base + stored.size], span, index)
+
+    def _define(
+        self, writer: ChunkWriter, piece: WholeChunk, defined: set[tuple[type, int]]
+    ) -> None:
+        """Write what defines the channels of a chunk before it, unless it stands in it."""
+        defined.update((type(record), record.id) for record in piece.definitions[: piece.leading])
+        for number in piece.stored.entries:
+            channel = self._definitions.channels[number]
+            schema = self._definitions.schemas[channel.schema_id]
+            for record in (schema, channel):
+                if (type(record), record.id) not in defined:
+                    writer.write_definition(record)
+                    defined.add((type(record), record.id))
+
+
+def _place(dtype: np.dtype[Any], name: str) -> int:
+    assert dtype.fields is not None
+    return int(dtype.fields[name][1])
+
+
+def _time_fields(types: Mapping[str, Any], name: str, prefix: str = "") -> Iterator[str]:
+    """List the fields of a message type that are points in time; none is in an array."""
+    for field, (node, kind) in types[name]:
+        if node is Nodetype.NAME and kind == _TIME:
+            yield f"{prefix}{field}"
+        elif node is Nodetype.NAME and kind in types and not kind.startswith("builtin_interfaces/"):
+            yield from _time_fields(types, kind, f"{prefix}{field}.")
+
+
+def _nanoseconds(spans: NDArray[Any]) -> Int64:
+    total: Int64 = spans["sec"].astype(np.int64) * NANOSECONDS + spans["nanosec"]
+    return total
+
+
+def _spans(nanoseconds: Int64) -> NDArray[Any]:
+    spans = np.empty(len(nanoseconds), _SPAN)
+    spans["sec"], spans["nanosec"] = np.divmod(nanoseconds, NANOSECONDS)
+    return spans
+
+
+def _copy_attachment(writer: ChunkWriter, piece: WholeAttachment, time: int) -> None:
+    record = parse(Opcode.ATTACHMENT, piece.record[HEAD.size :])
+    assert isinstance(record, Attachment)
+    created, logged = (each + time if each else 0 for each in (record.create_time, record.log_time))
+    writer.add_attachment(created, logged, record.name, record.media_type, record.data)
