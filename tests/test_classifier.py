@@ -22,6 +22,7 @@ from hearthlog.schemas.progress import ignore_progress
 pytestmark = pytest.mark.fast
 
 ROWS = 600
+HALF_A_STEP = 2.0**-17
 
 
 @cache
@@ -65,12 +66,12 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
 
     assert ours.dtype == np.float32
     assert ours.shape == (ROWS, classes)
-    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=HALF_A_STEP + 1e-6)
     assert len(np.unique(ours.argmax(axis=1))) == classes
 
 
 def judged(model, rows):
-    """Probabilities, and before their rounding to float32 the decisions behind them."""
+    """Probabilities, and before their rounding the decisions behind them."""
     decisions, _ = SVM_RBF.machine(model).decide(rows)
     return np.concatenate([Classifier(model).probabilities(rows), decisions], axis=1)
 
@@ -101,13 +102,21 @@ def test_the_number_of_blas_threads_changes_nothing(classes):
 def test_every_row_sums_to_one_however_far_from_what_was_learned():
     rows = unseen(9) * np.geomspace(1e-30, 1e30, ROWS, dtype=np.float32)[:, np.newaxis]
     result = Classifier(trained(9)).probabilities(rows)
-    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=9 * HALF_A_STEP)
+
+
+def test_probabilities_come_in_steps_and_novelty_is_of_the_same():
+    probabilities, novelty = Classifier(trained(9)).classify(unseen(9))
+    assert ((probabilities > 0.0) & (probabilities < 1.0)).mean() > 0.5
+    for values in (probabilities, novelty):
+        steps = values / (2 * HALF_A_STEP)
+        np.testing.assert_array_equal(steps, np.round(steps))
 
 
 def test_support_vectors_beyond_all_precision_still_give_probabilities():
     far = trained(3).arrays["support_vectors"] * np.float32(1e20)
     result = Classifier(with_arrays(trained(3), support_vectors=far)).probabilities(far)
-    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.sum(axis=1), 1.0, rtol=0, atol=3 * HALF_A_STEP)
 
 
 def test_no_rows_give_no_probabilities():

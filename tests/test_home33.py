@@ -4,8 +4,10 @@ import librosa
 import numpy as np
 import pytest
 
+from hearthlog.analyzer.training.learned_segments import segment_digests
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.home33 import HOME33
+from hearthlog.models.features.home33.extractor import rounded
 
 pytestmark = pytest.mark.fast
 
@@ -34,11 +36,29 @@ def test_frames_give_the_same_bits_in_blocks_of_any_size(size):
     np.testing.assert_array_equal(np.concatenate(blocks), HOME33.extractor()(sound))
 
 
-def test_the_first_values_are_those_of_the_paper(real_frames):
-    values = HOME33.extractor()(real_frames)
-    np.testing.assert_array_equal(values[:, :21], AUROS21.extractor()(real_frames))
+def test_the_first_values_are_those_of_the_paper_rounded(real_frames):
+    values, exact = HOME33.extractor()(real_frames), AUROS21.extractor()(real_frames)
+    np.testing.assert_allclose(values[:, :21], exact, rtol=2.0**-11, atol=2.0**-25)
+    np.testing.assert_allclose(values[:, [0, 6]], exact[:, [0, 6]], rtol=2.0**-11, atol=0)
     assert HOME33.feature_names[:21] == AUROS21.feature_names
     assert values.shape[1] == HOME33.width == len(HOME33.units) == 33
+
+
+def test_values_have_11_of_the_24_binary_digits_of_a_float32(real_frames):
+    bits = HOME33.extractor()(real_frames).view(np.uint32)
+    assert not (bits % 2**13).any()
+    assert (bits % 2**14).any(axis=0).all()
+
+
+def test_what_is_left_of_the_cepstra_of_silence_by_rounding_is_nothing():
+    values = HOME33.extractor()(np.zeros((4, 800), np.float32))
+    assert not values[:, 9:21].any()
+
+
+def test_models_of_exact_values_know_what_they_have_learned_from():
+    exact = np.random.default_rng(0).normal(0.0, 100.0, (200, 20, 33)).astype(np.float32)
+    values = rounded(exact.reshape(-1, 33)).reshape(exact.shape)
+    np.testing.assert_array_equal(segment_digests(values), segment_digests(exact))
 
 
 def test_flatness_is_that_of_librosa(real_frames):
@@ -46,7 +66,8 @@ def test_flatness_is_that_of_librosa(real_frames):
     values = HOME33.extractor()(real_frames)[:, FLATNESS]
     for number, band in enumerate(BANDS):
         theirs = librosa.feature.spectral_flatness(S=power[:, band].T, power=1.0, amin=1e-12)[0]
-        np.testing.assert_allclose(values[:, number], 10 * np.log10(theirs), atol=1e-4)
+        expected = 10 * np.log10(theirs)
+        np.testing.assert_allclose(values[:, number], expected, rtol=2.0**-11, atol=1e-4)
 
 
 def test_a_tone_is_peaked_and_noise_is_flat():

@@ -10,6 +10,7 @@ from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Float32
 
 _ROWS_AT_ONCE = 256
+_STEPS = 1 << 16  # of a probability; what is finer is noise, of the processor too
 
 
 class Classifier:
@@ -72,7 +73,7 @@ class Classifier:
         Returns
         -------
         np.ndarray [shape=(n, C)], float32
-            In the order of the model's classes; every row sums to 1.
+            In the order of the model's classes, as of `classify`.
         """
         return self.classify(inputs)[0]
 
@@ -87,7 +88,8 @@ class Classifier:
         Returns
         -------
         probabilities : np.ndarray [shape=(n, C)], float32
-            In the order of the model's classes; every row sums to 1.
+            In the order of the model's classes, in steps of 2**-16; every row sums to 1 within
+            half a step for each class. Those of older models are not rounded.
         novelty : np.ndarray [shape=(n,)], float32
             Probability that it is none of the classes but `unknown` that is likeliest, 0 to 1;
             of older models what the kind of classifier gives, or NaN.
@@ -102,6 +104,8 @@ class Classifier:
             decision -= decision.max(axis=1, keepdims=True)
             np.exp(decision, out=decision)
             result[rows] = decision / decision.sum(axis=1, keepdims=True)
-        if self._doubts:
+        if self._doubts:  # models of hearthlog 0.1 label as they did, to the last bit
+            np.rint(_STEPS * result, out=result)
+            result /= _STEPS
             novelty = 1.0 - result[:, self._known].max(axis=1, initial=0.0)
         return result, novelty
