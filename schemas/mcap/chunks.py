@@ -21,6 +21,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
 
 _WRONG_INDEX = "the index of a chunk does not belong to it"
+_ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
 _BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
@@ -273,11 +274,14 @@ class _Batch(NamedTuple):
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
             heads = gather(self.raw, starts, index_head.itemsize).view(index_head)
             length, size = heads["length"], heads["size"].astype(np.int64)
+            # Records may grow at their end, but not by what may be entries: the size is wrong then.
+            content = size + index_head.itemsize - HEAD.size
             sound = (
                 (heads["opcode"] == Opcode.MESSAGE_INDEX)
-                & (length >= size + index_head.itemsize - HEAD.size)
+                & (length >= content)
+                & ((length == content) | ((length - content) % _ENTRY_SIZE > 0))
                 & (length <= ends - starts - HEAD.size)
-                & (size % formats.INDEX_ENTRIES.itemsize == 0)
+                & (size % _ENTRY_SIZE == 0)
             )
             if not sound.all():
                 raise self._damaged(numbers[sound.argmin()], "here should be a message index")
