@@ -23,6 +23,8 @@ from tempfile import TemporaryFile
 
 MAGIC = b"\x89MCAP0\r\n"
 MESSAGE, CHUNK, INDEX, METADATA, DATA_END = 5, 6, 7, 12, 15
+SECONDS = 120  # for all verbs; the machine may be busy
+LABELLED = {"finished", "live", "live-finished"}  # files that are relabelled
 RELABELLED = "general"  # a starter model
 
 
@@ -462,10 +464,18 @@ def rosbag(folder):
     return path
 
 
-def main():
-    """Change files at random, and print what is said of none of them."""
+def begin(name, path, folder):
+    """Note what the verbs say of a whole file; return the process that will read changed ones."""
     from fuzzing import Victim  # noqa: PLC0415
 
+    folder.mkdir(parents=True)
+    (folder / path.name).write_bytes(path.read_bytes())
+    expect(folder / path.name, folder, VERBS if name in LABELLED else VERBS[:-1])
+    return Victim(folder, (compared,), SECONDS)
+
+
+def main():
+    """Change files at random, and print what is said of none of them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=2400)
@@ -476,13 +486,7 @@ def main():
     rng = random.Random(options.seed)
     counts, wrong = Counter(), Counter()
     for name, path in files.items():
-        folder = options.folder / "victims" / name
-        folder.mkdir(parents=True)
-        data = path.read_bytes()
-        (folder / path.name).write_bytes(data)
-        verbs = VERBS if name in {"finished", "live", "live-finished"} else VERBS[:-1]
-        expect(folder / path.name, folder, verbs)
-        victim = Victim(folder, (compared,))
+        data, victim = path.read_bytes(), begin(name, path, options.folder / "victims" / name)
         for number in range(options.count // len(files)):
             mutation = MUTATIONS[number % len(MUTATIONS)]
             changed = mutation(rng, data)

@@ -425,6 +425,25 @@ def test_a_summary_that_is_damaged_is_done_without_and_named(log, tmp_path):
     assert_same(columns["/mic/label"], *expected([log], "label"))
 
 
+def test_a_message_index_that_lists_less_than_it_holds_is_refused(tmp_path):
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start("ros2", "test")
+    schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+    channel = writer.register_channel("/s", "cdr", schema)
+    for number in range(3):
+        writer.add_message(channel, number, b"\0\1\0\0\2\0\0\0a\0", number)
+    writer.finish()
+    data = stream.getvalue()
+    head = b"\x07" + struct.pack("<QHI", 54, channel, 48)
+    assert data.count(head) == 1
+    path = tmp_path / "less.mcap"
+    for size in (0, 16, 32):
+        path.write_bytes(data.replace(head, head[:-4] + struct.pack("<I", size)))
+        with pytest.raises(LogError, match="here should be a message index"):
+            read_columns([path])
+
+
 def test_iterating_takes_little_memory_however_long_the_log(tmp_path):
     path = tmp_path / "long.mcap"
     writer = LogWriter(path, [Topic("/mic/statistics", message_types.STATISTICS)], {})

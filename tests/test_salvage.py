@@ -497,6 +497,18 @@ def test_files_of_other_writers_are_recovered_in_the_same_way(recover, form):
         assert len(result.messages) == len(everything) or result.some_lost, place
 
 
+@pytest.mark.parametrize("form", ["lz4", "zstd", "uncompressed"])
+def test_a_chunk_behind_an_index_or_metadata_that_lost_bytes_is_saved(recover, form):
+    data, everything = written(**FORMS[form])
+    records = [r for r in structure(data) if r.opcode in {INDEX, METADATA}]
+    rng = random.Random(form)
+    for _ in range(25):
+        record = rng.choice(records)
+        place = rng.randrange(record.start, record.end)
+        end = min(place + rng.randrange(1, 40), record.end)
+        assert recover(data[:place] + data[end:]).messages == everything, (place, end)
+
+
 def test_messages_outside_of_chunks_are_saved_up_to_a_wrong_length_and_from_there_on(recover):
     data, everything = written(CompressionType.NONE, chunked=False)
     records = [r for r in structure(data) if r.opcode == MESSAGE]

@@ -86,7 +86,7 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
         return
     finished = source.size > len(MAGIC) and source.tail(len(MAGIC)) == MAGIC
     outline = _outline(findings.path, source)
-    data = DataSection(findings, _KEPT, ours=outline.ours)
+    data = DataSection(findings, _KEPT, source.size, ours=outline.ours)
     checks = MessageChecks(data, findings) if outline.ours else ForeignMessages(data, findings)
     walk = RecordWalk(source, findings, outline.offsets, finished=finished)
     complete = _walk(walk, data, checks, outline, lambda offset: progress(offset / source.size))

@@ -15,6 +15,7 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
+from hearthlog.schemas.mcap.chunk_table import not_empty
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
@@ -131,10 +132,11 @@ def read_definitions(file: LogFile) -> None:
     LogError
         If the log cannot be read, or one of these chunks is damaged.
     """
-    for number, channels in enumerate(file.chunks["channels"].tolist()):
+    chunks = not_empty(file.chunks)
+    for number, channels in enumerate(chunks["channels"].tolist()):
         identities = file.channel_sets[channels]
         if not identities or not identities <= file.channels.keys():
-            read_chunks(file, file.chunks[number : number + 1], topics=())
+            read_chunks(file, chunks[number : number + 1], topics=())
 
 
 def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:

@@ -319,6 +319,7 @@ class Salvage:
         data = self._file.read(start, size)
         chunks = {start + place for place in find_chunk_heads(data) if place < _WINDOW}
         heads = {start + place for place in find_record_heads(data[: _WINDOW + 8])}
+        chunks |= {place for place in heads if data[place - start] == Opcode.CHUNK}
         return _Places(window, sorted(chunks), sorted(chunks | heads))
 
     def _take(self, whole: WholeRecord) -> Iterator[Piece]:
