@@ -223,6 +223,8 @@ def columns(path, _folder):
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             read = read_columns([path])
+            with LogFile(path) as file:
+                complete = file.complete
     except HearthlogError as error:
         return 1, "", str(error)
     text = {
@@ -230,8 +232,7 @@ def columns(path, _folder):
         for topic, same in sorted(read.items())
     }
     lines = [str(each.message) for each in warned]
-    with LogFile(path) as file:
-        lines += [] if file.complete else ["not complete"]
+    lines += [] if complete else ["not complete"]
     return 3 if lines else 0, json.dumps(text), "\n".join(lines)
 
 
