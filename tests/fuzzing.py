@@ -12,8 +12,9 @@ SECONDS = 30  # a file; the machine may be busy
 class Victim:
     """A process that reads whatever it is given, and is started again when that has killed it."""
 
-    def __init__(self, folder: Path, readers=None) -> None:
+    def __init__(self, folder: Path, readers=None, seconds=SECONDS) -> None:
         self._folder = folder
+        self._seconds = seconds
         self._readers = READERS if readers is None else readers
         self._context = multiprocessing.get_context("spawn")
         self._start()
@@ -25,6 +26,7 @@ class Victim:
         )
         self._process.start()
         other.close()
+        self._pipe.recv()  # it is there: what follows is timed
 
     def close(self) -> None:
         self._process.kill()
@@ -37,9 +39,9 @@ class Victim:
         path.write_bytes(data)
         try:
             self._pipe.send(path)
-            if self._pipe.poll(SECONDS):
+            if self._pipe.poll(self._seconds):
                 return self._pipe.recv()
-            what = f"took more than {SECONDS} s"
+            what = f"took more than {self._seconds} s"
         except (EOFError, OSError):
             what = "killed the process"
         self.close()
@@ -55,6 +57,7 @@ def _serve(pipe, folder: Path, readers) -> None:
 
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+    pipe.send("ready")
     while True:
         path = pipe.recv()
         pipe.send("".join(_try(reader, path, folder) for reader in readers))

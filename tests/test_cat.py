@@ -392,6 +392,14 @@ def test_an_unfinished_log_is_printed_as_far_as_it_is_there(recorded, hearthlog)
     assert "there are /diagnostics" in hearthlog("cat", unfinished, "--topics", "x").stderr
 
 
+def test_an_unfinished_log_without_a_message_is_named(recorded, hearthlog, tmp_path):
+    (tmp_path / "cut.mcap").write_bytes(find_logs(recorded)[0].read_bytes()[:100])
+    for paths in ([tmp_path], [tmp_path, recorded]):
+        result = hearthlog("cat", *paths, "--topics", "/mic/info")
+        assert result.returncode == 3
+        assert str(tmp_path / "cut.mcap") in result.stderr
+
+
 def test_a_reader_who_has_seen_enough_ends_it_quietly(long):
     for form in ("text", "ndjson", "csv"):
         command = [*HEARTHLOG, "cat", str(long), "--format", form]

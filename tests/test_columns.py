@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import threading
+import warnings
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.log_stream import TopicBatch
@@ -404,7 +405,9 @@ def test_no_changed_byte_becomes_another_value_without_a_word(log, tmp_path):
         changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         path.write_bytes(changed)
         try:
-            columns = read_columns([path])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", HearthlogWarning)
+                columns = read_columns([path])
         except LogError:
             refused += 1
             continue
@@ -458,12 +461,34 @@ def outcome(path):
     }
 
 
-def test_a_summary_that_is_damaged_is_done_without(log, tmp_path):
+def test_a_summary_that_is_damaged_is_done_without_and_named(log, tmp_path):
     data = bytearray(log.read_bytes())
     data[-300] ^= 1
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
-    assert_same(read_columns([path], ["/mic/label"])["/mic/label"], *expected([log], "label"))
+    with pytest.warns(HearthlogWarning, match="its index is damaged") as warned:
+        columns = read_columns([path], ["/mic/label"])
+    assert {each.message.where for each in warned} == {path}
+    assert_same(columns["/mic/label"], *expected([log], "label"))
+
+
+def test_a_message_index_that_lists_less_than_it_holds_is_refused(tmp_path):
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start("ros2", "test")
+    schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+    channel = writer.register_channel("/s", "cdr", schema)
+    for number in range(3):
+        writer.add_message(channel, number, b"\0\1\0\0\2\0\0\0a\0", number)
+    writer.finish()
+    data = stream.getvalue()
+    head = b"\x07" + struct.pack("<QHI", 54, channel, 48)
+    assert data.count(head) == 1
+    path = tmp_path / "less.mcap"
+    for size in (0, 16, 32):
+        path.write_bytes(data.replace(head, head[:-4] + struct.pack("<I", size)))
+        with pytest.raises(LogError, match="here should be a message index"):
+            read_columns([path])
 
 
 def test_iterating_takes_little_memory_however_long_the_log(tmp_path):

@@ -4,6 +4,7 @@ import json
 import shutil
 import struct
 import zlib
+from collections import Counter
 from threading import Event as Flag
 from types import SimpleNamespace
 
@@ -117,6 +118,20 @@ def test_a_time_that_a_chunk_does_not_speak_of_is_an_error_whatever_it_is(log, t
             raw.content = as_raw(chunk).content
 
     assert {"chunk-times", "log-time"} <= errors(log.write(tmp_path / NAME, edit))
+
+
+@pytest.mark.parametrize("inner", [b"", b"\x05" + struct.pack("<QHIQQ", 22, 1, 0, 1, 1)])
+def test_of_a_small_file_of_countless_records_few_are_looked_at(tmp_path, inner):
+    content = (inner or bytes(9)) * 1_200_000
+    head = struct.pack("<QQQII", 1, 1, len(content), zlib.crc32(content), 4) + b"zstd"
+    packed = zstandard.compress(content)
+    chunk = head + struct.pack("<Q", len(packed)) + packed
+    header = b"\x01" + struct.pack("<Q", 8) + bytes(8)
+    path = tmp_path / "small.mcap"
+    path.write_bytes(MAGIC + header + b"\x06" + struct.pack("<Q", len(chunk)) + chunk)
+    counts = Counter(f.rule for found in examine(path) for f in found.shown)
+    assert counts["too-large" if inner else "chunk-records"] == 1
+    assert not counts["chunk-opcode"]
 
 
 # What is wrong with the records of the data section. Everything that refers to them is right.

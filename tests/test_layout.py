@@ -200,6 +200,7 @@ module demo {{
     [
         (b"int32 a\nNowhere b", "cannot be read|not defined"),
         (b"float128 a", "cannot be read|not supported|not defined"),
+        (b"int32 b\nwstring a", "a is of type wstring, which is not supported"),
         (b"test/msg/Loop a\n" + b"=" * 80 + b"\nMSG: test/msg/Loop\ntest/msg/Loop a", "itself"),
         (b"uint8[4000000000] a", "ends before"),
         (b"std_msgs/Header[4000000000] a", "too many"),

@@ -19,6 +19,7 @@ from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
 from logs import features, labelled_frames
 from lossy import LossySource
+from mcap.reader import make_reader
 from mcap.records import Metadata
 from rewriting import Log
 from spliced import run, small_disk
@@ -289,12 +290,26 @@ def test_layers_are_sound(model, logs):
     assert kinds <= {("warning", "gap")}
 
 
-def test_segments_are_in_chunks_of_their_own(model, logs):
+def test_layers_do_not_run_back_in_time(model, logs):
+    relabelled(model, logs)
+    layers = [path for path in find_logs(logs) if is_layer(path)]
+    for path in layers:
+        with path.open("rb") as stream:
+            read = [
+                (message.log_time, "segment" in channel.topic)
+                for _, channel, message in make_reader(stream).iter_messages(log_time_order=False)
+            ]
+        assert read == sorted(read)  # of one time the label comes first
+    assert any(segment for _, segment in read[:-1])
+
+
+def test_a_chunk_of_a_layer_spans_a_minute_at_most(model, logs):
     relabelled(model, logs)
     for path in find_logs(logs):
-        if is_layer(path):
-            with LogFile(path) as file:
-                assert all(len(ids) == 1 for ids in file.channel_sets)
+        with LogFile(path) as file:
+            if is_layer(path):
+                spans = file.chunks["end"] - file.chunks["start"]
+                assert (spans < 60 * NANOSECONDS).all()
 
 
 def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capfd):

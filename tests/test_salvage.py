@@ -278,6 +278,65 @@ def test_what_was_lost_is_said_with_its_place_its_times_and_its_topics(log, reco
         assert f"{topics.count('/mic/features')} of /mic/features" in text
 
 
+def cut_out(data, records, number, *, indexes):
+    """Leave out a chunk, with or without its message indexes; return also what was in it."""
+    chunk = [r for r in records if r.opcode == CHUNK][number]
+    end = chunk.end
+    for record in records:
+        if indexes and record.start == end and record.opcode == INDEX:
+            end = record.end
+    return data[: chunk.start] + data[end:], chunk
+
+
+@pytest.mark.parametrize("indexes", [False, True], ids=["alone", "with indexes"])
+@pytest.mark.parametrize("number", [0, 1, 3, -1])
+def test_a_chunk_that_is_cut_out_is_missed_by_the_index(log, recover, number, indexes):
+    data, records = log
+    left, chunk = cut_out(data, records, number, indexes=indexes)
+    result = recover(left)
+    assert result.messages == messages_of(records, without=chunk.start)
+    (damage,) = [d for d in result.recovery.damages if not d.lossless]
+    topics, times = ([message[i] for message in chunk.messages] for i in range(2))
+    assert damage.messages == {topic: topics.count(topic) for topic in topics}
+    assert damage.times == (min(times), max(times))
+    assert damage.start <= chunk.start <= damage.end
+    assert damage.exact
+
+
+def test_chunks_that_are_cut_out_are_missed_by_what_is_left_of_an_index(log, recover):
+    data, records = log
+    unfinished = data[: next(r.start for r in records if r.opcode == DATA_END)]
+    uncounted = data[: [r for r in records if r.opcode == METADATA][-1].start]
+    left, chunk = cut_out(uncounted, records, 3, indexes=False)
+    (damage,) = recover(left).recovery.damages  # the message indexes list its messages
+    assert sum(damage.messages.values()) == len(chunk.messages)
+    left, chunk = cut_out(unfinished, records, 3, indexes=True)
+    (damage,) = recover(left).recovery.damages  # the record for rosbag2 counts them
+    assert sum(damage.messages.values()) == len(chunk.messages)
+
+
+def test_chunks_that_stand_elsewhere_or_twice_are_no_loss(log, recover):
+    data, records = log
+    first, second, third = [r for r in records if r.opcode == CHUNK][1:4]
+    swapped = data[: first.start] + data[second.start : third.start]
+    swapped += data[first.start : second.start] + data[third.start :]
+    result = recover(swapped)
+    assert sorted(result.messages) == sorted(messages_of(records))
+    assert result.recovery.lossless
+    twice = data[: second.start] + data[first.start : second.start] + data[second.start :]
+    result = recover(twice)
+    assert len(result.messages) == len(messages_of(records)) + len(first.messages)
+    assert result.recovery.lossless
+
+
+def test_a_metadata_record_or_an_attachment_that_is_cut_out_is_missed(log, recover):
+    data, records = log
+    for opcode, name in ((METADATA, "the metadata 'hearthlog'"), (ATTACHMENT, "the attachment")):
+        record = next(r for r in records if r.opcode == opcode)
+        (damage,) = recover(data[: record.start] + data[record.end :]).recovery.damages
+        assert damage.others[0].startswith(name)
+
+
 def test_messages_without_an_index_behind_their_chunk_are_lost_in_unknown_number(log, recover):
     data, records = log
     chunk, behind = next(
@@ -437,6 +496,18 @@ def test_files_of_other_writers_are_recovered_in_the_same_way(recover, form):
         kept = messages_of(records, without=place)
         assert result.messages in (kept, everything), place
         assert len(result.messages) == len(everything) or result.some_lost, place
+
+
+@pytest.mark.parametrize("form", ["lz4", "zstd", "uncompressed"])
+def test_a_chunk_behind_an_index_or_metadata_that_lost_bytes_is_saved(recover, form):
+    data, everything = written(**FORMS[form])
+    records = [r for r in structure(data) if r.opcode in {INDEX, METADATA}]
+    rng = random.Random(form)
+    for _ in range(25):
+        record = rng.choice(records)
+        place = rng.randrange(record.start, record.end)
+        end = min(place + rng.randrange(1, 40), record.end)
+        assert recover(data[:place] + data[end:]).messages == everything, (place, end)
 
 
 def test_messages_outside_of_chunks_are_saved_up_to_a_wrong_length_and_from_there_on(recover):

@@ -1,6 +1,7 @@
 """Logs are merged and cut message for message, into logs that anyone can open."""
 
 import json
+import shutil
 import tracemalloc
 from functools import partial
 
@@ -80,6 +81,35 @@ def test_merged_logs_hold_every_message_byte_for_byte_in_the_order_of_time(
     assert len({topic for topic, *_ in found}) > 6
     sources = [row for log in find_logs(recorded) for row in raw_messages(log)]
     assert sorted(raw_messages(output)) == sorted(sources)
+
+
+def test_what_logs_have_twice_is_merged_once_and_counted(recorded, hearthlog, tmp_path):
+    first, *_ = find_logs(recorded)
+    rows = raw_messages(first)
+    times = sorted(row[4] for row in rows)
+    hour = tmp_path / "hour.mcap"
+    start, end = (f"{np.datetime64(times[len(times) * i // 4], 'ns')}Z" for i in (1, 3))
+    hearthlog("cut", first, "--start", start, "--end", end, "--topics", "/mic/features", "-o", hour)
+    part = raw_messages(hour)
+    output = tmp_path / "both.mcap"
+    result = hearthlog("merge", hour, first, "-o", output)
+    assert sorted(raw_messages(output)) == sorted(rows)
+    line = f"hearthlog: {len(part)} messages left out that the logs have twice\n"
+    assert (result.returncode, result.stderr) == (0, line)
+    assert len(part) > 100
+
+
+def test_messages_that_differ_in_anything_are_not_the_same(hearthlog, tmp_path):
+    one, other = (message("std_msgs/msg/String", data=text) for text in ("one", "two"))
+    write_log(tmp_path / "1.mcap", {"/x": [(1, one), (1, other), (2, one)], "/y": [(1, one)]})
+    write_log(tmp_path / "2.mcap", {"/x": [(1, other), (3, one)], "/y": [(1, other)]})
+    result = hearthlog("merge", tmp_path, "-o", tmp_path / "all.mcap")
+    assert (result.returncode, result.stderr) == (0, "")  # their sequences differ
+    assert len(raw_messages(tmp_path / "all.mcap")) == 7
+    shutil.copy(tmp_path / "1.mcap", tmp_path / "3.mcap")
+    result = hearthlog("merge", tmp_path / "1.mcap", tmp_path / "3.mcap", "-o", tmp_path / "4.mcap")
+    assert "4 messages left out" in result.stderr
+    assert raw_messages(tmp_path / "4.mcap") == raw_messages(tmp_path / "1.mcap")
 
 
 def test_a_merged_log_is_opened_by_rosbags_and_says_what_it_holds(recorded, hearthlog, tmp_path):

@@ -1,7 +1,6 @@
 """Logs written from arrays are, byte for byte, what the writer of mcap makes of single messages."""
 
-import pickle
-from io import SEEK_END, BytesIO
+from io import BytesIO
 from operator import itemgetter
 
 import numpy as np
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
+from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
@@ -223,30 +222,3 @@ def test_a_log_says_how_many_messages_it_has_and_from_when_to_when(tmp_path):
     assert about.message_start_time == 7
     assert about.message_end_time == 4 * NANOSECONDS + 7
     assert about.channel_message_counts == {1: 5}
-
-
-def test_a_log_goes_on_in_another_process_as_if_nothing_had_been():
-    wholes, parts = BytesIO(), BytesIO()
-    whole, part = LogStreamWriter(wholes, TOPICS), LogStreamWriter(parts, TOPICS)
-    for first in (0, 40, 80):
-        times = 10**18 + np.arange(first, first + 40) * NANOSECONDS
-        fields = {
-            "header.stamp": times,
-            "header.frame_id": "mic",
-            "frame": np.arange(first, first + 40),
-            "label": ["speech"] * 40,
-            "confidence": np.ones(40, np.float32),
-            "novelty": np.zeros(40, np.float32),
-            "probabilities": np.ones((40, 2), np.float32),
-        }
-        for one in (whole, part):
-            one.write_columns([TopicBatch("/mic/label", times, fields)])
-            one.flush()
-        part = pickle.loads(pickle.dumps(part))
-        parts = BytesIO(parts.getvalue())
-        parts.seek(0, SEEK_END)
-        part.continue_on(parts)
-    for one in (whole, part):
-        one.add_metadata("hearthlog", {"node": "home"})
-        one.finish("a.mcap")
-    assert parts.getvalue() == wholes.getvalue()

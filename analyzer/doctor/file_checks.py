@@ -1,6 +1,7 @@
 """Check one file, from its first byte to its last."""
 
 import re
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ from hearthlog.analyzer.doctor.mcap.summary_section import SummarySection
 from hearthlog.analyzer.doctor.message_checks import MessageChecks
 from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataChecks
 from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import decode
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
@@ -85,7 +86,7 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
         return
     finished = source.size > len(MAGIC) and source.tail(len(MAGIC)) == MAGIC
     outline = _outline(findings.path, source)
-    data = DataSection(findings, _KEPT, ours=outline.ours)
+    data = DataSection(findings, _KEPT, source.size, ours=outline.ours)
     checks = MessageChecks(data, findings) if outline.ours else ForeignMessages(data, findings)
     walk = RecordWalk(source, findings, outline.offsets, finished=finished)
     complete = _walk(walk, data, checks, outline, lambda offset: progress(offset / source.size))
@@ -111,7 +112,10 @@ def _outline(path: Path, source: ByteSource) -> _Outline:
     footer = read_footer(source.tail(FOOTER_SIZE))
     start = 0 if footer is None else footer.summary_start
     try:
-        with LogFile(path) as file:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", HearthlogWarning)  # the checks tell more of it
+            file = LogFile(path)
+        with file:
             ours = _is_ours(file)
             offsets = file.chunks["offset"].tolist()
             offsets += [location.offset for location in file.record_locations]

@@ -6,14 +6,16 @@ import sys
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hearthlog.analyzer.export.file_names import unused_name
+from hearthlog.analyzer.export.repeats import without_repeats
 from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
@@ -37,10 +39,11 @@ def merge_logs(
     progress: Progress = ignore_progress,
     *,
     latched: bool = False,
-) -> None:
+) -> int:
     """Write the messages of a selection to one log, in the order of their log times.
 
-    Messages of one time keep the order of their log. Channels of equal topic, definition and
+    Messages of one time keep the order of their log. What is there twice, with the same topic,
+    times, sequence and bytes, is written once. Channels of equal topic, definition and
     metadata become one. Metadata records and attachments of the logs are copied, equal ones
     once; the `rosbag2` record is made anew.
 
@@ -56,6 +59,11 @@ def merge_logs(
         of each channel that is transient local without end, with the log time of the first message
         in the span, and its own publish time.
 
+    Returns
+    -------
+    int
+        How many messages were left out because they are there already.
+
     Raises
     ------
     LogError
@@ -63,7 +71,23 @@ def merge_logs(
         have, or if the output exists or cannot be written.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
-        write_log(selection, stream, output.name, progress, latched=latched)
+        return write_log(selection, stream, output.name, progress, latched=latched).repeated
+
+
+class WrittenLog(NamedTuple):
+    """What came of a log that was written.
+
+    Attributes
+    ----------
+    record : mapping of str to str, or None
+        Its `rosbag2` record; None, and no record, if a topic has channels that rosbag2 cannot tell
+        apart, or no ROS 2 messages.
+    repeated : int
+        How many messages were left out because they are there already.
+    """
+
+    record: Mapping[str, str] | None
+    repeated: int
 
 
 def write_log(
@@ -73,7 +97,7 @@ def write_log(
     progress: Progress = ignore_progress,
     *,
     latched: bool = False,
-) -> Mapping[str, str] | None:
+) -> WrittenLog:
     """Write the messages of a selection to a stream, as `merge_logs` does to a file.
 
     Parameters
@@ -87,12 +111,6 @@ def write_log(
         Is told the share that is done, 0 to 1.
     latched : bool
         As of `merge_logs`.
-
-    Returns
-    -------
-    mapping of str to str, or None
-        The `rosbag2` record that was written; None, and no record, if a topic has channels that
-        rosbag2 cannot tell apart, or no ROS 2 messages.
 
     Raises
     ------
@@ -112,10 +130,12 @@ def write_log(
         for topic, message in _latched(selection).items():
             if topic not in spoken:
                 log.write([_at(start, message)])
-    log.write(first)
-    for batch in batches:
-        log.write(batch)
-    return log.finish(name)
+    repeated = 0
+    for batch in chain([first], batches):
+        once = without_repeats(batch)
+        repeated += sum(map(len, batch)) - sum(map(len, once))
+        log.write(once)
+    return WrittenLog(log.finish(name), repeated)
 
 
 class _Log:

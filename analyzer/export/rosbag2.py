@@ -11,7 +11,7 @@ def _save(selection: Selection, files: OutputFiles, progress: Progress) -> None:
     """Write a log and `metadata.yaml`; raise LogError if rosbag2 cannot tell its channels apart."""
     log = files.path / f"{files.output.name}.mcap"
     with log.open("xb") as stream:
-        record = write_log(selection, stream, log.name, progress)
+        record = write_log(selection, stream, log.name, progress).record
     if record is None:
         raise LogError(
             "a topic has channels of different types or qualities of service, or no ROS 2 "

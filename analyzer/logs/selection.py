@@ -39,7 +39,7 @@ class Selection:
 
     logs: Sequence[Path]  # those with messages in the span
     earlier: Sequence[Path]  # those with messages before it, the last first
-    unfinished: Sequence[Path]  # those of `logs` that were not completed
+    unfinished: Sequence[Path]  # those of `logs` that were not completed, or have no message yet
     channels: Mapping[str, Sequence[Described]]  # by topic, equal ones once
     # the `hearthlog` records of the logs; equal ones are there once
     metadata: Sequence[Mapping[str, str]]
@@ -205,6 +205,7 @@ def select(
         return result
 
     spans = time_spans(files.values(), sound(lambda path: _span(path, catalogs[path])))
+    spoken = {*damages, *(path for _, _, path in spans)}
     chosen = [
         (first, last, path)
         for first, last, path in spans
@@ -226,7 +227,10 @@ def select(
     return Selection(
         logs=[path for _, _, path in chosen],
         earlier=[p for first, _, p in reversed(spans) if start is not None and first < start],
-        unfinished=[content.path for content in contents if not content.complete],
+        unfinished=[
+            *(content.path for content in contents if not content.complete),
+            *(path for path in files.values() if path not in spoken and _is_cut(path)),
+        ],
         channels={t: same for t, same in channels.items() if topics is None or t in topics},
         metadata=metadata,
         topics=topics,
@@ -260,6 +264,11 @@ def _catalog(folder: Path) -> "Catalog | None":
 def _span(path: Path, catalog: "Catalog | None") -> tuple[int, int] | None:
     """Return the span of a log, from the catalogue if that speaks of the file as it is now."""
     return (catalog and catalog.span(path)) or time_span(path)
+
+
+def _is_cut(path: Path) -> bool:
+    with LogFile(path) as file:
+        return not file.complete
 
 
 class _Content:

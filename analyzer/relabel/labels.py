@@ -1,7 +1,7 @@
 """The task of a worker: the labels and segments of one log."""
 
-import shutil
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -42,8 +42,13 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
+from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import METADATA
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.storage.new_files import new_file, replaced_file
+from hearthlog.schemas.times import NANOSECONDS
+
+_CHUNK_SPAN = 60 * NANOSECONDS  # who wants segments alone reads the minutes in which some end
 
 
 class LabelledSound(NamedTuple):
@@ -91,8 +96,7 @@ class LabelledSound(NamedTuple):
 class UnfinishedLayer(NamedTuple):
     """The labels of a log, and the segments of each of its microphones."""
 
-    part: Path  # the unfinished file, with the labels
-    writer: LogStreamWriter  # that has written it
+    part: Path  # a file of the labels alone
     inputs: LayerInputs
     node: str
     provenance: Mapping[str, str]  # the `hearthlog` record of the log
@@ -185,17 +189,21 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
         "feature_set": model.description.feature_set,
         "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
     }
-    batches = [_segments_of(sound, model, classifier) for sound in labelled.sounds]
+    topics = [layer_topics(s.microphone, model.name, classifier.classes) for s in labelled.sounds]
+    segments = [segments.name for _, segments in topics]
     put = replaced_file if job.replaces else new_file
     try:
         with put(job.layer) as temporary, temporary.open("xb") as out:
-            with labelled.part.open("rb") as stream:
-                shutil.copyfileobj(stream, out, 1 << 20)
-            writer = labelled.writer
-            writer.continue_on(out)
-            for batch in batches:
-                writer.write_columns([batch])
-                writer.flush()
+            writer = LogStreamWriter(out, [topic for pair in topics for topic in pair])
+            current = 0
+            for minute, labels, decided in _by_minutes(labelled):
+                if minute != current:
+                    writer.flush()
+                    current = minute
+                rows = zip(segments, decided, labelled.sounds, strict=True)
+                writer.write_columns(
+                    [_segments_of(*row, classifier.classes) for row in rows], labels
+                )
             record = layer_record(metadata, job.log.name, labelled.node, more)
             writer.add_metadata(METADATA, record)
             writer.finish(job.layer.name)
@@ -206,11 +214,37 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     delete_parts(job.layer)
 
 
-def _segments_of(sound: LabelledSound, model: Model, classifier: Classifier) -> TopicBatch:
-    _, topic = layer_topics(sound.microphone, model.name, classifier.classes)
-    times: Int64 = np.array([segment.decided_at for segment in sound.segments], np.int64)
-    columns = segment_columns(sound.segments, classifier.classes, sound.microphone)
-    return TopicBatch(topic.name, times, columns)
+def _by_minutes(
+    labelled: UnfinishedLayer,
+) -> Iterator[tuple[int, list[RawMessages], list[Sequence[Segment]]]]:
+    """Yield what is known in each minute: its labels, and the segments of each microphone.
+
+    The last segments come with a minute of their own. A minute may come in pieces.
+    """
+    times = [[segment.decided_at for segment in sound.segments] for sound in labelled.sounds]
+    done = [0] * len(times)
+
+    def segments(ends: Sequence[int]) -> list[Sequence[Segment]]:
+        return [s.segments[a:b] for s, a, b in zip(labelled.sounds, done, ends, strict=True)]
+
+    for batch in iterate_messages([labelled.part]):
+        batch.sort(key=lambda messages: messages.channel.topic)
+        known = np.concatenate([messages.log_times for messages in batch])
+        for minute in np.unique(known // _CHUNK_SPAN).tolist():
+            start = minute * _CHUNK_SPAN
+            end = min(start + _CHUNK_SPAN, int(known.max()) + 1)
+            labels = [messages.between(start, end) for messages in batch]
+            ends = [bisect_left(same, end) for same in times]
+            yield minute, [messages for messages in labels if len(messages)], segments(ends)
+            done = ends
+    yield -1, [], segments([len(same) for same in times])
+
+
+def _segments_of(
+    topic: str, segments: Sequence[Segment], sound: LabelledSound, classes: Sequence[str]
+) -> TopicBatch:
+    times: Int64 = np.array([segment.decided_at for segment in segments], np.int64)
+    return TopicBatch(topic, times, segment_columns(segments, classes, sound.microphone))
 
 
 @lru_cache(2)
@@ -235,7 +269,7 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Unfinis
     infos, left_out = infos_for_model(log, model, job.log)
     begun = [_begin(job, info, classifier) for info in infos]
     part = part_path(job.layer)
-    writer, frames = _write_labels(part, job, begun, model)
+    frames = _write_labels(part, job, begun, model)
     following = [_goes_on(job, each) for each in begun]
     ends = zip(begun, frames, following, strict=True)
     sounds = [_end(each, count, goes_on=bool(goes_on)) for each, count, goes_on in ends]
@@ -243,7 +277,6 @@ def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> Unfinis
     behind = "" if job.next_log is None or None in following else stem(job.next_log)
     return UnfinishedLayer(
         part=part,
-        writer=writer,
         inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),
         node=infos[0].node,
         provenance=infos[0].metadata,
@@ -280,25 +313,25 @@ def _end(begun: _Begun, frames: int, *, goes_on: bool) -> LabelledSound:
     )
 
 
-def _write_labels(
-    part: Path, job: Job, begun: Sequence[_Begun], model: Model
-) -> tuple[LogStreamWriter, list[int]]:
-    """Write the labels of a log to a new file; return also how many each microphone has."""
-    topics = [layer_topics(each.info.microphone, model.name, model.classes) for each in begun]
+def _write_labels(part: Path, job: Job, begun: Sequence[_Begun], model: Model) -> list[int]:
+    """Write the labels of a log to a new file; return how many each microphone has."""
+    pairs = [layer_topics(each.info.microphone, model.name, model.classes) for each in begun]
+    topics = [labels for labels, _ in pairs]
     try:
         with part.open("xb") as out:
-            writer = LogStreamWriter(out, [topic for pair in topics for topic in pair])
+            writer = LogStreamWriter(out, topics)
             frames = [
                 _write_sound(writer, labels.name, each)
-                for each, (labels, _) in zip(begun, topics, strict=True)
+                for each, labels in zip(begun, topics, strict=True)
             ]
+            writer.finish(part.name)
     except BaseException as error:
         with suppress(OSError):
             part.unlink()
         if isinstance(error, OSError):
             raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
         raise
-    return writer, frames
+    return frames
 
 
 def _write_sound(writer: LogStreamWriter, topic: str, begun: _Begun) -> int:

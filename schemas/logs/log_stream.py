@@ -10,7 +10,8 @@ import numpy as np
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs import rosbag2
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
-from hearthlog.schemas.mcap.message_blocks import Block
+from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
+from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
 from hearthlog.schemas.messages.message_types import definition, type_hash
 from hearthlog.schemas.messages.topics import Topic
@@ -49,8 +50,6 @@ class TopicBatch(NamedTuple):
 class LogStreamWriter:
     """Writes a log to a stream.
 
-    A pickled writer can go on elsewhere: `continue_on` a stream that has what was flushed.
-
     Parameters
     ----------
     stream : BinaryIO
@@ -77,16 +76,6 @@ class LogStreamWriter:
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, ENCODING, schemas[topic.type], channel_metadata
             )
-
-    def continue_on(self, stream: BinaryIO) -> None:
-        """Go on with another stream.
-
-        Parameters
-        ----------
-        stream : BinaryIO
-            It contains all that was flushed, and is at its end; stays open.
-        """
-        self._writer.continue_on(stream)
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         """Append a metadata record.
@@ -126,7 +115,9 @@ class LogStreamWriter:
         self._writer.add_message(self._channels[topic], log_time, data, log_time)
         self._count(topic, 1, log_time, log_time)
 
-    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
+    def write_columns(
+        self, batch: Sequence[TopicBatch], encoded: Sequence[RawMessages] = ()
+    ) -> None:
         """Append messages of several topics, in the order of their log times.
 
         The file is the same as if they had been encoded and written one by one.
@@ -135,14 +126,22 @@ class LogStreamWriter:
         ----------
         batch : sequence of TopicBatch
             Messages of one time are written in the order of the batch.
+        encoded : sequence of RawMessages
+            Messages of the writer's topics in another file, which are copied. Those of one time
+            come before those of the batch.
 
         Raises
         ------
         LogError
             If a message cannot be encoded; see `encode_groups`.
         """
-        blocks = []
+        blocks: list[Block] = []
         first = 0
+        for messages in encoded:
+            topic, times = messages.channel.topic, messages.log_times
+            blocks += message_blocks(messages, self._channels[topic], first)
+            first += len(messages)
+            self._count(topic, len(messages), int(times[0]), int(times[-1]))
         for part in batch:
             count = len(part.log_times)
             for rows, payloads in encode_groups(self._counts[part.topic].type, part.fields, count):

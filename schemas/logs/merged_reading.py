@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.mcap.chunk_table import not_empty
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -111,8 +112,8 @@ class _Query(NamedTuple):
 
     def chunks(self, file: LogFile) -> NDArray[np.void]:
         """Return the chunks that may hold a message of the query."""
-        chunks = file.chunks[(file.chunks["end"] >= self.start) & (file.chunks["start"] < self.end)]
-        chunks = chunks[:: self.every]
+        chunks = not_empty(file.chunks)
+        chunks = chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)][:: self.every]
         if self.topics is None:
             return chunks
         others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}

@@ -1,6 +1,7 @@
 """What rosbag2 wants to find in an MCAP file."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -8,6 +9,9 @@ from typing import NamedTuple
 from hearthlog.schemas.messages.topics import Quality
 
 METADATA = "rosbag2"
+_COUNTED = re.compile(
+    r"^ *(?:name: *(?P<name>\S+)|message_count: *(?P<count>\d{1,18})) *$", re.MULTILINE
+)
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 
 
@@ -87,6 +91,47 @@ def file_metadata(
         `serialized_metadata`, as JSON.
     """
     return {"serialized_metadata": json.dumps(_information([FileCounts(name, topics, span)]))}
+
+
+def message_counts(record: Mapping[str, str]) -> dict[str, int]:
+    """Read how many messages of each topic a file has by its `rosbag2` metadata record.
+
+    Parameters
+    ----------
+    record : mapping of str to str
+        Of any writer: JSON, or YAML in blocks as rosbag2 itself writes it.
+
+    Returns
+    -------
+    dict of str to int
+        By topic; empty if the record does not say so, or says two things.
+    """
+    text = record.get("serialized_metadata", "")
+    try:
+        total, counts = _from_json(text) if text.lstrip().startswith("{") else _from_yaml(text)
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return {}
+    return counts if sum(counts.values()) == total else {}
+
+
+def _from_json(text: str) -> tuple[int, dict[str, int]]:
+    record = json.loads(text)
+    topics = record["topics_with_message_count"]
+    counts = {topic["topic_metadata"]["name"]: int(topic["message_count"]) for topic in topics}
+    return int(record["message_count"]), counts
+
+
+def _from_yaml(text: str) -> tuple[int, dict[str, int]]:
+    before, _, topics = text.partition("topics_with_message_count:")
+    totals = [int(match["count"]) for match in _COUNTED.finditer(before) if match["count"]]
+    counts: dict[str, int] = {}
+    name = ""
+    for match in _COUNTED.finditer(topics):
+        if match["name"]:
+            name = match["name"]
+        elif name:  # those of files, further on, have none
+            counts[name], name = int(match["count"]), ""
+    return totals[0] if totals else -1, counts
 
 
 def metadata_yaml(files: Sequence[FileCounts]) -> str:

@@ -23,6 +23,7 @@ CHUNKS = np.dtype(
         ("channels", "<i8"),  # a place in `LogFile.channel_sets`
     ]
 )
+_EMPTY = 80  # bytes that a chunk without records has at most
 _RUN_LIMIT = 1 << 20  # bytes of messages outside of chunks that are read at once
 
 
@@ -134,6 +135,20 @@ def read_chunk_index(content: bytes) -> ChunkRow:
     if max(offset + length + index_length, start, end, size) >= 1 << 63:
         raise McapError("a number is out of range")
     return ChunkRow(offset, length, index_length, size, start, end, channels)
+
+
+def not_empty(chunks: NDArray[np.void]) -> NDArray[np.void]:
+    """Leave out chunks that hold nothing, of which a hostile file may have very many.
+
+    Parameters
+    ----------
+    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
+
+    Returns
+    -------
+    np.ndarray [shape=(m,)], of dtype `CHUNKS`
+    """
+    return chunks[(chunks["size"] > 0) | (chunks["length"] > _EMPTY)]
 
 
 def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:

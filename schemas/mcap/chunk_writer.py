@@ -50,19 +50,6 @@ class ChunkWriter:
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = ChunkBuilder()  # in progress
 
-    def __getstate__(self) -> dict[str, object]:
-        return self.__dict__ | {"_stream": None}
-
-    def continue_on(self, stream: BinaryIO) -> None:
-        """Write to another stream from here on.
-
-        Parameters
-        ----------
-        stream : binary file
-            Holds all that was written to the last one, and is positioned behind it.
-        """
-        self._stream = stream
-
     def start(self, profile: str, library: str) -> None:
         """Write the magic bytes and the header.
 

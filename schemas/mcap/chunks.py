@@ -15,6 +15,7 @@ from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap import formats
 from hearthlog.schemas.mcap.chunk_records import index_messages, iterate_records
+from hearthlog.schemas.mcap.chunk_table import not_empty
 from hearthlog.schemas.mcap.decompression import decompress_together
 from hearthlog.schemas.mcap.formats import HEAD, MESSAGE_HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -22,6 +23,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompress_into, parse
 
 _WRONG_INDEX = "the index of a chunk does not belong to it"
+_ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
 _BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
@@ -131,10 +133,11 @@ def read_definitions(file: LogFile) -> None:
     LogError
         If the log cannot be read, or one of these chunks is damaged.
     """
-    for number, channels in enumerate(file.chunks["channels"].tolist()):
+    chunks = not_empty(file.chunks)
+    for number, channels in enumerate(chunks["channels"].tolist()):
         identities = file.channel_sets[channels]
         if not identities or not identities <= file.channels.keys():
-            read_chunks(file, file.chunks[number : number + 1], topics=())
+            read_chunks(file, chunks[number : number + 1], topics=())
 
 
 def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:
@@ -299,11 +302,14 @@ class _Batch(NamedTuple):
                 raise self._damaged(numbers[(first > ends).argmax()], "a message index is cut")
             heads = gather(self.raw, starts, index_head.itemsize).view(index_head)
             length, size = heads["length"], heads["size"].astype(np.int64)
+            # Records may grow at their end, but not by what may be entries: the size is wrong then.
+            content = size + index_head.itemsize - HEAD.size
             sound = (
                 (heads["opcode"] == Opcode.MESSAGE_INDEX)
-                & (length >= size + index_head.itemsize - HEAD.size)
+                & (length >= content)
+                & ((length == content) | ((length - content) % _ENTRY_SIZE > 0))
                 & (length <= ends - starts - HEAD.size)
-                & (size % formats.INDEX_ENTRIES.itemsize == 0)
+                & (size % _ENTRY_SIZE == 0)
             )
             if not sound.all():
                 raise self._damaged(numbers[sound.argmin()], "here should be a message index")

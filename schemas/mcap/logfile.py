@@ -2,6 +2,7 @@
 
 import io
 import struct
+import warnings
 import zlib
 from array import array
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 from numpy.typing import NDArray
 
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.mcap.chunk_table import (
     CHUNKS,
     ChunkRow,
@@ -29,6 +30,7 @@ from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAG
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
 
+_NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
 _RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
 _CHANNEL_END = HEAD.size + UINT16.size
@@ -224,14 +226,25 @@ class LogFile:
         raise LogError(f"{self.path}: is no MCAP file")
 
     def _find_chunks(self) -> None:
-        size = self.size
-        footer = read_footer(self.read(max(size - FOOTER_SIZE, 0), FOOTER_SIZE))
+        end = self.size - FOOTER_SIZE
+        footer = read_footer(self.read(max(end, 0), FOOTER_SIZE))
         self.complete = footer is not None
-        if footer is None or not self._read_summary(footer, size - FOOTER_SIZE):
+        if footer is None or footer.summary_start in {0, end} or not self._has_index(footer, end):
             self.scan_new()
 
+    def _has_index(self, footer: records.Footer, end: int) -> bool:
+        """Read the summary, and return whether it has an index; warn if it is damaged."""
+        if not self._read_summary(footer, end):
+            self._forget()
+            warnings.warn(HearthlogWarning(_NO_INDEX, self.path), stacklevel=2)
+            return False
+        if not len(self.chunks) and (self.statistics is None or self.statistics.message_count):
+            self._forget()
+            return False
+        return True
+
     def _read_summary(self, footer: records.Footer, end: int) -> bool:
-        """Read the summary, and return whether it has an index and is sound."""
+        """Read the summary, and return whether it is sound."""
         start = footer.summary_start
         if not len(MAGIC) <= start < end:
             return False
@@ -247,10 +260,8 @@ class LogFile:
                     self._add(parse(location.opcode, content))
             crc = zlib.crc32(self.read(end, HEAD.size + FOOTER.size), crc)
         except (McapError, UnicodeDecodeError, struct.error):
-            crc = -1
-        counted = self.statistics.message_count if self.statistics else -1
-        if crc < 0 or footer.summary_crc not in {0, crc} or (not rows and counted):
-            self._forget()
+            return False
+        if footer.summary_crc not in {0, crc}:
             return False
         opcode, length = HEAD.unpack(self.read(len(MAGIC), HEAD.size))
         self._note(RecordLocation(opcode, len(MAGIC), HEAD.size + length))
@@ -375,6 +386,8 @@ class LogFile:
             self.record_locations.append(RecordLocation(opcode, record.offset, record.length))
 
     def _forget(self) -> None:
+        self.header = None
+        self.chunks = np.empty(0, CHUNKS)
         self.schemas.clear()
         self.channels.clear()
         self.record_locations.clear()

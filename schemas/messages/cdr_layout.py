@@ -237,6 +237,10 @@ class LayoutWalk:
             the message ends before one of its fields, or has too many of them.
         """
         if name not in self._types:
+            if name.endswith("/wstring"):
+                raise LogError(
+                    f"{self._name}: {prefix[:-1]} is of type wstring, which is not supported"
+                )
             raise LogError(f"{self._name}: builds on {name}, which is not defined")
         self._step()
         self._depth += 1

@@ -1,40 +1,29 @@
 """What was lost where a file is damaged, as far as the file still shows it."""
 
-import zlib
-from array import array
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from mcap import records
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.definitions import Definition, Definitions
-from hearthlog.schemas.mcap.formats import (
-    CHUNK,
-    FOOTER,
-    FOOTER_SIZE,
-    HEAD,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_INDEX_HEAD,
-)
-from hearthlog.schemas.mcap.records import LIMIT, read_footer
+from hearthlog.schemas.mcap.definitions import Definitions
+from hearthlog.schemas.mcap.formats import CHUNK, HEAD, MESSAGE
+from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.salvage.file_index import Index, UnmetChunks
+from hearthlog.schemas.salvage.index_claims import Claim
 from hearthlog.schemas.salvage.record_sizes import SHORTEST
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import WholeRecord
 from hearthlog.schemas.times import millisecond_text
 
-_BLOCK = 1 << 20
 _DAMAGES = 1000  # as many are told apart
+_UNMET = "the index lists more than there is"
 _NAME_AFTER = {Opcode.METADATA: 0, Opcode.ATTACHMENT: 16}  # bytes
 
 
@@ -117,6 +106,66 @@ class DamageList:
         span = min(span[0], times[0]), max(span[1], times[1])
         self.unnamed[channel] = count + messages, span, (start, whole.end)
 
+    def add_unmet(self, unmet: Iterable[UnmetChunks], names: Sequence[str]) -> None:
+        """Add what an index lists and the file does not have, unless damages tell of it already.
+
+        Where the index knows more than a damage, the damage is told.
+
+        Parameters
+        ----------
+        unmet : iterable of UnmetChunks
+            All chunks of the index that were not met.
+        names : sequence of str
+            All metadata records and attachments of the index that were not met.
+        """
+        starts = [damage.start for damage, _ in self._damages]
+        more: list[tuple[Damage, dict[int, int]]] = []
+        for chunks in unmet:
+            first = bisect_left(starts, chunks.start)
+            last = bisect_left(starts, max(chunks.end, chunks.start + 1))
+            lost = Counter(chunks.messages)
+            for _, told in self._damages[first:last]:
+                lost.subtract(told)
+            lost = +lost
+            if first < last:
+                damage, told = self._damages[last - 1]
+                if lost or not damage.exact:
+                    times = _span(damage.times, chunks.times)
+                    damage = replace(damage, exact=chunks.exact, times=times)
+                    self._damages[last - 1] = damage, dict(lost + Counter(told))
+            elif lost or not chunks.exact:
+                damage = Damage(chunks.start, chunks.end, _UNMET, {}, chunks.exact, chunks.times)
+                more.append((damage, dict(lost)))
+        known = Counter(name for damage, _ in self._damages for name in damage.others)
+        others = tuple((Counter(names) - known).elements())
+        if others:
+            more.append((Damage(0, 0, _UNMET, others=others), {}))
+        self._insert(more)
+
+    def add_claims(self, claims: Iterable[Claim]) -> None:
+        """Add what message indexes list and no chunk has.
+
+        Parameters
+        ----------
+        claims : iterable of Claim
+            In the order of the file.
+        """
+        why = "message indexes list more than there is"
+        self._insert(
+            [(Damage(start, start, why, times=times), dict(lost)) for start, lost, times in claims]
+        )
+
+    def _insert(self, more: list[tuple[Damage, dict[int, int]]]) -> None:
+        """Put damages among the others by their offsets; too many of them become one."""
+        room = max(_DAMAGES - len(self._damages), 1)
+        if len(more) > room:
+            rest = more[room - 1 :]
+            exact = all(damage.exact for damage, _ in rest)
+            ends = rest[0][0].start, max(damage.end for damage, _ in rest)
+            lost = sum((Counter(lost) for _, lost in rest), Counter[int]())
+            more[room - 1 :] = [(Damage(*ends, _UNMET, exact=exact), dict(lost))]
+        self._damages = sorted([*self._damages, *more], key=lambda each: each[0].start)
+
     def resolve(self, definitions: Definitions) -> list[Damage]:
         """List the damages, then the messages without a definition, with the names of topics.
 
@@ -142,28 +191,6 @@ class DamageList:
             messages = {definitions.topic(channel): count}
             damages.append(Damage(*place, why, messages, times=times))
         return damages
-
-
-class Index(NamedTuple):
-    """The index of a file, whose checksum is right if it has one.
-
-    Attributes
-    ----------
-    reader : RecordVerifier
-        Of the whole file.
-    messages : dict of int to int, or None
-        How many messages each channel has; None if the index does not say so.
-    chunks : np.ndarray [shape=(n, 6)], int64
-        Offset, length, length of the message indexes, first and last log time of each chunk, and
-        the byte at which its record in the index begins; in the order of the file.
-    """
-
-    reader: RecordVerifier
-    start: int  # byte at which it begins
-    definitions: list[Definition]
-    messages: dict[int, int] | None
-    chunks: NDArray[np.int64]
-    names: dict[int, str]  # of metadata records and attachments, by offset
 
 
 class DamagedRange(NamedTuple):
@@ -197,72 +224,8 @@ class Loss(NamedTuple):
 _NOTHING = Loss({}, exact=True)
 
 
-def read_index(reader: RecordVerifier, limit: int) -> Index | None:
-    """Read the index of a finished file.
-
-    Parameters
-    ----------
-    reader : RecordVerifier
-        Of the file, up to its end, where it stays.
-    limit : int
-        Bytes; a larger index is not read.
-
-    Returns
-    -------
-    Index or None
-        None if the file is not finished, or if its index is damaged or larger than the limit. That
-        of a finished file may be empty.
-    """
-    end = reader.end - FOOTER_SIZE
-    tail = reader.read(max(end, 0), FOOTER_SIZE)
-    footer = read_footer(tail)
-    if footer is None:
-        return None
-    start = footer.summary_start or end
-    if not len(MAGIC) <= start <= end or end - start > limit:
-        return None
-    crc = 0
-    for place in range(start, end, _BLOCK):
-        crc = zlib.crc32(reader.read(place, min(_BLOCK, end - place)), crc)
-    crc = zlib.crc32(tail[: HEAD.size + FOOTER.size], crc)
-    if footer.summary_crc not in {0, crc}:
-        return None
-    with suppress(McapError, UnicodeDecodeError, OverflowError):
-        return _records_of_index(reader, start, end)
-    return None
-
-
-def _records_of_index(reader: RecordVerifier, start: int, end: int) -> Index:
-    definitions: list[Definition] = []
-    names: dict[int, str] = {}
-    messages: dict[int, int] | None = None
-    chunks = array("q")
-    offset = start
-    while offset < end:
-        whole = reader.whole(offset)
-        record = whole.record
-        if isinstance(record, Definition):
-            definitions.append(record)
-        elif isinstance(record, records.Statistics):
-            messages = record.channel_message_counts
-        elif isinstance(record, records.ChunkIndex):
-            chunks.extend([record.chunk_start_offset, record.chunk_length])
-            chunks.extend([record.message_index_length, record.message_start_time])
-            chunks.extend([record.message_end_time, offset])
-        elif isinstance(record, records.MetadataIndex):
-            if record.name != rosbag2.METADATA:  # it is made anew
-                names[record.offset] = f"the metadata {record.name!r}"
-        elif isinstance(record, records.AttachmentIndex):
-            names[record.offset] = f"the attachment {record.name!r}"
-        elif not isinstance(record, records.SummaryOffset):
-            raise McapError("here should be the index")
-        offset = whole.end
-    table = np.array(chunks, np.int64).reshape(-1, 6)
-    table = table[np.argsort(table[:, 0])]
-    ends = table[:, :3].sum(axis=1)
-    if (table < 0).any() or (ends[:-1] > table[1:, 0]).any():
-        raise McapError("chunks overlap")
-    return Index(reader, start, definitions, messages, table, names)
+def _span(first: tuple[int, int] | None, second: tuple[int, int]) -> tuple[int, int]:
+    return second if first is None else (min(first[0], second[0]), max(first[1], second[1]))
 
 
 def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) -> Loss:
@@ -275,9 +238,9 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
     damaged : DamagedRange
     index : Index or None
         Index of the file. None if the file has none that is whole: the bytes of the range and the
-        message indexes behind it then tell what was lost.
+        message indexes behind it then tell what was lost, as where the index has moved.
     """
-    if index is None:
+    if index is None or index.moved:
         return _loss_by_neighbours(reader, damaged)
     others = tuple(
         name for offset, name in index.names.items() if damaged.start <= offset < damaged.end
@@ -289,25 +252,9 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
     if first == last:
         return Loss({}, True, None, others)
     chunks = index.chunks[first:last]
-    messages: Counter[int] = Counter()
-    for place in chunks[:, 5].tolist():
-        record = index.reader.whole(place).record
-        assert isinstance(record, records.ChunkIndex)
-        messages.update(_messages_of(record))
     times = int(chunks[:, 3].min()), int(chunks[:, 4].max())
+    messages = index.messages_of(int(first), int(last))
     return Loss(messages, exact=True, times=times, others=others)
-
-
-def _messages_of(chunk: records.ChunkIndex) -> dict[int, int]:
-    """Count the messages of a chunk, by channel, from the lengths of its message indexes."""
-    places = sorted(chunk.message_index_offsets.items(), key=itemgetter(1))
-    ends = [place for _, place in places[1:]]
-    ends.append(chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length)
-    head = MESSAGE_INDEX_HEAD.itemsize
-    return {
-        channel: max(end - place - head, 0) // INDEX_ENTRY.size
-        for (channel, place), end in zip(places, ends, strict=False)
-    }
 
 
 def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:

@@ -22,7 +22,9 @@ from hearthlog.schemas.mcap.chunk_records import CHUNK_HEAD_LIMIT, find_chunk_he
 from hearthlog.schemas.mcap.definitions import Definition, Definitions
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.salvage.damage import Damage, DamagedRange, DamageList, loss_in, read_index
+from hearthlog.schemas.salvage.damage import Damage, DamagedRange, DamageList, loss_in
+from hearthlog.schemas.salvage.file_index import MetRecords, read_index
+from hearthlog.schemas.salvage.index_claims import IndexClaims
 from hearthlog.schemas.salvage.record_sizes import SHORTEST, find_record_heads
 from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 from hearthlog.schemas.salvage.whole_records import (
@@ -65,7 +67,7 @@ class Salvage:
     is_mcap : bool
         Whether it begins as such a file does.
     complete : bool
-        Whether it is finished, and its index is whole.
+        Whether it is finished, and its index is whole and where it should be.
     header : mcap.records.Header or None
         The first one met so far.
     definitions : Definitions
@@ -98,13 +100,16 @@ class Salvage:
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
         self._index = read_index(RecordVerifier(self._file, self.size), _KEPT_LIMIT)
-        self.complete = self._index is not None
+        self._met: MetRecords | None = None
+        self.complete = self._index is not None and not self._index.moved
         self.expected = None if self._index is None else self._index.messages
         if self._index is not None:
+            self._met = MetRecords(self._index)
             self._reader.end = self._index.start
             definitions = [*self._index.definitions, *definitions]
         for record in definitions:
             self.definitions.add(record)
+        self._claims = IndexClaims()
         self._next: WholeRecord | None = None  # by the last search
         self._places = _Places(-1, [], [])  # of the window that was searched last
         self._vain = self._kept = 0
@@ -139,6 +144,14 @@ class Salvage:
             should have. They hold no messages of undefined channels: where there are such, the
             other messages come one by one.
         """
+        yield from self._walk()
+        if self._met is not None:
+            self._damages.add_unmet(self._met.unmet(), self._met.unmet_names())
+        else:
+            self._claims.close(self.offset)
+            self._damages.add_claims(self._claims.unmet())
+
+    def _walk(self) -> Iterator[Piece]:
         self.offset = len(MAGIC) if self.is_mcap else 0
         while self.offset < self._reader.end:
             offset = self.offset
@@ -153,8 +166,22 @@ class Salvage:
                 self._damages.add(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
             self.offset = whole.end
             self._last_index = offset if whole.record is None else None
+            self._compare_index(whole)
             yield from self._take(whole)
             del whole  # before the next is read, which may be as large
+
+    def _compare_index(self, whole: WholeRecord) -> None:
+        """Compare message indexes with the chunk before them, where there is no other index."""
+        if self._index is not None:
+            return
+        if whole.record is None:
+            with suppress(McapError):
+                channel, entries, _ = self._reader.message_index(whole.offset)
+                self._claims.add_index(channel, entries)
+            return
+        self._claims.close(whole.offset)
+        if isinstance(whole.record, WholeChunk):
+            self._claims.add_chunk(whole.end, whole.record.stored)
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
         """Read the record that begins here; raise McapError if there is none that is whole."""
@@ -212,6 +239,8 @@ class Salvage:
     def _pass(self, offset: int, why: str) -> int:
         """Note that no whole record begins here; return where the next one does."""
         reader, cost = self._reader, self._cost
+        self._claims.close(offset)
+        self._claims.give_up()
         if (chunk := self._chunk_in_last_index(offset)) is not None:
             return chunk
         opcode = reader.read(offset, 1)[0]
@@ -290,11 +319,14 @@ class Salvage:
         data = self._file.read(start, size)
         chunks = {start + place for place in find_chunk_heads(data) if place < _WINDOW}
         heads = {start + place for place in find_record_heads(data[: _WINDOW + 8])}
+        chunks |= {place for place in heads if data[place - start] == Opcode.CHUNK}
         return _Places(window, sorted(chunks), sorted(chunks | heads))
 
     def _take(self, whole: WholeRecord) -> Iterator[Piece]:
         """Note what a record tells of the file; yield it if the new log will hold it."""
         record = whole.record
+        if self._met is not None:
+            self._met.meet(whole)
         if isinstance(record, records.Header):
             self.header = self.header or record
             self._ended = False

@@ -94,6 +94,7 @@ class SalvagedCopy:
         self._search = FrameSearch(salvage)
         self._writer = ChunkWriter(stream)
         self._begun = False
+        self._counted: dict[str, int] = {}  # messages by topic, as the `rosbag2` record has them
         self._written: set[tuple[type, int]] = set()
         self._counts: Counter[int] = Counter()
         self._stated: Counter[int] = Counter()  # gaps that were not in the log
@@ -155,8 +156,13 @@ class SalvagedCopy:
             topic.end = max(topic.end, self._ends.get(number, 0))
             if expected is not None and not self._drops(number):
                 topic.expected = (topic.expected or 0) + expected.get(number, 0)
+        if expected is None and self._selection is None:
+            for name, count in self._counted.items():
+                if name in topics and count > topics[name].messages:
+                    topics[name].expected = count
         damages = self._salvage.damages()
-        return Recovery(topics, [*damages, *_untraced(topics, damages)], self._salvage.complete)
+        untraced = [] if self._salvage.unnamed else _untraced(topics, damages)
+        return Recovery(topics, [*damages, *untraced], self._salvage.complete)
 
     def _channel_types(self) -> Iterator[tuple[int, Channel, str]]:
         definitions = self._salvage.definitions
@@ -179,7 +185,9 @@ class SalvagedCopy:
             self._writer.copy_attachment(piece.record, piece.index_record)
         elif piece.name == provenance.METADATA and self._selection is not None:
             self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
-        elif piece.name != rosbag2.METADATA:
+        elif piece.name == rosbag2.METADATA:
+            self._counted = rosbag2.message_counts(piece.metadata)
+        else:
             self._writer.add_metadata(piece.name, piece.metadata)
 
     def _add_chunk(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
@@ -274,7 +282,7 @@ class SalvagedCopy:
 
 
 def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[Damage]:
-    """List messages that the log counts, while nothing shows where they were."""
+    """List messages that a count in the log has, while nothing shows where they were."""
     if not all(damage.exact for damage in damages):
         return []
     missing = {
@@ -283,4 +291,4 @@ def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[D
         if topic.expected is not None
     }
     missing = {name: count for name, count in missing.items() if count > 0}
-    return [Damage(0, 0, "its statistics count more", missing)] if missing else []
+    return [Damage(0, 0, "a count in the log has more", missing)] if missing else []

@@ -1,7 +1,7 @@
 """`hearthlog cut`: a part of some logs as a log of its own."""
 
 from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_output, parse_span
-from hearthlog.tools.cli.text import end_with_warnings, unfinished_lines
+from hearthlog.tools.cli.text import end_with_warnings, number, tell, unfinished_lines
 
 
 def cut(
@@ -24,6 +24,8 @@ def cut(
     check_output("--output", output, ".mcap", "a log")
     selection = select(logs, topics or [], *parse_span(start, end))
     with share_done("cutting") as progress:
-        merge_logs(selection, output, progress, latched=True)
+        repeated = merge_logs(selection, output, progress, latched=True)
     print(output)
+    if repeated:
+        tell(f"{number(repeated, 'message')} left out that the logs have twice")
     end_with_warnings(unfinished_lines(selection.unfinished))

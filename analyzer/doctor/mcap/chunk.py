@@ -33,15 +33,24 @@ class Chunk:
         Is added to.
     definitions : CheckedDefinitions
         Of the file so far; those in the chunk are added.
+    budget : RecordBudget
+        Of the file.
     """
 
-    def __init__(self, record: Record, findings: Findings, definitions: CheckedDefinitions) -> None:
+    def __init__(
+        self,
+        record: Record,
+        findings: Findings,
+        definitions: CheckedDefinitions,
+        budget: "RecordBudget",
+    ) -> None:
         self.content: ChunkContent | None = None  # None if the chunk is too damaged to be read
         self.whole = False  # whether all of its messages are in `content`
         self.offset = record.offset
         self._length = record.length
         self._findings = findings
         self._definitions = definitions
+        self._budget = budget
         self._head: ChunkHead | None = None
         self._records = b""
         self._indexes: dict[int, bytes] = {}
@@ -129,9 +138,12 @@ class Chunk:
     def _find_records(self, hints: Int64) -> None:
         """Find messages, take schemas and channels."""
         records = self._records
-        starts, others, end = _split(records, hints)
-        if end != len(records):
-            self._error("chunk-records", "the last record of a chunk is longer than the chunk")
+        starts, others, end = _split(records, hints, self._budget)
+        if self._budget.left < 0:
+            self._error("too-large", "the file holds more records than one of its size can")
+            self.whole = False
+        elif end != len(records):
+            self._error("chunk-records", "the last record of a chunk is damaged")
             self.whole = False
         new: dict[int, int] = {}
         for start in others.tolist():
@@ -195,7 +207,20 @@ class Chunk:
         self._findings.error(rule, what, advice, offset=self.offset)
 
 
-def _split(records: bytes, hints: Int64) -> tuple[Int64, Int64, int]:
+class RecordBudget:
+    """How many records inside of chunks are gone through one by one in a file.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of the file: a small one that claims very many is not believed.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.left = (1 << 20) + 4 * size
+
+
+def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, Int64, int]:
     """Find the records of a chunk.
 
     Parameters
@@ -220,20 +245,23 @@ def _split(records: bytes, hints: Int64) -> tuple[Int64, Int64, int]:
         ).all():
             others = [np.empty(0, np.int64)]
             for place in np.flatnonzero(firsts < lasts).tolist():
-                starts, between, end = _walk(records, int(firsts[place]), int(lasts[place]))
+                starts, between, end = _walk(records, int(firsts[place]), int(lasts[place]), budget)
                 if len(starts) or end != lasts[place]:
                     break  # a message that the index does not know, or no whole records
                 others.append(between)
             else:
                 return hints, np.concatenate(others), len(records)
-    return _walk(records, 0, len(records))
+    return _walk(records, 0, len(records), budget)
 
 
-def _walk(content: bytes, start: int, end: int) -> tuple[Int64, Int64, int]:
+def _walk(content: bytes, start: int, end: int, budget: RecordBudget) -> tuple[Int64, Int64, int]:
     """Go from record to record; return what `_split` does."""
     messages, others = array("q"), array("q")
     with suppress(McapError):
         for opcode, first, last in iterate_records(content, start, end):
+            budget.left -= 1
+            if opcode == 0 or budget.left < 0:
+                break
             if opcode == Opcode.MESSAGE and last - first >= formats.MESSAGE_HEAD.itemsize:
                 messages.append(first)
             else:

@@ -15,7 +15,7 @@ from hearthlog.analyzer.doctor.mcap.checked_definitions import (
     name_of,
     parse_strictly,
 )
-from hearthlog.analyzer.doctor.mcap.chunk import Chunk, check_channels
+from hearthlog.analyzer.doctor.mcap.chunk import Chunk, RecordBudget, check_channels
 from hearthlog.analyzer.doctor.mcap.message_batch import (
     BATCH_SIZE,
     ChunkContent,
@@ -50,11 +50,15 @@ class DataSection:
         Is added to.
     names : collection of str
         Of metadata records and attachments, the first two of each are kept if they are not large.
+    size : int
+        Bytes of the file.
     ours : bool
         Whether hearthlog made this file.
     """
 
-    def __init__(self, findings: Findings, names: Collection[str], *, ours: bool) -> None:
+    def __init__(
+        self, findings: Findings, names: Collection[str], size: int, *, ours: bool
+    ) -> None:
         self.definitions = CheckedDefinitions(findings, ours=ours)
         self.header: Header | None = None
         self.metadata: dict[str, list[dict[str, str]]] = {}
@@ -72,6 +76,7 @@ class DataSection:
         self.ended = False  # there was a Data End
         self.findings = findings
         self._names = names
+        self._budget = RecordBudget(size)
         self._chunk: Chunk | None = None
         self._run = bytearray()  # of messages outside of chunks
         self._run_offset = 0
@@ -103,7 +108,7 @@ class DataSection:
         else:
             yield from self._end_chunk()
         if record.opcode == Opcode.CHUNK:
-            self._chunk = Chunk(record, self.findings, self.definitions)
+            self._chunk = Chunk(record, self.findings, self.definitions, self._budget)
         elif record.opcode not in {Opcode.MESSAGE, Opcode.MESSAGE_INDEX}:
             self._add_other(record)
         if self._size >= BATCH_SIZE:
