@@ -23,7 +23,7 @@ class LogError(HearthlogError):
 
 
 class HearthlogWarning(UserWarning):
-    """Something is read in part only; the command line prints the line once, and exits with 3.
+    """Something is read in part only; the command line prints a line, and exits with 3.
 
     Parameters
     ----------

@@ -439,6 +439,23 @@ def test_of_many_logs_the_damaged_ones_are_named_and_the_rest_is_printed(
     assert (alone.returncode, alone.stderr) == (1, f"hearthlog: {logs[-1]}: is no MCAP file\n")
 
 
+def test_of_many_logs_with_the_same_fault_the_first_are_named_and_the_others_counted(
+    recorded, hearthlog, tmp_path
+):
+    data = bytearray(find_logs(recorded)[0].read_bytes())
+    data[-300] ^= 1  # in the index
+    for second in range(13):
+        (tmp_path / f"home_20260301T0700{second:02}Z.mcap").write_bytes(data)
+    done = hearthlog("cat", tmp_path, "--topics", "/mic/info")
+    assert done.returncode == 3
+    *told, rest = done.stderr.splitlines()
+    text = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
+    named = [line.removeprefix("hearthlog: ").removesuffix(f": {text}") for line in told]
+    assert len(set(named)) == 10
+    assert set(named) <= {str(log) for log in find_logs(tmp_path)}
+    assert rest == f"hearthlog: and 3 more: {text}"
+
+
 def test_messages_that_are_not_of_ros_2_are_refused(hearthlog, tmp_path):
     with (tmp_path / "x.mcap").open("xb") as stream:
         writer = ChunkWriter(stream)

@@ -69,6 +69,7 @@ _ON_LOGS = (
     retain,
 )
 _LEARNING = (manifest, train, enrol)
+_NAMED = 10  # of many files with the same fault
 for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)
 app.add_typer(annotate, name="annotate")
@@ -149,22 +150,31 @@ def _message(error: Exception) -> str:
 
 
 @contextmanager
-def _warnings_shown() -> Iterator[set[str]]:
-    """Print each of our warnings once, in one line, and collect them."""
-    warned: set[str] = set()
+def _warnings_shown() -> Iterator[dict[str, set[str]]]:
+    """Print our warnings, and collect for each text what it is about.
+
+    Of many files with the same fault the first ones are named.
+    """
+    warned: dict[str, set[str]] = {}
     others = warnings.showwarning
 
     def show(message: Any, *arguments: Any, **options: Any) -> None:
         if not isinstance(message, HearthlogWarning):
             others(message, *arguments, **options)
-        elif str(message) not in warned:
-            warned.add(str(message))
+            return
+        places = warned.setdefault(str(message), set())
+        is_new = str(message.where) not in places
+        places.add(str(message.where))
+        if is_new and len(places) <= _NAMED:
             tell(f"{message.where}: {message}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", HearthlogWarning)
         warnings.showwarning = show
         yield warned
+        for text, places in warned.items():
+            if len(places) > _NAMED:
+                tell(f"and {len(places) - _NAMED:,} more: {text}")
 
 
 if __name__ == "__main__":
