@@ -35,9 +35,11 @@ from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap import chunks as chunk_reading
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
-from hearthlog.schemas.mcap.formats import HEAD
+from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.records import encode as encode_record
+from hearthlog.schemas.mcap.records import read_footer
+from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
@@ -470,6 +472,21 @@ def test_a_summary_that_is_damaged_is_done_without_and_named(log, tmp_path):
         columns = read_columns([path], ["/mic/label"])
     assert {each.message.where for each in warned} == {path}
     assert_same(columns["/mic/label"], *expected([log], "label"))
+
+
+@pytest.mark.filterwarnings("ignore:its index is damaged")
+def test_statistics_that_are_damaged_hide_no_log(log, tmp_path):
+    span, data = time_span(log), log.read_bytes()
+    path = tmp_path / "damaged.mcap"
+    end = len(data) - FOOTER_SIZE
+    rest = read_footer(data[end:]).summary_start
+    while data[rest] != Opcode.STATISTICS:
+        rest += HEAD.size + HEAD.unpack_from(data, rest)[1]
+    for place in range(rest, rest + HEAD.size + HEAD.unpack_from(data, rest)[1]):
+        changed = bytearray(data)
+        changed[place] ^= 1
+        path.write_bytes(changed)
+        assert time_span(path) == span
 
 
 def test_a_message_index_that_lists_less_than_it_holds_is_refused(tmp_path):

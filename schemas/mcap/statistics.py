@@ -1,6 +1,7 @@
 """The time span and the message counts of a log, without its index where it is finished."""
 
 import struct
+import zlib
 from collections import Counter
 from contextlib import closing, suppress
 from pathlib import Path
@@ -12,9 +13,9 @@ from mcap.records import McapRecord
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_records import iterate_records
-from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, SUMMARY_OFFSET
+from hearthlog.schemas.mcap.formats import FOOTER, FOOTER_SIZE, HEAD, SUMMARY_OFFSET
 from hearthlog.schemas.mcap.logfile import LogFile, open_log
-from hearthlog.schemas.mcap.records import parse, read_footer
+from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, StoredFile
 
 _SIZE_LIMIT = 1 << 20  # bytes of the records of one kind that are read
@@ -41,7 +42,7 @@ def time_span(path: Path) -> tuple[int, int] | None:
     try:
         _, opened = open_log(path)
         with closing(opened) as file:
-            statistics = _statistics(file)
+            statistics = _statistics(file) if _is_summary_sound(file) else None
     except (McapError, UnicodeDecodeError, struct.error):
         statistics = None
     if statistics is not None:
@@ -78,6 +79,19 @@ def topic_counts(path: Path) -> Counter[str]:
                     most = file.size  # a message takes more than a byte
                     topics[channel.topic] += min(counts.get(channel.id, 0), most)
     return topics
+
+
+def _is_summary_sound(file: LocalFile | StoredFile) -> bool:
+    """Compare the summary of a finished log with its checksum, if it has one."""
+    end = file.size - FOOTER_SIZE
+    footer = read_footer(file.read(max(end, 0), FOOTER_SIZE))
+    if footer is None or not footer.summary_crc:
+        return True
+    start = footer.summary_start
+    if not 0 < start <= end or end - start > LIMIT:
+        return False
+    summary = file.read(start, end - start + HEAD.size + FOOTER.size)
+    return zlib.crc32(summary) == footer.summary_crc
 
 
 def _statistics(file: LocalFile | StoredFile) -> records.Statistics | None:
