@@ -2,7 +2,8 @@
 
     python tests/scheduler_kills.py LOGS MODEL [TIMES]
 
-LOGS is a folder of small logs without layers, of which a copy is labelled each time.
+LOGS is a folder of small logs without layers, of which a copy is labelled each time. The moments
+are between the first connection and the end of a run that nothing happens to.
 """
 
 import random
@@ -13,10 +14,12 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import psutil
 from clusters import scheduler_in, worker_of
 
 _ANNOUNCED = "hearthlog: labelling logs\n"
@@ -37,8 +40,13 @@ class Ending(NamedTuple):
         return self.seconds < 30 and (self.status == 0 or (self.status == 1 and one_line))
 
 
-def run_and_kill(logs: Path, model: Path, folder: Path, due: Callable[[Path], bool]) -> Ending:
-    """Label a copy of logs on a cluster of one's own, and kill its scheduler once that is due."""
+def run_and_kill(
+    logs: Path, model: Path, folder: Path, due: Callable[[Path], Callable[[], bool]]
+) -> Ending:
+    """Label a copy of logs on a cluster of one's own, and kill its scheduler once that is due.
+
+    `due` is told the copy when the run has connected, and returns the function that is asked.
+    """
     folder.mkdir()
     copy = shutil.copytree(logs, folder / "logs")
     with (
@@ -49,8 +57,11 @@ def run_and_kill(logs: Path, model: Path, folder: Path, due: Callable[[Path], bo
         with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         ) as process:
-            while process.poll() is None and not due(copy):
+            while process.poll() is None and not _connected(process.pid, address):
                 time.sleep(0.05)
+            is_due = due(copy)
+            while process.poll() is None and not is_due():
+                time.sleep(0.02)
             scheduler.kill()
             killed = time.monotonic()
             try:
@@ -62,15 +73,27 @@ def run_and_kill(logs: Path, model: Path, folder: Path, due: Callable[[Path], bo
             return Ending(status, time.monotonic() - killed, said.replace(_ANNOUNCED, "", 1))
 
 
-def after(seconds: float) -> Callable[[Path], bool]:
-    """Make the function that says that the kill is due after some seconds."""
-    began = time.monotonic()
-    return lambda _: time.monotonic() - began > seconds
+def _connected(process: int, address: str) -> bool:
+    port = int(address.rpartition(":")[2])
+    with suppress(psutil.NoSuchProcess):
+        connections = psutil.Process(process).net_connections("tcp")
+        return any(each.raddr and each.raddr.port == port for each in connections)
+    return False
 
 
-def with_layers(count: int) -> Callable[[Path], bool]:
-    """Make the function that says that the kill is due when so many layers are done."""
-    return lambda logs: sum(1 for _ in logs.rglob("*.relabel-*.mcap")) >= count
+def after(seconds: float) -> Callable[[Path], Callable[[], bool]]:
+    """Say that the kill is due some seconds after the run has connected."""
+
+    def due(_: Path) -> Callable[[], bool]:
+        connected = time.monotonic()
+        return lambda: time.monotonic() - connected > seconds
+
+    return due
+
+
+def with_layers(count: int) -> Callable[[Path], Callable[[], bool]]:
+    """Say that the kill is due when so many layers are done."""
+    return lambda logs: lambda: sum(1 for _ in logs.rglob("*.relabel-*.mcap")) >= count
 
 
 def _main(logs: str, model: str, times: str = "100") -> None:
@@ -79,16 +102,20 @@ def _main(logs: str, model: str, times: str = "100") -> None:
         folder = Path(text)
 
         def once(number: int) -> tuple[float, Ending]:
-            seconds = rng.uniform(0.4, 1.0) * longest  # before, it is imported
+            seconds = rng.uniform(0.0, longest)
             due = after(seconds)
             ending = run_and_kill(Path(logs), Path(model), folder / str(number), due)
             shutil.rmtree(folder / str(number), ignore_errors=True)
             return seconds, ending
 
-        began = time.monotonic()
-        whole = run_and_kill(Path(logs), Path(model), folder / "whole", lambda _: False)
-        assert whole.status == 0
-        longest = time.monotonic() - began
+        took: list[float] = []
+
+        def never(_: Path) -> Callable[[], bool]:
+            connected = time.monotonic()
+            return lambda: took.append(time.monotonic() - connected) or False
+
+        assert run_and_kill(Path(logs), Path(model), folder / "whole", never).status == 0
+        longest = took[-1]
         endings = []
         for seconds, ending in pool.map(once, range(int(times))):
             endings.append(ending)

@@ -1,10 +1,11 @@
 """A run on a Dask cluster, while parts of the cluster are killed."""
 
+import json
 from threading import Event
 
 import pytest
 from killed_workers import every_layers, layers, relabel_under_fire
-from scheduler_kills import run_and_kill
+from scheduler_kills import run_and_kill, with_layers
 from simulated_fleet import write_fleet
 
 from hearthlog.analyzer.relabel.run import relabel
@@ -27,12 +28,16 @@ def small_logs(day, model_file, tmp_path_factory):
     return find_logs(folder)[:6]
 
 
-@pytest.mark.parametrize("after", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize("done", [0, 4])
 def test_a_scheduler_that_is_killed_ends_a_run_with_one_line(
-    small_logs, model_file, tmp_path, after
+    small_logs, model_file, tmp_path, done
 ):
-    ending = run_and_kill(small_logs, model_file, tmp_path / "run", after)
-    assert ending.good, ending
+    fleet = write_fleet(small_logs, tmp_path / "fleet", 2, 6)
+    ending = run_and_kill(fleet, model_file, tmp_path / "run", with_layers(done))
+    assert ending.status == 1, ending
+    assert "Dask scheduler at tcp://" in ending.said
+    assert ending.said.startswith("hearthlog: ")
+    assert ending.said.count("\n") == 1
 
 
 def test_a_fleet_is_labelled_while_workers_are_killed(
@@ -48,3 +53,15 @@ def test_a_fleet_is_labelled_while_workers_are_killed(
     assert run.status == 0, run
     assert run.kills >= 3
     assert [layers(home) for home in fleet.iterdir()] == [whole] * 12
+
+
+def test_a_store_that_throttles_is_asked_again(
+    small_logs, model_file, bucket, throttled_account, hearthlog
+):
+    """Both servers have the same buckets, since they are in one process."""
+    for log in small_logs[:4]:
+        (bucket / "2026" / "03" / "01" / log.name).write_bytes(log.read_bytes())
+    command = ("relabel", bucket, "--model", model_file, "--workers", "2", "--json")
+    done = hearthlog(*command, env=throttled_account)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["layers"]) == 4
