@@ -23,6 +23,7 @@ from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.workers.parallel import fits_on, in_parallel
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.cli import progress
 from hearthlog.tools.home.simulate import write_training_set
 
 
@@ -190,6 +191,13 @@ def test_a_terminal_shows_the_time_left():
     os.close(shown)
     assert b"trying" in text
     assert b"0:1" in text  # of ten minutes or so
+
+
+def test_elsewhere_a_line_now_and_then_says_how_much_is_done(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_LINE_SECONDS", 0.0)
+    with progress.share_done("trying") as report:
+        report(0.125)
+    assert capsys.readouterr().err == "hearthlog: trying: 12.5%\n"
 
 
 def _read(terminal):

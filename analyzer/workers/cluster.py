@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import logging
+import pickle
 import time
 import warnings
 from collections.abc import Callable, Coroutine, Iterator
@@ -257,10 +258,13 @@ class Cluster:
         self, function: Callable[..., T], args: tuple[Any, ...], allowed: list[str]
     ) -> T:
         """Run a task on some workers; raise CancelledError if all of them have left."""
-        sent = [await self._send(arg, allowed) for arg in args]
+        places = [n for n, arg in enumerate(args) if _is_large(arg)]
+        sent = [await self._send(args[place], allowed) for place in places]
+        others = [None if n in places else arg for n, arg in enumerate(args)]
         name = getattr(function, "__name__", "task").strip("_<>")
         future = self._client.submit(
-            function,
+            _caller(),
+            pickle.dumps((function, others, places)),
             *sent,
             key=f"{name}-{uuid4().hex}",  # Dask groups tasks by what is before the number
             workers=allowed,  # not those of another version
@@ -278,14 +282,34 @@ class Cluster:
             gathering.cancel()
             future.release()
 
-    async def _send(self, value: Any, allowed: list[str]) -> Any:
-        """Send a large array to all workers, once; anything else goes with its task."""
-        if not isinstance(value, np.ndarray) or value.nbytes < _SENT_ONCE:
-            return value
-        if id(value) not in self._sent:
-            scattered = self._client.scatter(value, workers=allowed, broadcast=True, hash=False)
-            self._sent[id(value)] = value, asyncio.ensure_future(scattered)
+    async def _send(self, array: Any, allowed: list[str]) -> Any:
+        """Send a large array to all workers, once."""
+        if id(array) not in self._sent:
+            scattered = self._client.scatter(array, workers=allowed, broadcast=True, hash=False)
+            self._sent[id(array)] = array, asyncio.ensure_future(scattered)
         try:
-            return await asyncio.shield(self._sent[id(value)][1])
+            return await asyncio.shield(self._sent[id(array)][1])
         except (OSError, TimeoutError, ValueError) as error:  # a worker left meanwhile
             raise CancelledError from error
+
+
+def _is_large(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.nbytes >= _SENT_ONCE
+
+
+def _caller() -> Callable[..., Any]:
+    """Make the function that calls what it is sent.
+
+    Dask's scheduler unpickles the arguments of a task, too. As bytes, and with a nested function,
+    which Dask sends as code, they do not keep it busy with importing what workers need.
+    """
+
+    def call(packed: bytes, *sent: Any) -> Any:
+        import pickle  # noqa: PLC0415  runs elsewhere
+
+        function, args, places = pickle.loads(packed)  # noqa: S301  sent by our own client
+        for place, value in zip(places, sent, strict=True):
+            args[place] = value
+        return function(*args)
+
+    return call
