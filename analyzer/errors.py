@@ -9,3 +9,7 @@ class DataError(HearthlogError):
 
 class WorkerError(HearthlogError):
     """A task was not done, through no fault of its own, or there is nothing to run it."""
+
+
+class LostClusterError(WorkerError):
+    """The Dask cluster is gone, with all tasks that were not done."""

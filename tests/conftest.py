@@ -12,7 +12,7 @@ import pytest
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
 from spliced import record_logs
-from stores import bucket, in_memory, s3_account
+from stores import bucket, in_memory, s3_account, throttled_account
 from streams import camera, live_server
 
 from hearthlog.analyzer.training.dataset import build_dataset
@@ -43,6 +43,7 @@ __all__ = [
     "pulse_daemon",
     "pulse_microphone",
     "s3_account",
+    "throttled_account",
 ]
 
 _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"

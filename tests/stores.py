@@ -1,5 +1,7 @@
 """Stores for the tests of logs that lie elsewhere: a server that speaks S3, and memory."""
 
+import itertools
+import threading
 from pathlib import Path
 from uuid import uuid4
 
@@ -18,6 +20,30 @@ def s3_account() -> dict[str, str]:
     host, port = server.get_host_and_port()
     yield account(f"http://{host}:{port}")
     server.stop()
+
+
+@pytest.fixture
+def throttled_account() -> dict[str, str]:
+    """Environment of an S3 server that answers every fourth request with `SlowDown`."""
+    from moto.server import DomainDispatcherApplication, create_backend_app  # noqa: PLC0415
+    from werkzeug.serving import make_server  # noqa: PLC0415
+
+    moto = DomainDispatcherApplication(create_backend_app)
+    asked = itertools.count()
+
+    def application(environ, start_response):
+        if next(asked) % 4:
+            return moto(environ, start_response)
+        start_response("503 Slow Down", [("Content-Type", "application/xml")])
+        return [b"<Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>"]
+
+    server = make_server("127.0.0.1", 0, application, threaded=True)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield account(f"http://127.0.0.1:{server.server_port}")
+    server.shutdown()
+    thread.join()
+    assert next(asked) > 4
 
 
 def account(endpoint: str) -> dict[str, str]:

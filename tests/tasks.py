@@ -52,6 +52,17 @@ def die_once(path):
     return "done"
 
 
+def fail_once(path):
+    if not Path(path).exists():
+        Path(path).touch()
+        raise LogError(f"{path}: the store cannot be used (SlowDown)")
+    return "done"
+
+
+def total(values, number):
+    return float(values.sum()) + number
+
+
 def nap(seconds):
     time.sleep(seconds)
     return "done"

@@ -18,20 +18,22 @@ from mcap.opcode import Opcode
 from spliced import record_logs, run
 from stores import put
 
-from hearthlog.analyzer.errors import DataError
+import hearthlog.analyzer.logs.catalog.making
+from hearthlog.analyzer.errors import LostClusterError
 from hearthlog.analyzer.logs.catalog.catalog import (
     DAMAGED,
     FINISHED,
     LOG,
     UNFINISHED,
-    load_catalog,
     read_catalog,
-    write_catalog,
 )
-from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed
+from hearthlog.analyzer.logs.catalog.file import SCHEMA, sealed, write_table
 from hearthlog.analyzer.logs.catalog.fleet import homes, label_amounts
+from hearthlog.analyzer.logs.catalog.making import write_catalog
+from hearthlog.analyzer.logs.catalog.parts import part_of
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.workers.workers import InlineWorkers, open_workers
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
@@ -46,6 +48,7 @@ from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import nanoseconds
 from hearthlog.schemas.messages.topics import RELABEL, REVIEW, Topic
+from hearthlog.schemas.progress import ignore_progress
 from hearthlog.schemas.times import NANOSECONDS
 
 SECOND = NANOSECONDS
@@ -242,6 +245,12 @@ def test_more_labels_than_a_classifier_has_are_an_error_in_a_row(tmp_path):
     }
 
 
+@pytest.fixture
+def file_by_file(monkeypatch):
+    monkeypatch.setattr(hearthlog.analyzer.logs.catalog.making, "_TASK", 1)
+
+
+@pytest.mark.usefixtures("file_by_file")
 def test_a_log_that_is_renamed_while_others_are_read_has_no_row(fleet):
     first, second, *others = find_logs(fleet)
 
@@ -251,7 +260,7 @@ def test_a_log_that_is_renamed_while_others_are_read_has_no_row(fleet):
 
     catalog = write_catalog(fleet, None, rename)
     names = [path.relative_to(fleet).as_posix() for path in (first, *others)]
-    assert sorted(names) == catalog.table["path"].to_pylist()
+    assert sorted(names) == sorted(catalog.table["path"].to_pylist())
 
 
 def test_what_a_log_claims_of_its_frames_is_not_believed_beyond_its_size(recording, tmp_path):
@@ -295,7 +304,7 @@ def test_what_did_not_change_is_not_read_again(fleet):
     first = write_catalog(fleet)
     for path in find_logs(fleet):
         garbage(path)
-    again = write_catalog(fleet, load_catalog(fleet))
+    again = write_catalog(fleet, read_catalog(fleet))
     assert again.table == first.table
     assert {row.state for row in write_catalog(fleet).rows()} == {DAMAGED}
 
@@ -308,7 +317,7 @@ def test_what_changed_came_or_went_is_read_as_if_there_was_no_catalogue(fleet):
     relabelled(third, [(12, "speech")])
     first.unlink()
     overwritten(second)
-    catalog = write_catalog(fleet, load_catalog(fleet))
+    catalog = write_catalog(fleet, read_catalog(fleet))
     assert catalog.table == write_catalog(fleet).table
     assert catalog.current(first) is None
     assert catalog.current(second).state == DAMAGED
@@ -337,7 +346,7 @@ def test_a_damaged_log_is_a_row_with_its_error_and_is_looked_at_every_time(fleet
     assert row.error == "is no MCAP file"
     path.write_bytes(whole)
     os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
-    assert write_catalog(fleet, load_catalog(fleet)).current(path).state == FINISHED
+    assert write_catalog(fleet, read_catalog(fleet)).current(path).state == FINISHED
 
 
 def test_damage_in_a_chunk_that_is_read_is_noticed(fleet):
@@ -348,6 +357,7 @@ def test_damage_in_a_chunk_that_is_read_is_noticed(fleet):
     assert row.error.startswith("damaged at byte ")
 
 
+@pytest.mark.usefixtures("file_by_file")
 def test_an_interrupted_catalogue_keeps_what_was_read(fleet):
     paths = find_logs(fleet)
 
@@ -357,7 +367,7 @@ def test_an_interrupted_catalogue_keeps_what_was_read(fleet):
 
     with pytest.raises(KeyboardInterrupt):
         write_catalog(fleet, None, interrupt)
-    known = load_catalog(fleet)
+    known = read_catalog(fleet)
     assert len(known) == len(paths) // 2
     assert write_catalog(fleet, known).table == write_catalog(fleet).table
 
@@ -467,23 +477,103 @@ def unusable(kind: str, data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("kind", [*FILES, *TABLES, *ENCODINGS])
-def test_a_catalogue_that_cannot_be_used_is_no_catalogue(fleet, kind):
+def test_a_part_that_cannot_be_used_is_not_used_and_made_anew(fleet, kind):
     before = select([fleet])
-    write_catalog(fleet)
-    path = fleet / CATALOG
-    path.write_bytes(unusable(kind, path.read_bytes()))
-    with pytest.raises(DataError, match="cannot be used as a catalogue"):
-        load_catalog(fleet)
-    assert read_catalog(fleet) is None
+    whole = write_catalog(fleet).table
+    part = fleet / CATALOG / part_of("north/anna")
+    part.write_bytes(unusable(kind, part.read_bytes()))
+    left = read_catalog(fleet)
+    assert set(left.table["home"].to_pylist()) == {"bert"}
+    (why,) = left.unusable
+    assert why.startswith(f"{part}: cannot be used as a catalogue")
     assert select([fleet]) == before
+    assert write_catalog(fleet, left).table == whole
+    assert not read_catalog(fleet).unusable
 
 
 def test_how_much_a_catalogue_holds_is_known_before_it_is_read(fleet):
     write_catalog(fleet)
-    path = fleet / CATALOG
-    path.write_bytes(unusable("long lists", path.read_bytes()))
-    with pytest.raises(DataError, match="holds more than a file of its size can"):
-        load_catalog(fleet)
+    part = fleet / CATALOG / part_of("north/anna")
+    part.write_bytes(unusable("long lists", part.read_bytes()))
+    (why,) = read_catalog(fleet).unusable
+    assert "holds more than a file of its size can" in why
+
+
+def test_a_home_that_did_not_change_keeps_its_part(fleet):
+    write_catalog(fleet)
+    parts = {part.name: part.stat().st_ino for part in (fleet / CATALOG).iterdir()}
+    assert parts.keys() == {part_of("north/anna"), part_of("bert")}
+    first = find_logs(fleet / "north")[0]
+    relabelled(first, [(12, "speech")])
+    write_catalog(fleet, read_catalog(fleet))
+    changed = {
+        part.name for part in (fleet / CATALOG).iterdir() if part.stat().st_ino != parts[part.name]
+    }
+    assert changed == {part_of("north/anna")}
+
+
+def test_a_home_that_has_gone_has_no_part(fleet):
+    write_catalog(fleet)
+    shutil.rmtree(fleet / "bert")
+    catalog = write_catalog(fleet, read_catalog(fleet))
+    assert [part.name for part in (fleet / CATALOG).iterdir()] == [part_of("north/anna")]
+    assert catalog.table == read_catalog(fleet).table
+
+
+def test_each_home_has_a_part_of_its_own_whatever_it_is_called():
+    names = ["", "_a", ".a", "a", "a/b", "a%2Fb", "A b", "é" * 300, "é" * 301]
+    parts = [part_of(name) for name in names]
+    assert len(set(parts)) == len(names)
+    assert all(part.isascii() and "/" not in part and len(part) < 200 for part in parts)
+
+
+def test_an_older_catalogue_of_one_file_is_used_and_replaced(fleet):
+    table = write_catalog(fleet).table
+    shutil.rmtree(fleet / CATALOG)
+    with (fleet / CATALOG).open("wb") as stream:
+        write_table(table.sort_by("path"), stream)
+    for path in find_logs(fleet):
+        garbage(path)
+    older = read_catalog(fleet)
+    assert write_catalog(fleet, older).table == table
+    assert (fleet / CATALOG).is_dir()
+
+
+def test_processes_make_the_same_catalogue(fleet):
+    alone = write_catalog(fleet).table
+    with open_workers(2) as workers:
+        assert write_catalog(fleet, None, ignore_progress, workers).table == alone
+
+
+@pytest.mark.usefixtures("file_by_file")
+def test_a_catalogue_whose_workers_are_lost_keeps_what_was_read(fleet):
+    class Lost(InlineWorkers):
+        def submit(self, function, *arguments):
+            if len(calls) == 2:
+                raise LostClusterError("gone")
+            calls.append(arguments)
+            return super().submit(function, *arguments)
+
+    calls = []
+    with pytest.raises(LostClusterError):
+        write_catalog(fleet, None, ignore_progress, Lost())
+    assert len(read_catalog(fleet)) == 2
+
+
+def test_a_log_under_two_names_is_one_with_a_catalogue_too(fleet):
+    first, *_ = find_logs(fleet / "north")
+    first.with_name("zz.mcap").symlink_to(first)
+    before = select([fleet]), select([fleet, fleet / "north"])
+    write_catalog(fleet)
+    assert (select([fleet]), select([fleet, fleet / "north"])) == before
+
+
+def test_what_was_before_a_span_is_the_same_with_a_catalogue(fleet):
+    spans = list(map(time_span, find_logs(fleet / "north")))
+    before = list(select([fleet], (), spans[2][0]).earlier)
+    assert len(before) > 1
+    write_catalog(fleet)
+    assert list(select([fleet], (), spans[2][0]).earlier) == before
 
 
 def test_a_catalogue_in_a_store_is_like_one_of_this_machine(fleet, in_memory):
@@ -491,7 +581,7 @@ def test_a_catalogue_in_a_store_is_like_one_of_this_machine(fleet, in_memory):
     store = put(fleet, in_memory)
     there = write_catalog(store)
     assert there.table.drop_columns("mtime") == here
-    again = load_catalog(store)
+    again = read_catalog(store)
     assert again.table == there.table
     assert all(again.current(path) for path in find_logs(store))
     (store / there.table["path"][0].as_py()).write_bytes(b"nonsense")
@@ -501,7 +591,7 @@ def test_a_catalogue_in_a_store_is_like_one_of_this_machine(fleet, in_memory):
 def test_the_command_makes_the_catalogue_of_a_bucket(fleet, bucket, capfd):
     store = put(fleet, bucket)
     assert run(capfd, "catalog", store).returncode == 3
-    assert load_catalog(store).table.column("path") == write_catalog(fleet).table.column("path")
+    assert read_catalog(store).table.column("path") == write_catalog(fleet).table.column("path")
 
 
 def test_a_selection_in_a_bucket_is_the_same_with_a_catalogue(fleet, bucket):
@@ -510,7 +600,7 @@ def test_a_selection_in_a_bucket_is_the_same_with_a_catalogue(fleet, bucket):
     _, end = time_span(first)
     before = select([store], (), None, end - SECOND)
     catalog = write_catalog(store)
-    assert write_catalog(store, load_catalog(store)).table == catalog.table
+    assert write_catalog(store, read_catalog(store)).table == catalog.table
     assert select([store], (), None, end - SECOND) == before
 
 
@@ -556,7 +646,7 @@ def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
     assert f"unfinished: {cut.relative_to(fleet).as_posix()}" in done.stdout
     cut.unlink()
     assert run(capfd, "catalog", fleet).returncode == 0
-    assert {row.home for row in load_catalog(fleet).rows()} == {"north/anna"}
+    assert {row.home for row in read_catalog(fleet).rows()} == {"north/anna"}
 
 
 def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
@@ -566,7 +656,7 @@ def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
     assert done.returncode == 3
     assert done.stderr == f"hearthlog: {path}: is no MCAP file\n"
     said = json.loads(done.stdout)
-    catalog = load_catalog(fleet)
+    catalog = read_catalog(fleet)
     assert said["files"] == len(catalog)
     assert said["damaged"] == {path.relative_to(fleet).as_posix(): "is no MCAP file"}
     assert [home["home"] for home in said["homes"]] == ["bert", "north/anna"]
@@ -577,11 +667,12 @@ def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
 
 def test_the_command_says_that_a_catalogue_was_unusable_and_makes_it_anew(fleet, capfd):
     table = write_catalog(fleet).table
-    (fleet / CATALOG).write_bytes(b"PAR1")
+    part = fleet / CATALOG / part_of("bert")
+    part.write_bytes(b"PAR1")
     done = run(capfd, "catalog", fleet)
-    assert done.stderr.startswith(f"hearthlog: {fleet / CATALOG}: cannot be used as a catalogue")
+    assert done.stderr.startswith(f"hearthlog: {part}: cannot be used as a catalogue")
     assert done.stderr.endswith("; it is made anew\n")
-    assert load_catalog(fleet).table == table
+    assert read_catalog(fleet).table == table
 
 
 def test_a_catalogue_is_of_a_folder_with_logs(recording, tmp_path, capfd):

@@ -20,9 +20,10 @@ from hearthlog.analyzer.evaluation.grid_search import search
 from hearthlog.analyzer.training.method import cross_validate, prepare
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
-from hearthlog.analyzer.workers.parallel import in_parallel, joblib_on
+from hearthlog.analyzer.workers.parallel import fits_on, in_parallel
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.progress import ignore_progress
+from hearthlog.tools.cli import progress
 from hearthlog.tools.home.simulate import write_training_set
 
 
@@ -80,7 +81,7 @@ def test_a_cluster_decides_as_threads_do_bit_for_bit(cluster):
     methods, examples = PAPER.variations()[:3], prepare(PAPER, data)
     arguments = (methods, examples, 3, group_folds(data), ignore_progress)
     here = cross_validate(*arguments)
-    with joblib_on(cluster):
+    with fits_on(cluster):
         there = cross_validate(*arguments)
     assert not np.isnan(here).any()
     np.testing.assert_array_equal(here, there)
@@ -91,7 +92,7 @@ def test_a_cluster_adapts_as_threads_do(cluster):
     group = np.arange(len(data)) // 4
     data = dataclasses.replace(data, group=group, collection=group % 2, collection_names=("a", "b"))
     here = adaptation_curve(data, PAPER, ignore_progress)
-    with joblib_on(cluster):
+    with fits_on(cluster):
         assert adaptation_curve(data, PAPER, ignore_progress) == here
 
 
@@ -100,7 +101,7 @@ def test_a_cluster_runs_what_it_is_given(cluster):
         return set(in_parallel(delayed(tasks.own_id)() for _ in range(4)))
 
     assert ids() == {os.getpid()}
-    with joblib_on(cluster):
+    with fits_on(cluster):
         assert os.getpid() not in ids()
     assert ids() == {os.getpid()}
 
@@ -110,7 +111,7 @@ def test_a_scheduler_that_goes_away_while_learning_is_one_line(tmp_path):
         scheduler_in(tmp_path) as (address, scheduler),
         worker_of(address, "--no-nanny", threads=2),
         pytest.raises(WorkerError) as error,
-        joblib_on(address),
+        fits_on(address),
     ):
         [scheduler.kill() for _ in in_parallel(delayed(tasks.nap)(0.2) for _ in range(40))]
     assert str(error.value).startswith(f"the Dask scheduler at {address} is gone")
@@ -121,7 +122,7 @@ def test_a_fit_that_kills_its_workers_is_one_line(tmp_path):
         scheduler_in(tmp_path) as (address, _),
         worker_of(address, "--local-directory", str(tmp_path), threads=2),
         pytest.raises(WorkerError, match="lost its worker 4 times"),
-        joblib_on(address),
+        fits_on(address),
     ):
         list(in_parallel(delayed(tasks.die)() for _ in range(2)))
 
@@ -190,6 +191,13 @@ def test_a_terminal_shows_the_time_left():
     os.close(shown)
     assert b"trying" in text
     assert b"0:1" in text  # of ten minutes or so
+
+
+def test_elsewhere_a_line_now_and_then_says_how_much_is_done(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_LINE_SECONDS", 0.0)
+    with progress.share_done("trying") as report:
+        report(0.125)
+    assert capsys.readouterr().err == "hearthlog: trying: 12.5%\n"
 
 
 def _read(terminal):

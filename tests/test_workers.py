@@ -7,17 +7,22 @@ import site
 import subprocess
 import sys
 from concurrent.futures import wait
+from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 import tasks
 from clusters import DASK, LONG, PRIVATE, running, scheduler_in, until, worker_of
+from dask.utils import key_split
+from distributed import Client
 
 import hearthlog.analyzer.workers.cluster
-from hearthlog.analyzer.errors import WorkerError
+import hearthlog.analyzer.workers.members
+from hearthlog.analyzer.errors import LostClusterError, WorkerError
 from hearthlog.analyzer.workers import open_workers
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogWarning, LogError
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +42,8 @@ def workers(request):
 
 @pytest.fixture
 def hurried(monkeypatch):
-    monkeypatch.setattr(hearthlog.analyzer.workers.cluster, "_CONNECT_SECONDS", 0.5)
+    for name in ("_CONNECT_SECONDS", "_WORKERS_SECONDS"):
+        monkeypatch.setattr(hearthlog.analyzer.workers.cluster, name, 0.5)
 
 
 def test_a_task_returns_what_its_function_returns(workers):
@@ -239,21 +245,100 @@ def _site_without_hearthlog(folder):
 
 
 @pytest.mark.parametrize("site_of", [_site_of_another_version, _site_without_hearthlog])
-def test_a_worker_with_another_hearthlog_is_refused(cluster, tmp_path, site_of):
+def test_a_worker_with_another_hearthlog_that_joins_later_gets_nothing(cluster, tmp_path, site_of):
+    start, paths, has = site_of(tmp_path)
+    options = ["--nthreads", "1", "--no-nanny", *PRIVATE]
+    told = pytest.warns(HearthlogWarning, match=rf"has {has}, this is .*: not used")
+    with (
+        told,
+        open_workers(scheduler=cluster) as workers,
+        running([*start, cluster, *options], paths=paths, cwd=tmp_path),
+    ):
+        until(lambda: workers.refused)
+        assert workers.parallel == 1
+        futures = [workers.submit(tasks.own_id) for _ in range(20)]
+        assert len({future.result(LONG) for future in futures}) == 1
+
+
+@pytest.mark.parametrize("site_of", [_site_of_another_version, _site_without_hearthlog])
+def test_a_worker_with_another_hearthlog_is_refused_before_a_run(cluster, tmp_path, site_of):
     start, paths, has = site_of(tmp_path)
     options = ["--nthreads", "1", "--no-nanny", *PRIVATE]
     said = rf"the Dask worker at tcp://127\.0\.0\.1:\d+ has {has}, this is "
+    with running([*start, cluster, *options], paths=paths, cwd=tmp_path):
+        until(lambda: _threads(cluster) == 2)
+        with pytest.raises(WorkerError, match=said), open_workers(scheduler=cluster):
+            pass
+    until(lambda: _threads(cluster) == 1)
+
+
+def test_tasks_go_on_when_all_workers_leave_and_others_come(tmp_path):
+    with scheduler_in(tmp_path) as (address, _):
+        first = worker_of(address, "--no-nanny")
+        with first as process, open_workers(scheduler=address) as workers:
+            futures = [workers.submit(tasks.nap, 1.0) for _ in range(3)]
+            process.kill()
+            with worker_of(address, "--no-nanny"):
+                assert [future.result(LONG) for future in futures] == ["done"] * 3
+
+
+def test_a_task_that_fails_once_is_tried_again(cluster, tmp_path):
     with open_workers(scheduler=cluster) as workers:
-        with running([*start, cluster, *options], paths=paths, cwd=tmp_path):
-            until(lambda: workers.parallel == 2)
-            futures = [workers.submit(tasks.nap, 0.1) for _ in range(20)]
-            errors = [future.exception(LONG) for future in futures]
-            assert None in errors
-            with pytest.raises(WorkerError, match=said):
-                raise next(error for error in errors if error is not None)
-            with pytest.raises(WorkerError, match=said), open_workers(scheduler=cluster):
-                pass
-        until(lambda: workers.parallel == 1)
+        assert workers.submit(tasks.fail_once, str(tmp_path / "failed")).result(LONG) == "done"
+
+
+def test_dask_names_tasks_after_their_functions(cluster, tmp_path):
+    with open_workers(scheduler=cluster) as workers, Client(cluster, set_as_default=False) as other:
+        futures = [workers.submit(tasks.touch_and_nap, str(tmp_path / "n"), 5) for _ in range(2)]
+        until((tmp_path / "n").exists)
+        keys = [key for running in other.processing().values() for key in running]
+        assert len(set(keys)) == 2
+        assert {key_split(key) for key in keys} == {"touch_and_nap"}
+        assert not any(future.done() for future in futures)
+
+
+def test_a_large_array_is_sent_once_and_arrives_again_after_its_worker_left(tmp_path):
+    array = np.arange(100_000.0)
+    with scheduler_in(tmp_path) as (address, _), cluster_of_one(address) as (workers, process):
+        assert workers.submit(tasks.total, array, 1).result(LONG) == array.sum() + 1
+        ((_, sent),) = workers._sent.values()
+        assert workers.submit(tasks.total, array, 2).result(LONG) == array.sum() + 2
+        assert next(iter(workers._sent.values()))[1] is sent
+        process.kill()
+        with worker_of(address, "--no-nanny"):
+            assert workers.submit(tasks.total, array, 3).result(LONG) == array.sum() + 3
+
+
+@contextmanager
+def cluster_of_one(address):
+    with worker_of(address, "--no-nanny") as process, open_workers(scheduler=address) as workers:
+        yield workers, process
+
+
+def test_a_scheduler_that_stops_answering_is_gone(tmp_path, monkeypatch):
+    monkeypatch.setattr(hearthlog.analyzer.workers.members, "_SILENT_SECONDS", 1.0)
+    with (
+        scheduler_in(tmp_path) as (address, scheduler),
+        worker_of(address, "--no-nanny"),
+        open_workers(scheduler=address) as workers,
+    ):
+        future = workers.submit(tasks.nap, 1000)
+        scheduler.send_signal(signal.SIGSTOP)
+        with pytest.raises(LostClusterError, match=rf"scheduler at {address} does not answer"):
+            future.result(LONG)
+
+
+def test_a_cluster_that_has_lost_all_workers_is_not_waited_for_without_end(tmp_path, monkeypatch):
+    with scheduler_in(tmp_path) as (address, _), cluster_of_one(address) as (workers, process):
+        monkeypatch.setattr(hearthlog.analyzer.workers.cluster, "_DESERTED_SECONDS", 1.0)
+        process.kill()
+        with pytest.raises(LostClusterError, match="has had no workers"):
+            workers.submit(tasks.own_id).result(LONG)
+
+
+def _threads(address):
+    with Client(address, set_as_default=False) as client:
+        return sum(client.nthreads().values())
 
 
 def _children():

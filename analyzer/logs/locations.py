@@ -13,8 +13,11 @@ _FILES = {"file", "local"}
 _OURS = {"fsspec", "s3fs", "upath", ""}  # what the extra `cluster` installs, or nobody knows
 # A listing that is kept hides what others put there since.
 _FRESH: dict[str, Any] = {"use_listings_cache": False}
-# s3fs tries five times whatever botocore tried: a silent server is given up after three minutes.
-_S3 = _FRESH | {"config_kwargs": {"retries": {"total_max_attempts": 2}}}
+# botocore waits longer each time where a store says that it is asked too often. s3fs tries five
+# times whatever botocore tried: a silent server is given up after four minutes.
+_S3 = _FRESH | {
+    "config_kwargs": {"retries": {"mode": "standard", "total_max_attempts": 5}, "read_timeout": 10}
+}
 _OPTIONS: dict[str, dict[str, Any]] = {
     "s3": _S3,
     "s3a": _S3,

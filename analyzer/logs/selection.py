@@ -2,20 +2,20 @@
 
 import warnings
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
 
+from hearthlog.analyzer.logs.log_spans import LogSpan, find_spans
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import HearthlogWarning, LogError
-from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.log_stream import ENCODING
-from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
+from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.provenance import read_provenance
 from hearthlog.schemas.mcap.chunks import read_definitions, verify_chunks
 from hearthlog.schemas.mcap.formats import MESSAGE_HEAD
@@ -23,10 +23,7 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.progress import Progress, ignore_progress
-from hearthlog.schemas.storage.byte_ranges import map_logs, store_errors
-
-if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.catalog.catalog import Catalog
+from hearthlog.schemas.storage.byte_ranges import map_logs
 
 _LAST = (1 << 63) - 1  # log time
 Result = TypeVar("Result")
@@ -38,7 +35,6 @@ class Selection:
     """Topics and a span of time of some logs."""
 
     logs: Sequence[Path]  # those with messages in the span
-    earlier: Sequence[Path]  # those with messages before it, the last first
     unfinished: Sequence[Path]  # those of `logs` that were not completed, or have no message yet
     channels: Mapping[str, Sequence[Described]]  # by topic, equal ones once
     # the `hearthlog` records of the logs; equal ones are there once
@@ -47,6 +43,14 @@ class Selection:
     start: int | None  # log times in nanoseconds: from `start` on, before `end`
     end: int | None
     span: tuple[int, int]  # log times of the first and the last message
+    spans: Sequence[LogSpan] = field(compare=False, repr=False)  # of all logs
+
+    @property
+    def earlier(self) -> Iterator[Path]:
+        """The logs with messages before the span, the last first."""
+        start = 0 if self.start is None else self.start
+        spans = [each for each in self.spans if each.first < start]
+        return (each.path for each in sorted(spans, key=_in_time, reverse=True))
 
     def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
         """Read the messages of the selection, still encoded, in the order of time.
@@ -188,10 +192,6 @@ def select(
     LogError
         If there is no such log, if none of them is sound, or if a pattern fits no topic.
     """
-    catalogs: dict[Path, Catalog | None] = {}
-    for each in paths:
-        catalogs |= dict.fromkeys(find_logs(each), _catalog(each))
-    files = {path.resolve(): path for path in catalogs}
     damages: dict[Path, LogError] = {}
 
     def sound(function: Callable[[Path], Result]) -> Callable[[Path], Result | None]:
@@ -204,13 +204,21 @@ def select(
 
         return result
 
-    spans = time_spans(files.values(), sound(lambda path: _span(path, catalogs[path])))
-    spoken = {*damages, *(path for _, _, path in spans)}
-    chosen = [
-        (first, last, path)
-        for first, last, path in spans
-        if (start is None or last >= start) and (end is None or first < end)
+    silent: list[Path] = []
+
+    def span_of(path: Path) -> tuple[int, int] | None:
+        span = time_span(path)
+        if span is None:
+            silent.append(path)
+        return span
+
+    spans = find_spans(paths, sound(span_of))
+    within = [
+        each
+        for each in spans
+        if (start is None or each.last >= start) and (end is None or each.first < end)
     ]
+    chosen = [(each.first, each.last, each.path) for each in sorted(within, key=_in_time)]
     read = map_logs(sound(_Content), [path for _, _, path in chosen])
     contents = [content for content in read if content is not None]
     for path, error in damages.items():
@@ -226,10 +234,9 @@ def select(
             metadata.append(record)
     return Selection(
         logs=[path for _, _, path in chosen],
-        earlier=[p for first, _, p in reversed(spans) if start is not None and first < start],
         unfinished=[
             *(content.path for content in contents if not content.complete),
-            *(path for path in files.values() if path not in spoken and _is_cut(path)),
+            *(path for path in sorted(silent, key=str) if _is_cut(path)),
         ],
         channels={t: same for t, same in channels.items() if topics is None or t in topics},
         metadata=metadata,
@@ -240,30 +247,18 @@ def select(
             max([start or 0, *(first for first, _, _ in chosen[:1])]),
             max((last for _, last, _ in chosen), default=0),
         ),
+        spans=spans,
     )
+
+
+def _in_time(span: LogSpan) -> tuple[int, int, tuple[str, ...]]:
+    # Paths of this machine and of a store do not compare; their parts do.
+    return span.first, span.last, span.path.parts
 
 
 def _warn(path: Path, error: LogError) -> None:
     text = str(error).removeprefix(f"{path}: ")
     warnings.warn(HearthlogWarning(text, path), stacklevel=3)
-
-
-def _catalog(folder: Path) -> "Catalog | None":
-    """Read the catalogue of a folder, if it has one and there is what reads it."""
-    with store_errors(folder):
-        exists = (folder / CATALOG).exists()
-    if not exists:
-        return None
-    try:
-        from hearthlog.analyzer.logs.catalog.catalog import read_catalog  # noqa: PLC0415  pyarrow is an extra
-    except ModuleNotFoundError:
-        return None
-    return read_catalog(folder)
-
-
-def _span(path: Path, catalog: "Catalog | None") -> tuple[int, int] | None:
-    """Return the span of a log, from the catalogue if that speaks of the file as it is now."""
-    return (catalog and catalog.span(path)) or time_span(path)
 
 
 def _is_cut(path: Path) -> bool:

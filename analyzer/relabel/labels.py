@@ -171,7 +171,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     ----------
     job : Job
     labelled : UnfinishedLayer
-        That lacks no starts any more. Its file `part` is deleted.
+        That lacks no starts any more. Its file `part` is deleted once the layer is complete.
 
     Raises
     ------
@@ -209,7 +209,6 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
             writer.finish(job.layer.name)
     except LogError:
         if read_layer_metadata(job.layer) != metadata:  # else another run was quicker
-            labelled.part.unlink(missing_ok=True)
             raise
     delete_parts(job.layer)
 

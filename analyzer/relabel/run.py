@@ -9,6 +9,7 @@ from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
+from hearthlog.analyzer.errors import LostClusterError
 from hearthlog.analyzer.logs.layers import Chain, find_chains
 from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
 from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_log
@@ -78,6 +79,8 @@ def relabel(
     ------
     LogError
         If there is no such log, or one is a layer.
+    LostClusterError
+        If the workers are those of a cluster that is gone; what is complete stays.
     """
     chains = find_chains(paths)
     total = sum(len(chain.asked) for chain in chains)
@@ -210,7 +213,7 @@ class _Relabelling:
         queue, task = self._running.pop(future)
         error = future.exception()
         if error is not None:
-            if not isinstance(error, Exception):
+            if isinstance(error, LostClusterError) or not isinstance(error, Exception):
                 raise error
             self._fail(queue, task, error)
         elif isinstance(labelled := future.result(), UnfinishedLayer):
@@ -229,6 +232,8 @@ class _Relabelling:
         self.result.failed[task.job.log] = text
         if task in queue.tasks:  # it is not, if its layer was to be completed
             queue.tasks.remove(task)
+        if task.labelled is not None:
+            self._delete(task.labelled.part)
 
     def _advance(self, queue: _ChainQueue) -> None:
         """Complete layers, in the order of time, up to the first log that is not labelled."""

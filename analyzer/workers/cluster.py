@@ -1,29 +1,49 @@
 """Workers of a Dask cluster that runs already."""
 
+import asyncio
 import gc
 import logging
-from collections.abc import Callable, Iterator
+import pickle
+import time
+import warnings
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from uuid import uuid4
 
-from hearthlog.analyzer.errors import WorkerError
+import numpy as np
+
+from hearthlog.analyzer.errors import LostClusterError, WorkerError
 from hearthlog.analyzer.extras import remedy
-from hearthlog.analyzer.workers.pickled_calls import pack_call, read_reply
+from hearthlog.analyzer.workers.members import Members
+from hearthlog.schemas.errors import HearthlogWarning
 
 if TYPE_CHECKING:
     from distributed import Client
 
 _CONNECT_SECONDS = 10.0
+_WORKERS_SECONDS = 30.0  # for workers that are started together with the run
+_CLOSE_SECONDS = 3.0
+_LOOK_SECONDS = 1.0  # between two looks at the cluster
+_DESERTED_SECONDS = 600.0  # without a worker, after which no more are waited for
+_RETRIES = 2  # of a task that raises an error, which may be that of a store for a moment
+_LOSSES = 4  # of the worker of a task, after which it is given up, as Dask does
+_SENT_ONCE = 100_000  # bytes of an array from which on each worker gets it once, not each task
+_GONE = "is gone; start it"
+_NOISY = ("distributed", "tornado")  # loggers
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 @contextmanager
-def connected(scheduler: str) -> Iterator["Client"]:
+def connected(scheduler: str) -> Iterator["Cluster"]:
     """Connect to a Dask cluster whose workers have this version of hearthlog.
+
+    Workers of another version that join later get no tasks; they are named in a HearthlogWarning
+    when the block ends.
 
     Parameters
     ----------
@@ -32,7 +52,7 @@ def connected(scheduler: str) -> Iterator["Client"]:
 
     Yields
     ------
-    distributed.Client
+    Cluster
         Open until the block ends.
 
     Raises
@@ -52,60 +72,85 @@ def connected(scheduler: str) -> Iterator["Client"]:
         if client is None:
             gc.collect()  # else the remains may block the next client, if they are collected then
             raise WorkerError(f"no Dask scheduler at {scheduler}; start one with: dask scheduler")
+        cluster = Cluster(client, scheduler)
+        # What Dask leaves behind when it loses a scheduler would be told at the end of the process.
+        cluster.loop.set_exception_handler(lambda *_: None)
         try:
-            _check_versions(client, scheduler)
-            yield client
+            cluster.open()
+            yield cluster
         finally:
-            client.close(timeout=_CONNECT_SECONDS)
+            cluster.close()
+            with suppress(Exception):  # what is left of a lost connection ends with the process
+                client.close(timeout=_CLOSE_SECONDS)
+    for worker, has in cluster.refused.items():
+        what = f"the Dask worker has {has}, this is {version('hearthlog')}: not used"
+        warnings.warn(HearthlogWarning(what, worker), stacklevel=3)
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
     """Keep Dask from logging, since errors are reported once, by us."""
-    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
-    levels = {name: logging.getLogger(name).level for name in names}
-    for name in names:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    known = (name for name in logging.root.manager.loggerDict if name.split(".")[0] in _NOISY)
+    loggers = [logging.getLogger(name) for name in {*_NOISY, *known}]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
-
-
-def gone(scheduler: str) -> WorkerError:
-    """Make the error that says that the scheduler was lost.
-
-    Parameters
-    ----------
-    scheduler : str
-        Address of the scheduler, as `tcp://host:port`.
-    """
-    return WorkerError(f"the Dask scheduler at {scheduler} is gone; start it, and run this again")
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 class Cluster:
     """Workers of a Dask cluster.
 
+    All that waits for the cluster waits, in the event loop of the client, for the end of `_watch`
+    too, which looks at the cluster once a second: so nothing outlives the scheduler, and no task
+    costs a call of its own.
+
     Parameters
     ----------
     client : distributed.Client
-        From `connected`.
     scheduler : str
-        Address of the scheduler, for messages.
+        Its address, for messages.
     """
 
     def __init__(self, client: "Client", scheduler: str) -> None:
         self._client, self._scheduler = client, scheduler
-        self._executor = client.get_executor(pure=False)
-        self._guard = _guard(version("hearthlog"))
+        running: Any = client.loop
+        self.loop: asyncio.AbstractEventLoop = running.asyncio_loop  # of the client alone
+        self._members = Members(client)
+        self._watching: asyncio.Task[LostClusterError]
+        self._sent: dict[int, tuple[Any, asyncio.Task[Any]]] = {}  # by the id of the array
+        self._open: set[Future[Any]] = set()
+
+    def open(self) -> None:
+        """Wait for workers, and compare their versions.
+
+        Raises
+        ------
+        WorkerError
+            As `connected` does.
+        """
+        self._in_loop(self._begin()).result()
+
+    def close(self) -> None:
+        """Give up the tasks that are not done; those that run come to their end."""
+        for future in tuple(self._open):
+            future.cancel()
+        if hasattr(self, "_watching"):
+            self.loop.call_soon_threadsafe(self._watching.cancel)
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """What workers have that were not used, by their addresses."""
+        return self._members.refused
 
     @property
     def parallel(self) -> int:
-        """Number of threads of all workers at the moment; at least 1."""
-        if self._client.status != "running":
-            return 1
-        return max(sum(self._client.nthreads().values()), 1)
+        """Number of threads of all workers that may be used, a moment ago; at least 1."""
+        return max(sum(self._members.threads.values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a function on any worker of the cluster.
@@ -115,109 +160,156 @@ class Cluster:
         function : callable
             At the top level of a module, which the worker imports.
         *args
-            Arguments of the function, which can be pickled.
+            Arguments of the function, which can be pickled. A large array that several tasks have
+            is sent once, and must not change.
 
         Returns
         -------
         concurrent.futures.Future
-            It raises what the function raises, and WorkerError if the scheduler is gone, if the
-            task killed its workers, or if the worker has another version of hearthlog.
+            It raises what the function raises, LostClusterError if the scheduler is gone, and
+            WorkerError if the task killed its workers.
         """
-        future: Future[T] = Future()
-        if self._client.status != "running":
-            future.set_exception(gone(self._scheduler))
-            return future
-        sent = self._executor.submit(self._guard, pack_call(function, args))
-        sent.add_done_callback(lambda done: self._deliver(done, future))
+        future = self._in_loop(self._until_lost(self._run(function, args)))
+        self._open.add(future)
+        future.add_done_callback(self._open.discard)
         return future
 
-    def _deliver(self, done: Future[Any], future: Future[Any]) -> None:
-        if not future.set_running_or_notify_cancel():
-            return
+    def _in_loop(self, work: Coroutine[Any, Any, T]) -> Future[T]:
+        return asyncio.run_coroutine_threadsafe(work, self.loop)
+
+    async def _begin(self) -> None:
+        self._watching = asyncio.create_task(self._watch())
         try:
-            future.set_result(self._read(done))
-        except Exception as error:  # noqa: BLE001  raised where the result is asked for
-            future.set_exception(error)
+            await self._until_lost(self._wait_for_workers())
+        except (OSError, TimeoutError) as error:
+            raise self._lost(_GONE) from error
 
-    def _read(self, done: Future[Any]) -> Any:
+    async def _wait_for_workers(self) -> None:
+        deadline = time.monotonic() + _WORKERS_SECONDS
+        while not self._members.threads and time.monotonic() < deadline:
+            await self._members.look()
+            await self._members.settle()
+            for worker, has in self.refused.items():
+                ours = version("hearthlog")
+                raise WorkerError(
+                    f"the Dask worker at {worker} has {has}, this is {ours}; install {ours} there"
+                )
+            await asyncio.sleep(0 if self._members.threads else _LOOK_SECONDS / 10)
+        if not self._members.threads:
+            raise WorkerError(
+                f"the Dask scheduler at {self._scheduler} has no workers; start some with: "
+                f"dask worker {self._scheduler}"
+            )
+
+    async def _watch(self) -> LostClusterError:
+        """Look at the cluster until it is lost, and return the error that says so."""
         try:
-            refusal, reply = done.result()
-        except CancelledError as error:
-            raise gone(self._scheduler) from error
-        except Exception as error:
-            raise_if_killed(error)
-            raise
-        if refusal:
-            raise WorkerError(refusal)
-        return read_reply(reply)
+            what = await self._look_on()
+        except TimeoutError:
+            what = "does not answer; see what keeps it"
+        except Exception:  # noqa: BLE001  whatever a broken connection raises
+            what = _GONE
+        return self._lost(what)
+
+    async def _look_on(self) -> str:
+        """Look at the cluster once a second; return why that has an end."""
+        manned = time.monotonic()
+        while self._client.status == "running":
+            await self._members.look()
+            now = time.monotonic()
+            manned = now if self._members.threads else manned
+            if now - manned > _DESERTED_SECONDS:
+                return f"has had no workers for {_DESERTED_SECONDS / 60:.0f} minutes; start some"
+            await asyncio.sleep(_LOOK_SECONDS)
+        return _GONE
+
+    def _lost(self, what: str) -> LostClusterError:
+        return LostClusterError(
+            f"the Dask scheduler at {self._scheduler} {what}, and run this again"
+        )
+
+    async def _until_lost(self, work: Coroutine[Any, Any, T]) -> T:
+        """Return what work returns; raise LostClusterError once the cluster is lost."""
+        working = asyncio.create_task(work)
+        try:
+            await asyncio.wait({working, self._watching}, return_when=asyncio.FIRST_COMPLETED)
+            if self._watching.done() and (not working.done() or working.exception()):
+                raise self._watching.result()
+            return working.result()
+        finally:
+            working.cancel()
+
+    async def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
+        """Run a task, again if Dask drops it, or if all workers that may run it have left."""
+        from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
+
+        with suppress(KilledWorker):
+            for _ in range(_LOSSES):
+                await self._members.manned.wait()
+                allowed = list(self._members.threads)
+                try:
+                    return await self._attempt(function, args, allowed)
+                except CancelledError:
+                    self._sent.clear()
+                    await asyncio.sleep(_LOOK_SECONDS)  # for a look, if the scheduler is gone
+        raise WorkerError(f"the task lost its worker {_LOSSES} times: killed, or out of memory")
+
+    async def _attempt(
+        self, function: Callable[..., T], args: tuple[Any, ...], allowed: list[str]
+    ) -> T:
+        """Run a task on some workers; raise CancelledError if all of them have left."""
+        places = [n for n, arg in enumerate(args) if _is_large(arg)]
+        sent = [await self._send(args[place], allowed) for place in places]
+        others = [None if n in places else arg for n, arg in enumerate(args)]
+        name = getattr(function, "__name__", "task").strip("_<>")
+        future = self._client.submit(
+            _caller(),
+            pickle.dumps((function, others, places)),
+            *sent,
+            key=f"{name}-{uuid4().hex}",  # Dask groups tasks by what is before the number
+            workers=allowed,  # not those of another version
+            retries=_RETRIES,
+            pure=False,
+        )
+        gathering = asyncio.ensure_future(self._client.gather(future))
+        try:
+            while not gathering.done():
+                await asyncio.wait({gathering}, timeout=_LOOK_SECONDS)
+                if not gathering.done() and not self._members.any_of(allowed):
+                    raise CancelledError
+            return gathering.result()
+        finally:
+            gathering.cancel()
+            future.release()
+
+    async def _send(self, array: Any, allowed: list[str]) -> Any:
+        """Send a large array to all workers, once."""
+        if id(array) not in self._sent:
+            scattered = self._client.scatter(array, workers=allowed, broadcast=True, hash=False)
+            self._sent[id(array)] = array, asyncio.ensure_future(scattered)
+        try:
+            return await asyncio.shield(self._sent[id(array)][1])
+        except (OSError, TimeoutError, ValueError) as error:  # a worker left meanwhile
+            raise CancelledError from error
 
 
-def raise_if_killed(error: Exception) -> None:
-    """Raise WorkerError if an error of Dask says that a task killed its workers.
+def _is_large(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.nbytes >= _SENT_ONCE
 
-    Parameters
-    ----------
-    error : Exception
-        Any error of a task or a future; all but `distributed.KilledWorker` are left alone.
 
-    Raises
-    ------
-    WorkerError
-        If the task has lost its worker more often than Dask allows.
+def _caller() -> Callable[..., Any]:
+    """Make the function that calls what it is sent.
+
+    Dask's scheduler unpickles the arguments of a task, too. As bytes, and with a nested function,
+    which Dask sends as code, they do not keep it busy with importing what workers need.
     """
-    from distributed import KilledWorker  # noqa: PLC0415  part of the extra `cluster`
 
-    if isinstance(error, KilledWorker):
-        times = error.allowed_failures + 1
-        raise WorkerError(
-            f"the task lost its worker {times} times: killed, or out of memory"
-        ) from error
+    def call(packed: bytes, *sent: Any) -> Any:
+        import pickle  # noqa: PLC0415  runs elsewhere
 
+        function, args, places = pickle.loads(packed)  # noqa: S301  sent by our own client
+        for place, value in zip(places, sent, strict=True):
+            args[place] = value
+        return function(*args)
 
-def _check_versions(client: "Client", scheduler: str) -> None:
-    """Refuse a cluster with no workers, or with workers of another version."""
-    try:
-        client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
-    except TimeoutError as error:
-        raise WorkerError(
-            f"the Dask scheduler at {scheduler} has no workers; start some with: "
-            f"dask worker {scheduler}"
-        ) from error
-    ours = version("hearthlog")
-    # A function of the standard library, so that a worker without hearthlog can answer.
-    versions = client.run(version, "hearthlog", on_error="return")
-    for worker, theirs in versions.items():
-        if theirs != ours:
-            raise WorkerError(_refusal(worker, theirs, ours))
-
-
-def _refusal(worker: str, theirs: Any, ours: str) -> str:
-    has = f"hearthlog {theirs}" if isinstance(theirs, str) else "no hearthlog"
-    return f"the Dask worker at {worker} has {has}, this is {ours}; install {ours} there"
-
-
-def _guard(ours: str) -> Callable[[bytes], tuple[str, bytes]]:
-    """Make the function that workers run: it refuses calls on a worker of another version.
-
-    It is a nested function, which Dask sends as code, since a worker that joins later may have no
-    hearthlog to import it from.
-    """
-
-    def guarded(call: bytes) -> tuple[str, bytes]:
-        from importlib import metadata  # noqa: PLC0415  runs elsewhere
-
-        from distributed import get_worker  # noqa: PLC0415  runs elsewhere
-
-        try:
-            theirs = metadata.version("hearthlog")
-        except metadata.PackageNotFoundError:
-            theirs = ""
-        if theirs != ours:
-            has = f"hearthlog {theirs}" if theirs else "no hearthlog"
-            worker = get_worker().address
-            return f"the Dask worker at {worker} has {has}, this is {ours}: not used", b""
-        from hearthlog.analyzer.workers.pickled_calls import attempt  # noqa: PLC0415  not before it is known to be there
-
-        return "", attempt(call)
-
-    return guarded
+    return call

@@ -1,16 +1,19 @@
 """Many fits at once, in threads or on a Dask cluster, with the same code."""
 
 import os
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import joblib
 
-from hearthlog.analyzer.workers.cluster import connected, gone, raise_if_killed
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.analyzer.workers.cluster import Cluster, connected
 
 _MOST_THREADS = 4
+_CLUSTER: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
 
 def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
@@ -19,21 +22,35 @@ def in_parallel(calls: Iterable[Any]) -> Iterator[Any]:
     Parameters
     ----------
     calls : iterable of joblib.delayed
-        They run in up to four threads, since libsvm releases the lock, or where
-        `joblib.parallel_config` says.
+        With positional arguments. They run in up to four threads, since libsvm releases the lock,
+        or in the block of `fits_on` on the cluster.
 
     Yields
     ------
     object
         What each call returned; the first error of a call is raised.
     """
+    cluster = _CLUSTER.get()
+    if cluster is not None:
+        yield from _on(cluster, calls)
+        return
     threads = min(os.cpu_count() or 1, _MOST_THREADS)
-    return joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
+    yield from joblib.Parallel(threads, prefer="threads", return_as="generator")(calls)
+
+
+def _on(cluster: Cluster, calls: Iterable[Any]) -> Iterator[Any]:
+    waiting: deque[Future[Any]] = deque()
+    for function, args, _ in calls:
+        waiting.append(cluster.submit(function, *args))
+        if len(waiting) >= 2 * cluster.parallel:  # so that no worker waits for the next one
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 @contextmanager
-def joblib_on(scheduler: str | None) -> Iterator[None]:
-    """Let joblib run calls in this block on a Dask cluster, if one is named.
+def fits_on(scheduler: str | None) -> Iterator[None]:
+    """Let `in_parallel` run calls in this block on a Dask cluster, if one is named.
 
     Parameters
     ----------
@@ -48,32 +65,9 @@ def joblib_on(scheduler: str | None) -> Iterator[None]:
     if scheduler is None:
         yield
         return
-    with connected(scheduler) as client, joblib.parallel_config(_backend(client)):
+    with connected(scheduler) as cluster:
+        token = _CLUSTER.set(cluster)
         try:
             yield
-        except HearthlogError:
-            raise
-        except Exception as error:
-            if client.status != "running":
-                raise gone(scheduler) from error
-            raise_if_killed(error)
-            raise
-
-
-def _backend(client: Any) -> Any:
-    """Make joblib's Dask backend end where a task has killed its workers, instead of waiting."""
-    from joblib._dask import DaskDistributedBackend  # noqa: PLC0415  part of the extra `cluster`
-
-    class Backend(DaskDistributedBackend):  # type: ignore[misc]  # joblib has no types
-        def submit(self, func: Any, callback: Any = None) -> Any:
-            """Run a batch; report errors to the callback too, which joblib waits for."""
-
-            def tell(done: Any) -> None:
-                if (error := done.exception()) is not None:
-                    callback(error)
-
-            future = super().submit(func, callback)
-            future.add_done_callback(tell)
-            return future
-
-    return Backend(client=client)
+        finally:
+            _CLUSTER.reset(token)

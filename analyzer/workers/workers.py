@@ -5,7 +5,7 @@ from concurrent.futures import Future
 from contextlib import closing, contextmanager
 from typing import ParamSpec, Protocol, TypeVar
 
-from hearthlog.analyzer.workers.cluster import Cluster, connected
+from hearthlog.analyzer.workers.cluster import connected
 from hearthlog.analyzer.workers.processes import Processes
 
 P = ParamSpec("P")
@@ -36,8 +36,8 @@ class Workers(Protocol):
         Returns
         -------
         concurrent.futures.Future
-            It raises what the function raises, and WorkerError if the worker was lost three times,
-            the cluster is gone, or a worker has another version of hearthlog.
+            It raises what the function raises, WorkerError if the worker was lost three times, and
+            LostClusterError if the cluster is gone.
         """
 
 
@@ -64,8 +64,8 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
         version.
     """
     if scheduler is not None:
-        with connected(scheduler) as client:
-            yield Cluster(client, scheduler)
+        with connected(scheduler) as cluster:
+            yield cluster
     elif count == 1:
         yield InlineWorkers()
     else:

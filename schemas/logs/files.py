@@ -1,6 +1,8 @@
 """The files of logs: `<logs>/YYYY/MM/DD/<node>_YYYYMMDDTHHMMSSZ.mcap`, in UTC."""
 
+import os
 import re
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -18,7 +20,7 @@ RELABEL_LAYER = "relabel-"  # and the name of a model
 AUDIO_SUFFIX = f".{AUDIO_LAYER}{SUFFIX}"
 _NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER}))?", re.DOTALL)
 _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
-CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder
+CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder: itself a folder of parts
 ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
 
 
@@ -245,7 +247,7 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
 
 def _find_local(path: Path) -> list[Path]:
     if path.is_dir():
-        logs = sorted(filter(is_log, path.rglob("*")))
+        logs = sorted(Path(entry.path) for entry in walk_logs(path))
         if not logs:
             raise LogError(f"{path}: no log (*{SUFFIX}) in this folder")
         return logs
@@ -254,6 +256,36 @@ def _find_local(path: Path) -> list[Path]:
     if not may_be_regular(path):
         raise LogError(f"{path}: cannot be read (Not a regular file)")
     return [path]
+
+
+def walk_logs(folder: Path) -> Iterator["os.DirEntry[str]"]:
+    """List the logs in a folder of this machine, in any order.
+
+    Parameters
+    ----------
+    folder : Path
+        Links to other folders in it are not followed; folders that cannot be read are left out.
+
+    Yields
+    ------
+    os.DirEntry
+        Of regular files, and of what cannot be looked at, with the name of a log or a layer.
+    """
+    waiting = [os.fspath(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append(entry.path)
+                    elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)) and _may_be_log(entry):
+                        yield entry
+        except OSError:  # as Path.rglob does
+            continue
+
+
+def _may_be_log(entry: "os.DirEntry[str]") -> bool:
+    return entry.is_file() or not os.path.exists(entry)  # noqa: PTH110  no Path for each file
 
 
 def _find_stored(path: Any) -> list[Path]:

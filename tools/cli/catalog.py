@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import Json, log_location
+from hearthlog.tools.cli.options import Json, Scheduler, log_location
 from hearthlog.tools.cli.progress import share_done
 from hearthlog.tools.cli.table import print_table
 from hearthlog.tools.cli.text import first_of, moment, number, print_lines, tell, wrong_use
@@ -32,6 +32,10 @@ def catalog(
         ),
     ],
     *,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Processes; worth it where thousands of files are new.")
+    ] = 1,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Write FOLDER/catalog.parquet, a row for each file, and show the homes in the folder.
@@ -44,7 +48,7 @@ def catalog(
 
     if folder.is_file():
         wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
-    files = _write(folder)
+    files = _write(folder, workers, scheduler)
     damaged = files.of_state(DAMAGED)
     for row in damaged:
         tell(f"{folder / row.path}: {row.error}")
@@ -64,18 +68,17 @@ def catalog(
         raise typer.Exit(3)
 
 
-def _write(folder: Path) -> "Catalog":
-    from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.catalog.catalog import load_catalog, write_catalog
+def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
+    from hearthlog.analyzer.logs.catalog.catalog import read_catalog
+    from hearthlog.analyzer.logs.catalog.making import write_catalog
+    from hearthlog.analyzer.workers import open_workers
 
-    previous = None
+    previous = read_catalog(folder)
+    for line in () if previous is None else previous.unusable:
+        tell(f"{line}; it is made anew")
     try:
-        previous = load_catalog(folder)
-    except DataError as error:
-        tell(f"{error}; it is made anew")
-    try:
-        with share_done("reading logs") as progress:
-            return write_catalog(folder, previous, progress)
+        with open_workers(workers, scheduler) as pool, share_done("reading logs") as progress:
+            return write_catalog(folder, previous, progress, pool)
     except KeyboardInterrupt:
         tell(
             "interrupted; what was read is in the catalogue, and the same command goes on from "

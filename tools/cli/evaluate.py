@@ -294,10 +294,10 @@ def _learning(
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import read_manifest
     from hearthlog.analyzer.training.scenario import load_scenario
-    from hearthlog.analyzer.workers.parallel import joblib_on
+    from hearthlog.analyzer.workers.parallel import fits_on
 
     method = chosen_method(name)
-    with joblib_on(scheduler):
+    with fits_on(scheduler):
         classes = load_scenario(scenario)
         clips = read_manifest(manifest_path(data), classes.labels)
         classes = classes.with_unknown((clip.label, clip.source_group) for clip in clips)

@@ -98,10 +98,10 @@ def train(
         model, segments = _adapted(base, home)
     else:
         assert scenario is not None
-        from hearthlog.analyzer.workers.parallel import joblib_on
+        from hearthlog.analyzer.workers.parallel import fits_on
 
         chosen = chosen_method(method, cost=cost, gamma=gamma)
-        with joblib_on(scheduler):
+        with fits_on(scheduler):
             model, segments = _learned(data, scenario, home or [], chosen, smoothing)
     output = output or _next_of_home()
     save_model(model, output)

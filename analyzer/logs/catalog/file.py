@@ -1,4 +1,4 @@
-"""The file of a catalogue: its columns, and how it is read although it may come from anywhere."""
+"""A Parquet file of a catalogue: its columns, and how it is read, wherever it may come from."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -117,18 +117,20 @@ def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
     return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
 
 
-def read_table(stream: BinaryIO) -> pa.Table:
-    """Read the table of a catalogue, and check it.
+def read_table(stream: BinaryIO, names: Sequence[str] | None = None) -> pa.Table:
+    """Read the table of a part of a catalogue, and check it.
 
     Parameters
     ----------
     stream : binary file
         Is read from where it is, up to 1 GiB.
+    names : sequence of str, optional
+        Columns to read, none of which is a list; all by default.
 
     Returns
     -------
     pa.Table
-        Of `SCHEMA`.
+        Of `SCHEMA`, with the columns that were asked for.
 
     Raises
     ------
@@ -148,15 +150,17 @@ def read_table(stream: BinaryIO) -> pa.Table:
         raise ValueError("it is of another version of hearthlog")
     room = _ROOM + _GROWTH * len(data)
     _check_size(parquet, room)
-    tables = [SCHEMA.empty_table()]
+    schema = SCHEMA if names is None else pa.schema(map(SCHEMA.field, names), SCHEMA.metadata)
+    tables = [schema.empty_table()]
     with pq.ParquetFile(pa.BufferReader(data), metadata=parquet, read_dictionary=_TEXTS) as file:
-        for batch in file.iter_batches(_BATCH):
+        for batch in file.iter_batches(_BATCH, columns=schema.names):
             room -= _size(batch)
             if room < 0:
                 raise ValueError("it is too large")
-            if any(part.null_count for part in [*map(batch.column, _ALWAYS), *_parts(batch)]):
+            always = [batch.column(name) for name in schema.names if name in _ALWAYS]
+            if any(part.null_count for part in [*always, *_parts(batch)]):
                 raise ValueError("a value is missing")
-            tables.append(pa.Table.from_batches([batch]).cast(SCHEMA))
+            tables.append(pa.Table.from_batches([batch]).select(schema.names).cast(schema))
     return pa.concat_tables(tables)
 
 
@@ -192,5 +196,7 @@ def _size(batch: pa.RecordBatch) -> int:
 
 def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
     """Return what is in the lists."""
+    if "labels" not in batch.schema.names:
+        return []
     labels = batch.column("labels").flatten()
     return [labels, *labels.flatten(), batch.column("microphones").flatten()]
