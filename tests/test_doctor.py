@@ -1251,7 +1251,7 @@ def test_the_command_says_how_it_went_by_its_exit_status(hearthlog, recorded, lo
     assert result.returncode == 3
     assert result.stdout.count("\n") == 1
     assert result.stdout.startswith(f"warning: {recorded}: 2026-03-01T07:00:20.350Z: /mic/gap: ")
-    assert result.stderr == "1 files: 0 errors, 1 warnings\n"
+    assert result.stderr == "1 file: 0 errors, 1 warning\n"
     log.drop(log.messages(GAPS)[0])
     broken = log.write(tmp_path / NAME)
     assert hearthlog("doctor", broken).returncode == 1

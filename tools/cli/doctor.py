@@ -102,7 +102,8 @@ def _print(files: "list[Findings]") -> None:
         for (level, rule), count in findings.more().items():
             print(printable(f"{level}: {findings.path}: {count} more of this kind [{rule}]"))
     # Nobody who reads the findings with a program wants this among them.
-    print(f"{len(files)} files: {errors} errors, {warnings} warnings", file=sys.stderr)
+    counts = number(errors, "error"), number(warnings, "warning")
+    print(f"{number(len(files), 'file')}: {', '.join(counts)}", file=sys.stderr)
 
 
 def _as_json(files: "list[Findings]") -> dict[str, Any]:
