@@ -31,8 +31,11 @@ class HearthlogWarning(UserWarning):
         Names no file, because Python shows each text once.
     where : object
         The file or the topic.
+    each : bool
+        Whether the command line names each file of which this is said, and not the first alone.
     """
 
-    def __init__(self, text: str, where: object) -> None:
+    def __init__(self, text: str, where: object, *, each: bool = False) -> None:
         super().__init__(text)
         self.where = where
+        self.each = each

@@ -5,6 +5,7 @@ They read `logs`, `left` and `models` in the current folder, and get what runs t
 
 import csv
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -212,7 +213,7 @@ def by_splicing(run: Run) -> Any:
 def by_catalog(run: Run) -> Any:
     said = json.loads(run("catalog", "logs", "--json").stdout)
     rows = pq.read_table("logs/catalog.parquet").to_pylist()
-    Path("logs/catalog.parquet").unlink()
+    shutil.rmtree("logs/catalog.parquet")
     of_files = {"size", "mtime", "input_sha256"}
     return said["labels"], [
         {key: value for key, value in row.items() if key not in of_files} for row in rows

@@ -419,6 +419,7 @@ def test_no_changed_byte_becomes_another_value_without_a_word(log, tmp_path):
     assert 75 < refused < 150
 
 
+@pytest.mark.filterwarnings("ignore:its index is damaged")
 def test_chunks_read_together_are_what_each_of_them_holds(log, tmp_path, monkeypatch):
     rng = random.Random(8)
     data = log.read_bytes()

@@ -258,7 +258,7 @@ def _in_time(span: LogSpan) -> tuple[int, int, tuple[str, ...]]:
 
 def _warn(path: Path, error: LogError) -> None:
     text = str(error).removeprefix(f"{path}: ")
-    warnings.warn(HearthlogWarning(text, path), stacklevel=3)
+    warnings.warn(HearthlogWarning(text, path, each=True), stacklevel=3)
 
 
 def _is_cut(path: Path) -> bool:

@@ -84,7 +84,7 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
                 client.close(timeout=_CLOSE_SECONDS)
     for worker, has in cluster.refused.items():
         what = f"the Dask worker has {has}, this is {version('hearthlog')}: not used"
-        warnings.warn(HearthlogWarning(what, worker), stacklevel=3)
+        warnings.warn(HearthlogWarning(what, worker, each=True), stacklevel=3)
 
 
 @contextmanager

@@ -236,7 +236,7 @@ class LogFile:
         """Read the summary, and return whether it has an index; warn if it is damaged."""
         if not self._read_summary(footer, end):
             self._forget()
-            warnings.warn(HearthlogWarning(_NO_INDEX, self.path), stacklevel=2)
+            warnings.warn(HearthlogWarning(_NO_INDEX, self.path, each=True), stacklevel=2)
             return False
         if not len(self.chunks) and (self.statistics is None or self.statistics.message_count):
             self._forget()

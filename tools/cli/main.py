@@ -151,10 +151,7 @@ def _message(error: Exception) -> str:
 
 @contextmanager
 def _warnings_shown() -> Iterator[dict[str, set[str]]]:
-    """Print our warnings, and collect for each text what it is about.
-
-    Of many files with the same fault the first ones are named.
-    """
+    """Print our warnings, and collect for each text the files, or others, that it is about."""
     warned: dict[str, set[str]] = {}
     others = warnings.showwarning
 
@@ -163,10 +160,10 @@ def _warnings_shown() -> Iterator[dict[str, set[str]]]:
             others(message, *arguments, **options)
             return
         places = warned.setdefault(str(message), set())
-        is_new = str(message.where) not in places
-        places.add(str(message.where))
-        if is_new and len(places) <= _NAMED:
-            tell(f"{message.where}: {message}")
+        if not places or (message.each and str(message.where) not in places):
+            places.add(str(message.where))
+            if len(places) <= _NAMED:
+                tell(f"{message.where}: {message}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", HearthlogWarning)
