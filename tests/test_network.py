@@ -17,7 +17,15 @@ from conftest import HEARTHLOG
 from logs import features, read
 from mcap.reader import make_reader
 from streams import RATE, noise
-from test_capture import FRAME, SECONDS, batch, realtime_offset, recording, wait_for_frames
+from test_capture import (
+    FRAME,
+    ROUNDING,
+    SECONDS,
+    batch,
+    realtime_offset,
+    recording,
+    wait_for_frames,
+)
 
 from hearthlog.analyzer.doctor import examine
 from hearthlog.recorder.addresses import check_address, public_name
@@ -48,7 +56,10 @@ def sample_at(data, values):
     frame_power = (power[FRAME_SAMPLES:] - power[:-FRAME_SAMPLES])[: len(data)] / FRAME_SAMPLES
     (start,) = (
         int(at)
-        for at in np.flatnonzero(np.isclose(frame_power, values[1][0], rtol=1e-6))
+        for at in np.flatnonzero(
+            np.isclose(frame_power, values[1][0], rtol=ROUNDING)
+            & np.isclose(np.roll(frame_power, -FRAME_SAMPLES), values[2][0], rtol=ROUNDING)
+        )
         if np.array_equal(batch(data, int(at) - FRAME_SAMPLES, 2)[1], values[1])
     )
     return (start - FRAME_SAMPLES) % len(data)

@@ -1,12 +1,13 @@
 """When logs begin and end: from a catalogue where one knows, else from the logs."""
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from hearthlog.schemas.logs.files import CATALOG, find_logs
 from hearthlog.schemas.logs.merged_reading import time_spans
-from hearthlog.schemas.storage.byte_ranges import store_errors
+from hearthlog.schemas.storage.byte_ranges import is_local, store_errors
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.catalog.known_files import KnownFiles
@@ -71,8 +72,11 @@ def find_spans(paths: Iterable[Path], span_of: SpanOf) -> list[LogSpan]:
 
 def _catalogue_of(folder: Path) -> "KnownFiles | None":
     """Read what the catalogue of a folder knows, if it has one and there is what reads it."""
-    with store_errors(folder):
-        exists = (folder / CATALOG).exists()
+    try:
+        with nullcontext() if is_local(folder) else store_errors(folder):
+            exists = (folder / CATALOG).exists()
+    except OSError:  # what is wrong with its name is said where its logs are listed
+        return None
     if not exists:
         return None
     try:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
-from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     DIAGNOSTICS,
@@ -161,9 +159,9 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
         except LogError as error:
             home.lose(str(error))
             continue
-        if not selection.logs and not _is_complete(entry.path):
+        if selection.unfinished and not selection.logs:
             home.lose(f"{entry.path}: unfinished, and nothing of it is whole")
-        if selection.unfinished:
+        elif selection.unfinished:
             home.lose(f"unfinished, read up to the last whole chunk: {entry.path}")
         for topic in (*gaps, *selection.topics_of(message_types.STREAM_INFO, ())):
             microphones |= {microphone_of(topic)} - {""}
@@ -175,11 +173,6 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
     home.nodes = list(nodes)
     home.troubles = list(troubles_of(statuses, close[1]))
     return microphones
-
-
-def _is_complete(path: Path) -> bool:
-    with LogFile(path) as file:
-        return file.complete
 
 
 def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
