@@ -12,7 +12,6 @@ import contextlib
 import hashlib
 import io
 import json
-import pickle
 import random
 import struct
 import sys
@@ -309,7 +308,7 @@ VERBS = (columns, cat, info, doctor, recover, relabel)
 
 def compared(path, folder):
     """Let all verbs read a file; raise AssertionError where one says nothing of other values."""
-    expected = pickle.loads((folder / "expected.pickle").read_bytes())
+    expected = json.loads((folder / "expected.json").read_text())
     wrong = []
     for verb in VERBS:
         if verb.__name__ not in expected:
@@ -335,7 +334,7 @@ def json_more(text, own):
 def expect(path, folder, verbs=VERBS):
     """Note what the verbs say of a whole file."""
     texts = {verb.__name__: verb(path, folder) for verb in verbs}
-    (folder / "expected.pickle").write_bytes(pickle.dumps(texts))
+    (folder / "expected.json").write_text(json.dumps(texts))
     return texts
 
 
