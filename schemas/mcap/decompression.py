@@ -1,6 +1,5 @@
 """Many chunks decompressed at once, without Python between one and the next."""
 
-import threading
 import zlib
 from itertools import pairwise
 
@@ -10,7 +9,7 @@ from mcap.opcode import Opcode
 
 from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.mcap.formats import HEAD, ZSTD_CHUNK_HEAD
-from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.mcap.records import LIMIT, zstd_decompressor
 
 _IS_POSSIBLE = "multi_decompress_to_buffer" in zstandard.backend_features
 
@@ -58,7 +57,7 @@ def decompress_together(
         return None
     frames = np.stack([starts + fixed, stored], axis=1).astype(np.uint64)
     try:
-        chunks = _LOCAL.zstd.multi_decompress_to_buffer(
+        chunks = zstd_decompressor().multi_decompress_to_buffer(
             zstandard.BufferWithSegments(raw.data, frames.tobytes()),
             decompressed_sizes=sizes.astype(np.uint64).tobytes(),
             threads=1,  # whoever reads has threads of its own
@@ -71,13 +70,3 @@ def decompress_together(
     if ((heads["crc"] != sums) & (heads["crc"] != 0)).any():
         return None
     return buffer, sizes.astype(np.int64)
-
-
-class _Local(threading.local):
-    """Decompressors are dear to make and must not be shared between threads."""
-
-    def __init__(self) -> None:
-        self.zstd = zstandard.ZstdDecompressor()
-
-
-_LOCAL = _Local()

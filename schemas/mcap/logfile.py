@@ -26,15 +26,14 @@ from hearthlog.schemas.mcap.chunk_table import (
     read_chunk_index,
     read_chunk_row,
 )
-from hearthlog.schemas.mcap.formats import CHUNK, FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
+from hearthlog.schemas.mcap.formats import FOOTER, FOOTER_SIZE, HEAD, MAGIC, UINT16
+from hearthlog.schemas.mcap.record_walk import walk_records
 from hearthlog.schemas.mcap.records import LIMIT, parse, read_footer
 from hearthlog.schemas.storage.byte_ranges import LocalFile, Section, StoredFile, open_file
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
 ACTIVE_SUFFIX = ".mcap.active"  # of a file that is still being written
-_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
 _CHANNEL_END = HEAD.size + UINT16.size
-_WINDOW = 1 << 14  # bytes
 _ENDS = frozenset({int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 
@@ -295,7 +294,12 @@ class LogFile:
         """
         rows = array("q")
         row: ChunkRow | None = None
-        for opcode, offset, length, head in self._new_records(self.size):
+        size = self.size
+        for opcode, offset, length, head in walk_records(self.read, self._end):
+            self.ended = opcode in _ENDS
+            if self.ended or opcode == 0 or offset + length > size:
+                break
+            self._end = offset + length
             if opcode == Opcode.MESSAGE_INDEX and row is not None:
                 row.index_length += length
                 row.channels.add(int.from_bytes(head[HEAD.size : _CHANNEL_END], "little"))
@@ -309,6 +313,8 @@ class LogFile:
             self._add_row(rows, row)
             row = chunk
             self._note(location)
+        if self.complete and not self.ended:
+            raise self.damaged(self._end, "a record claims to be longer than the file")
         if row is not None:  # its indexes may not all be there yet
             row.index_length = min(row.index_length, 0)
             row.channels.clear()
@@ -327,34 +333,6 @@ class LogFile:
             self.record_locations.append(location)
         elif location.opcode in {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL}:
             self._add(self.record(location))
-
-    def _new_records(self, size: int) -> Iterator[tuple[int, int, int, bytes]]:
-        """Go from record to record, up to where the file ends or is cut.
-
-        Yields
-        ------
-        tuple of (int, int, int, bytes)
-            Opcode, offset and length of the record, and its first bytes, heads included.
-        """
-        window, first = b"", 0  # of the file, for there are half a million records an hour
-        while True:
-            start = self._end - first
-            if not 0 <= start <= len(window) - _RECORD_HEAD:
-                window, first, start = self.read(self._end, _WINDOW), self._end, 0
-            head = window[start : start + _RECORD_HEAD]
-            if len(head) < HEAD.size and not self.complete:
-                return
-            opcode, length = HEAD.unpack_from(head) if len(head) >= HEAD.size else (0, 0)
-            if opcode in _ENDS:
-                self.ended = True
-                return
-            length += HEAD.size
-            if opcode == 0 or self._end + length > size:
-                if self.complete:
-                    raise self.damaged(self._end, "a record claims to be longer than the file")
-                return
-            yield opcode, self._end, length, head[:length]
-            self._end += length
 
     def _chunk_row(self, location: RecordLocation, head: bytes) -> ChunkRow | None:
         """Describe a chunk, or a message outside of one; None if the record is neither."""

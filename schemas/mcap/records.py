@@ -231,4 +231,9 @@ class _Local(threading.local):
 _LOCAL = _Local()
 
 
+def zstd_decompressor() -> zstandard.ZstdDecompressor:
+    """Return the decompressor of this thread."""
+    return _LOCAL.zstd
+
+
 _DECOMPRESS = {b"zstd": _zstd, b"lz4": _lz4, b"": _stored}

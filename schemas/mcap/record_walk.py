@@ -1,0 +1,41 @@
+"""From record to record through a file that may be written still."""
+
+from collections.abc import Callable, Iterator
+
+from hearthlog.schemas.mcap.formats import CHUNK, HEAD
+
+_RECORD_HEAD = HEAD.size + CHUNK.size  # bytes that tell where a record ends and what it spans
+_WINDOW = 1 << 14  # bytes that are read at once: an hour has half a million records
+
+
+def walk_records(
+    read: Callable[[int, int], bytes], start: int
+) -> Iterator[tuple[int, int, int, bytes]]:
+    """Go from record to record, as long as there is the head of one.
+
+    Parameters
+    ----------
+    read : callable
+        Returns bytes of the file from an offset on, fewer than asked for at its end.
+    start : int
+        Offset of the first record.
+
+    Yields
+    ------
+    opcode, offset, length : int
+        Of the record, which may claim to be longer than the file; with opcode and length.
+    head : bytes
+        Its first bytes, opcode and length included, or all of them.
+    """
+    window, first = b"", start
+    while True:
+        place = start - first
+        if not 0 <= place <= len(window) - _RECORD_HEAD:
+            window, first, place = read(start, _WINDOW), start, 0
+        head = window[place : place + _RECORD_HEAD]
+        if len(head) < HEAD.size:
+            return
+        opcode, length = HEAD.unpack_from(head)
+        length += HEAD.size
+        yield opcode, start, length, head[:length]
+        start += length
