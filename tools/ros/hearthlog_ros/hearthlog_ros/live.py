@@ -26,7 +26,7 @@ from hearthlog_ros.graph import (
 )
 from hearthlog_ros.pace import Pace
 
-_DELAY_SECONDS = 1.2  # a block of sound, what writing and reading take, and a little more
+_DELAY_SECONDS = 1.5  # a block of sound, a new file, writing and reading, and a little more
 _LOOK_SECONDS = 0.5  # for a folder that is not there yet
 _FIND_SECONDS = 3.0  # of patience with subscribers that want another quality of service
 _FIND_LOOK_SECONDS = 0.02

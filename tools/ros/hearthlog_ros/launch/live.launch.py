@@ -13,7 +13,7 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("folder", description="where a recorder writes its logs"),
-            DeclareLaunchArgument("delay", default_value="1.2", description="seconds; 0: at once"),
+            DeclareLaunchArgument("delay", default_value="1.5", description="seconds; 0: at once"),
             Node(
                 package="hearthlog_ros",
                 executable="live",
