@@ -1,8 +1,12 @@
 """Matrix products whose rows do not depend on each other."""
 
+from typing import TypeVar
+
 import numpy as np
 
-from hearthlog.schemas.arrays import Float64
+from hearthlog.schemas.arrays import Float32, Float64
+
+Floats = TypeVar("Floats", Float32, Float64)
 
 _ROWS = 16
 _LINE = 64  # bytes of a cache
@@ -41,21 +45,21 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
     return product
 
 
-def aligned(weights: Float64) -> Float64:
+def aligned(weights: Floats) -> Floats:
     """Copy weights to the start of a cache line: products with them take a third less time.
 
     Parameters
     ----------
-    weights : np.ndarray [shape=(k, m)], float64
+    weights : np.ndarray [shape=(k, m)], float32 or float64
 
     Returns
     -------
-    np.ndarray [shape=(k, m)], float64
+    np.ndarray [shape=(k, m)], of the same type
         In C order.
     """
     room = np.empty(weights.size * weights.itemsize + _LINE, np.uint8)
     start = -room.ctypes.data % _LINE
-    copy = room[start : start + weights.size * weights.itemsize].view(np.float64)
+    copy = room[start : start + weights.size * weights.itemsize].view(weights.dtype)
     copy = copy.reshape(weights.shape)
     copy[:] = weights
     return copy

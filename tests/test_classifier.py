@@ -13,9 +13,10 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.training.method import softmax
-from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm, rounded
+from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm, in_whole_steps, rounded
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
+from hearthlog.models.classifiers.rbf_distances import RoundedDistances, in_steps
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.progress import ignore_progress
 
@@ -55,10 +56,10 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
         class_weight="balanced",
         decision_function_shape="ovo",
     )
-    fitted = make_pipeline(StandardScaler(), machine).fit(
+    fitted = make_pipeline(in_whole_steps(StandardScaler(), PAPER.steps), machine).fit(
         rounded(statistics(data)).astype(np.float64), data.target
     )
-    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp))
+    learned = LearnedSvm(fitted, unseen(classes)[:0], np.empty(0, np.intp), PAPER.steps)
     decision = learned.decide(unseen(classes), classes)
     expected = softmax(model.description.inverse_temperature * decision)
 
@@ -99,6 +100,31 @@ def test_the_number_of_blas_threads_changes_nothing(classes):
     assert np.array_equal(*results)
 
 
+@given(seed=st.integers(0, 1 << 32), width=st.integers(1, 300), spread=st.floats(1e-3, 1e4))
+def test_the_order_of_sums_changes_no_bit_of_a_distance(seed, width, spread):
+    rng = np.random.default_rng(seed)
+    rows, vectors = spread * rng.standard_normal((2, 40, width))
+    distances = RoundedDistances(0.5 / width, 64)
+    one, other = (
+        distances.between(distances.rows(rows[:, order]), distances.vectors(vectors[:, order]))
+        for order in (np.arange(width), rng.permutation(width))
+    )
+    np.testing.assert_array_equal(one, other)
+    whole = in_steps(rows, 64).astype(int), in_steps(vectors, 64).astype(int)
+    squares = ((whole[0][:, np.newaxis] - whole[1]) ** 2).sum(axis=-1)
+    np.testing.assert_allclose(one, -0.5 / width * squares / 64**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("spread", [1.0, 100.0])
+def test_a_row_far_away_changes_no_bit_of_the_others(spread):
+    rows, vectors = spread * np.random.default_rng(5).standard_normal((2, 40, 195))
+    distances = RoundedDistances(0.5 / 195, 64)
+    near, by = distances.rows(rows[1:]), distances.vectors(vectors)
+    rows[0] *= 1000.0
+    together = distances.between(distances.rows(rows), by)
+    np.testing.assert_array_equal(together[1:], distances.between(near, by))
+
+
 def test_every_row_sums_to_one_however_far_from_what_was_learned():
     rows = unseen(9) * np.geomspace(1e-30, 1e30, ROWS, dtype=np.float32)[:, np.newaxis]
     result = Classifier(trained(9)).probabilities(rows)
@@ -133,8 +159,10 @@ def test_a_class_without_support_vectors_is_no_obstacle():
 
 
 def of_older_format(model):
-    """Return a model whose novelty is that of formats 2 and 3."""
-    return replace(model, description=model.description.model_copy(update={"novelty": "machine"}))
+    """Return a model whose novelty is that of formats 2 and 3, which did not round inputs."""
+    parameters = {n: v for n, v in model.description.parameters.items() if n != "steps"}
+    older = {"novelty": "machine", "parameters": parameters}
+    return replace(model, description=model.description.model_copy(update=older))
 
 
 def test_novelty_is_how_likely_the_label_is_wrong():

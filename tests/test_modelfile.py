@@ -394,6 +394,7 @@ def older(number, **changed):
     about["feature_set"] = "auros21"
     about["smoothing"] = {"method": "merge", "lag_seconds": 0.0}
     about["format"] = number
+    del about["parameters"]["steps"]
     if number == 2:
         about |= about.pop("parameters")
         del about["feature_set_version"], about["method"]

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.pipeline import Pipeline, make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.method import Examples, Learned, Method
 from hearthlog.models.classifiers.description import Description
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.rbf_distances import in_steps
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 
@@ -53,6 +54,8 @@ class SvmMethod(Method):
         Cost of a window on the wrong side of the margin.
     gamma : float
         Gamma of the kernel, times the number of inputs.
+    steps : int or None
+        Of a standard deviation, to which inputs are rounded; None for a model that does not.
     most_windows : int
         That are learned from; the time that it takes grows with their square.
     scaling : Scaling, optional
@@ -61,6 +64,7 @@ class SvmMethod(Method):
 
     cost: float = 4.0
     gamma: float = 1.0
+    steps: int | None = 64
     most_windows: int = 12_000
     scaling: Scaling | None = field(default=None, compare=False)
 
@@ -99,14 +103,15 @@ class SvmMethod(Method):
             sample_weight=weight * self._costs(target, remembered >= 0),
         )
         support = machine.support_
-        learned = make_pipeline(scaler, machine)
-        return LearnedSvm(learned, inputs[support], np.maximum(remembered[support], -1))
+        learned = make_pipeline(*scaler, machine)
+        remembered = np.maximum(remembered[support], -1)
+        return LearnedSvm(learned, inputs[support], remembered, self.steps)
 
-    def _scaler(self, inputs: Float32) -> StandardScaler:
+    def _scaler(self, inputs: Float32) -> Pipeline:
         scaler = StandardScaler().fit(inputs.astype(np.float64))
         if self.scaling is not None:
             scaler.mean_, scaler.scale_ = self.scaling.mean, self.scaling.scale
-        return scaler
+        return in_whole_steps(scaler, self.steps)
 
     def _costs(self, target: Indices, remembered: Bool) -> Float64:
         """Weigh windows against the number of their class, an earlier machine's as it did."""
@@ -240,8 +245,14 @@ class SvmMethod(Method):
             If the feature set of the method is not installed.
         """
         width = self.features.inputs[description.inputs].width
-        cost, gamma = description.parameters["cost"], description.parameters["gamma"]
-        return replace(self, cost=cost, gamma=gamma * width, copies=description.copies)
+        values = description.parameters
+        return replace(
+            self,
+            cost=values["cost"],
+            gamma=values["gamma"] * width,
+            steps=values.get("steps"),
+            copies=description.copies,
+        )
 
 
 def _spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices:
@@ -253,6 +264,25 @@ def _spread_over_classes(target: Indices, weight: Float64, most: int) -> Indices
     rank = np.empty(len(target), np.intp)
     rank[order] = np.concatenate([np.arange(count) for count in counts])
     return shuffled[np.sort(np.argsort(rank, kind="stable")[:most])]
+
+
+def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
+    """Return a scaler that rounds as the machine does of which it is a part.
+
+    Parameters
+    ----------
+    scaler : StandardScaler
+    steps : int or None
+        Of a standard deviation; None: nothing is rounded.
+    """
+    if steps is None:
+        return make_pipeline(scaler)
+    rounding = FunctionTransformer(_rounded_to_steps, kw_args={"steps": steps})
+    return make_pipeline(scaler, rounding)
+
+
+def _rounded_to_steps(scaled: Float64, steps: int) -> Float64:
+    return in_steps(scaled, steps) / steps
 
 
 def rounded(inputs: Float32) -> Float32:
@@ -279,15 +309,20 @@ class LearnedSvm:
     Parameters
     ----------
     machine : sklearn.pipeline.Pipeline
-        A scaler and an `SVC`.
+        A scaler, what rounds to steps if they are rounded, and an `SVC`.
     support : np.ndarray [shape=(n, width)], float32
         Inputs that became support vectors, in the order of the `SVC`.
     remembered : np.ndarray [shape=(n,)], intp
         Their places in `Examples.more_inputs`; -1 for those of segments.
+    steps : int or None
+        Of a standard deviation, to which inputs are rounded.
     """
 
-    def __init__(self, machine: Pipeline, support: Float32, remembered: Indices) -> None:
+    def __init__(
+        self, machine: Pipeline, support: Float32, remembered: Indices, steps: int | None
+    ) -> None:
         self.machine = machine
+        self._steps = steps
         self.remembered = remembered
         self._support = support
 
@@ -314,7 +349,7 @@ class LearnedSvm:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of `hearthlog.models.classifiers.svm_rbf.SvmKind`."""
-        scaler, svc = self.machine
+        scaler, svc = self.machine[0], self.machine[-1]
         # scikit-learn inverts the sign if there are two classes only; the file does not.
         sign = -1.0 if len(svc.classes_) == 2 else 1.0
         return {
@@ -327,9 +362,10 @@ class LearnedSvm:
         }
 
     def parameters(self) -> dict[str, Any]:
-        """Return `cost`, and as `gamma` that of the kernel itself."""
+        """Return `cost`, as `gamma` that of the kernel itself, and `steps` if there are."""
         svc = self.machine[-1]
-        return {"cost": float(svc.C), "gamma": float(svc.gamma)}
+        steps = {} if self._steps is None else {"steps": self._steps}
+        return {"cost": float(svc.C), "gamma": float(svc.gamma), **steps}
 
 
 BANDS = SvmMethod("bands", "auros21", "bands", SVM_RBF.name, copies=1, cost=4.0, gamma=1.25)

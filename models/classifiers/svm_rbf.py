@@ -10,6 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.classifiers.rbf_distances import (
+    Distances,
+    Prepared,
+    RoundedDistances,
+    UnroundedDistances,
+)
 from hearthlog.schemas.arrays import Float32, Float64
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
@@ -24,12 +30,24 @@ _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class SvmParameters(BaseModel):
-    """Cost, and gamma of the kernel exp(-gamma |x - s|^2)."""
+    """Parameters of a machine.
+
+    Attributes
+    ----------
+    cost : float
+        Of an error.
+    gamma : float
+        Of the kernel exp(-gamma |x - s|^2).
+    steps : int or None
+        Of a standard deviation, to which inputs are rounded; None for those of hearthlog 0.1, which
+        are not.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     cost: _Positive
     gamma: _Positive
+    steps: Annotated[int, Field(ge=1, le=1024)] | None = None
 
 
 class SvmKind(ClassifierKind):
@@ -177,9 +195,10 @@ class SvmMachine:
         self._mean = model.arrays["scaler_mean"]
         self._scale = model.arrays["scaler_scale"]
         self._intercepts = model.arrays["intercepts"]
-        self._blocks = _blocks(model)
-        self._home_blocks = _home_blocks(model)
         self._count = len(model.classes)
+        self._distances = _distances(model)
+        self._blocks = self._support(model)
+        self._home_blocks = self._of_home(model)
         self._first, self._second = np.triu_indices(self._count, 1)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
@@ -196,20 +215,17 @@ class SvmMachine:
         novelty : np.ndarray [shape=(n,)], float64
             One minus the kernel of the nearest support vector, 0 to 1.
         """
-        extended = self._extended(inputs)
-        pairs, others, nearest = self._pairs(extended)
+        rows = self._distances.rows(self._scaled(inputs))
+        pairs, others, nearest = self._pairs(rows)
         decision = weakest_pairs(pairs, self._count)
         if self._home_blocks:
-            decision += home_votes(self._home(extended), others)
+            decision += home_votes(self._home(rows), others)
         return decision, -np.expm1(np.minimum(nearest, 0.0))
 
-    def _extended(self, inputs: Float32) -> Float64:
-        """Return scaled inputs x as (x, |x|^2, 1), shape (n, width + 2)."""
-        scaled = (inputs - self._mean) / self._scale
-        square = np.vecdot(scaled, scaled)[:, np.newaxis]
-        return np.concatenate([scaled, square, np.ones_like(square)], axis=1)
+    def _scaled(self, inputs: Float32) -> Float64:
+        return (inputs - self._mean) / self._scale
 
-    def _pairs(self, extended: Float64) -> tuple[Float64, Float64, Float64]:
+    def _pairs(self, rows: Prepared) -> tuple[Float64, Float64, Float64]:
         """Return the decision values of every pair of classes.
 
         Returns
@@ -220,32 +236,61 @@ class SvmMachine:
         nearest : np.ndarray [shape=(n,)]
             Logarithm of the kernel of the nearest support vector.
         """
-        nearest = np.full(len(extended), -np.inf)
-        against = np.zeros((self._count, len(extended), self._count - 1))
-        others = np.zeros((len(extended), 1))
-        rows = np.arange(len(extended))
-        for weights, parts in self._blocks:
-            distance = rowwise_matmul(extended, weights)
-            largest = distance[rows, distance.argmax(axis=1)]
+        count = len(rows.values)
+        nearest = np.full(count, -np.inf)
+        against = np.zeros((self._count, count, self._count - 1))
+        others = np.zeros((count, 1))
+        for vectors, parts in self._blocks:
+            exponents = self._distances.between(rows, vectors)
+            largest = exponents[np.arange(count), exponents.argmax(axis=1)]
             if largest.max() > 0.0:  # by rounding
-                np.minimum(distance, 0.0, out=distance)
+                np.minimum(exponents, 0.0, out=exponents)
             np.maximum(nearest, largest, out=nearest)
             if self._home_blocks:
-                sharp = np.exp(HOME_SHARPNESS * distance)
-                others += rowwise_matmul(sharp, np.ones((len(weights.T), 1)))
-            kernel = np.exp(distance, out=distance)
+                sharp = np.exp(HOME_SHARPNESS * exponents)
+                others += rowwise_matmul(sharp, np.ones((sharp.shape[1], 1)))
+            kernel = np.exp(exponents, out=exponents)
             for index, columns, coefficients in parts:
                 against[index] += rowwise_matmul(kernel[:, columns], coefficients)
         first, second = self._first, self._second
         decision = against[first, :, second - 1] + against[second, :, first]
         return decision.T + self._intercepts, others, nearest
 
-    def _home(self, extended: Float64) -> Float64:
+    def _home(self, rows: Prepared) -> Float64:
         """Return the sums of the sharp kernels of the home vectors by class, shape (n, C)."""
-        home = np.zeros((len(extended), self._count))
-        for weights, one_hot in self._home_blocks:
-            home += rowwise_matmul(np.exp(HOME_SHARPNESS * _distance(extended, weights)), one_hot)
+        home = np.zeros((len(rows.values), self._count))
+        for vectors, one_hot in self._home_blocks:
+            exponents = np.minimum(self._distances.between(rows, vectors), 0.0)
+            home += rowwise_matmul(np.exp(HOME_SHARPNESS * exponents), one_hot)
         return home
+
+    def _support(self, model: Model) -> list[tuple[Prepared, list[_Part]]]:
+        """Divide the support vectors into blocks, each with its parts by class."""
+        vectors = self._scaled(model.arrays["support_vectors"])
+        ends = np.cumsum(model.arrays["support_counts"]).tolist()
+        blocks = []
+        for low in range(0, len(vectors), _SUPPORT_AT_ONCE):
+            high = min(low + _SUPPORT_AT_ONCE, len(vectors))
+            parts = []
+            for index, (start, end) in enumerate(pairwise([0, *ends])):
+                first, last = max(start, low), min(end, high)
+                if first < last:
+                    coefficients: Float64 = aligned(
+                        model.arrays["dual_coefficients"][:, first:last].T
+                    )
+                    parts.append((index, slice(first - low, last - low), coefficients))
+            blocks.append((self._distances.vectors(vectors[low:high]), parts))
+        return blocks
+
+    def _of_home(self, model: Model) -> list[tuple[Prepared, Float64]]:
+        """Divide the home vectors into blocks, each with its one-hot classes."""
+        if "home_vectors" not in model.arrays:
+            return []
+        vectors = self._scaled(model.arrays["home_vectors"])
+        one_hot = np.eye(self._count)[model.arrays["home_target"]]
+        cuts = range(_SUPPORT_AT_ONCE, len(vectors), _SUPPORT_AT_ONCE)
+        blocks = zip(np.split(vectors, cuts), np.split(one_hot, cuts), strict=True)
+        return [(self._distances.vectors(part), classes) for part, classes in blocks]
 
 
 def weakest_pairs(pairs: Float64, classes: int) -> Float64:
@@ -294,45 +339,8 @@ def home_votes(home: Float64, others: Float64) -> Float64:
     return HOME_VOTE * home / (home.sum(axis=1, keepdims=True) + others + _TINY)
 
 
-def _distance(extended: Float64, weights: Float64) -> Float64:
-    """Return -gamma |x - s|^2, with positive values from rounding set to 0."""
-    distance = rowwise_matmul(extended, weights)
-    return np.minimum(distance, 0.0, out=distance)
-
-
-def _blocks(model: Model) -> list[tuple[Float64, list[_Part]]]:
-    """Divide the support vectors into blocks of weights, each with its parts by class."""
-    weights = _weights(model, model.arrays["support_vectors"])
-    ends = np.cumsum(model.arrays["support_counts"]).tolist()
-    blocks = []
-    for low in range(0, len(weights), _SUPPORT_AT_ONCE):
-        high = min(low + _SUPPORT_AT_ONCE, len(weights))
-        parts = []
-        for index, (start, end) in enumerate(pairwise([0, *ends])):
-            first, last = max(start, low), min(end, high)
-            if first < last:
-                coefficients = aligned(model.arrays["dual_coefficients"][:, first:last].T)
-                parts.append((index, slice(first - low, last - low), coefficients))
-        blocks.append((aligned(weights[low:high].T), parts))
-    return blocks
-
-
-def _home_blocks(model: Model) -> list[tuple[Float64, Float64]]:
-    """Return blocks of the home vectors: weights, and one-hot classes."""
-    if "home_vectors" not in model.arrays:
-        return []
-    weights = _weights(model, model.arrays["home_vectors"])
-    one_hot = np.eye(len(model.classes))[model.arrays["home_target"]]
-    cuts = range(_SUPPORT_AT_ONCE, len(weights), _SUPPORT_AT_ONCE)
-    return [
-        (aligned(part.T), classes)
-        for part, classes in zip(np.split(weights, cuts), np.split(one_hot, cuts), strict=True)
-    ]
-
-
-def _weights(model: Model, vectors: Float32) -> Float64:
-    """Return rows whose product with (x, |x|^2, 1) is -gamma |x - s|^2, for every vector s."""
-    gamma = model.description.parameters["gamma"]
-    scaled = (vectors - model.arrays["scaler_mean"]) / model.arrays["scaler_scale"]
-    square = np.vecdot(scaled, scaled)[:, np.newaxis]
-    return np.concatenate([2.0 * gamma * scaled, np.full_like(square, -gamma), -gamma * square], 1)
+def _distances(model: Model) -> Distances:
+    parameters = SvmParameters.model_validate(model.description.parameters)
+    if parameters.steps is None:
+        return UnroundedDistances(parameters.gamma)
+    return RoundedDistances(parameters.gamma, parameters.steps)

@@ -34,7 +34,7 @@ def measure(work: Workload) -> Table:
     rows = _inputs(work)
     rows_as_theirs = rows.astype(np.float64)
     machine[-1].decision_function_shape = "ovo"
-    none = rows[:0], np.empty(0, np.intp)
+    none = rows[:0], np.empty(0, np.intp), ROOM.steps
     learned = LearnedSvm(machine, *none)
     decision = learned.decide(rows, len(work.model.classes))
     machine[-1].decision_function_shape = "ovr"
