@@ -1,7 +1,8 @@
-"""Logs written from arrays are, byte for byte, what the writer of mcap makes of single messages."""
+"""Logs written from arrays are what the writer of mcap makes of single messages: the same bytes."""
 
 from io import BytesIO
 from operator import itemgetter
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.mcap import stored_chunk
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -55,6 +57,12 @@ BATCHES = st.lists(
 @settings(deadline=None)
 @given(BATCHES, st.sampled_from([100, 1000, 5000, 1 << 20]), st.lists(st.booleans(), min_size=6))
 def test_blocks_make_the_same_file_as_single_messages(batches, chunk_size, flushed):
+    level_of_mcap = patch.object(stored_chunk, "_LEVEL", 3)
+    with level_of_mcap, patch.object(stored_chunk, "_LOCAL", stored_chunk._Local()):
+        check_files(batches, chunk_size, flushed)
+
+
+def check_files(batches, chunk_size, flushed):
     one, many, single = BytesIO(), BytesIO(), BytesIO()
     theirs = begun(Writer(one, chunk_size=chunk_size))
     ours = begun(ChunkWriter(many, chunk_size))

@@ -46,11 +46,14 @@ class StoredChunk(NamedTuple):
         return decompress(head, self.data)
 
 
+_LEVEL = 1  # of zstd: the usual 3 takes half as long again and saves 0.5 % of a log
+
+
 class _Local(threading.local):
     """Compressors are dear to make and must not be shared between threads."""
 
     def __init__(self) -> None:
-        self.zstd = zstandard.ZstdCompressor()
+        self.zstd = zstandard.ZstdCompressor(_LEVEL)
 
 
 _LOCAL = _Local()
