@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 from mcap.records import Channel, Schema
@@ -97,6 +97,17 @@ class Contents:
         for columns in _decoded(batch, readable or is_readable):
             self._add(columns)
 
+    def differing(self, other: "Contents") -> list[str]:
+        """Name what is counted otherwise elsewhere; the order of gaps makes no difference.
+
+        Parameters
+        ----------
+        other : Contents
+        """
+        mine, theirs = (replace(each, gaps=sorted(each.gaps)) for each in (self, other))
+        names = [each.name for each in fields(Contents)]
+        return [name for name in names if getattr(mine, name) != getattr(theirs, name)]
+
     def _add_topic(self, raw: RawMessages) -> None:
         size, start, end = int(raw.sizes.sum()), int(raw.log_times[0]), int(raw.log_times[-1])
         before = self.topics.get(raw.channel.topic, TopicContents(0, 0, start, end))
@@ -115,8 +126,8 @@ class Contents:
             self._add_segments(microphone, columns)
         elif columns.type == message_types.GAP:
             starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
-            fields = starts, seconds, columns["reason"], columns["frames_lost"]
-            rows = zip(*(column.tolist() for column in fields), strict=True)
+            parts = starts, seconds, columns["reason"], columns["frames_lost"]
+            rows = zip(*(part.tolist() for part in parts), strict=True)
             self.gaps += [Gap(microphone, *row) for row in rows]
         elif columns.type == message_types.STREAM_INFO:
             for row in zip(*(columns[path].tolist() for path in STREAM.values()), strict=True):
@@ -158,7 +169,7 @@ def is_review(microphone: str) -> bool:
 
 
 def is_readable(
-    channel: Channel, schema: Schema | None, type_: str, fields: Collection[str]
+    channel: Channel, schema: Schema | None, type_: str, paths: Collection[str]
 ) -> bool:
     """Tell whether a channel has messages of a type, from which some fields can be read.
 
@@ -169,12 +180,12 @@ def is_readable(
         Of the channel; None if it has none.
     type_ : str
         Name of a message type, such as those in `message_types`.
-    fields : collection of str
-        Paths of the fields that the reader needs.
+    paths : collection of str
+        Of the fields that the reader needs.
     """
     if schema is None or schema.name != type_ or channel.message_encoding != "cdr":
         return False
-    return not missing_fields(type_, schema.encoding, schema.data, frozenset(fields))
+    return not missing_fields(type_, schema.encoding, schema.data, frozenset(paths))
 
 
 def has_contents(
@@ -194,9 +205,9 @@ def has_contents(
 
 
 def _decoded(batch: Sequence[RawMessages], readable: IsReadable) -> Iterator[Columns]:
-    for type_, fields in FIELDS.items():
-        same = [raw for raw in batch if readable(raw.channel, raw.schema, type_, fields)]
-        yield from decode(same, fields)
+    for type_, paths in FIELDS.items():
+        same = [raw for raw in batch if readable(raw.channel, raw.schema, type_, paths)]
+        yield from decode(same, paths)
 
 
 def _counter(counters: dict[str, Counter[str]], name: str) -> Counter[str]:

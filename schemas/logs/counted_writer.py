@@ -20,8 +20,8 @@ from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 class CountedWriter(ChunkWriter):
     """A `ChunkWriter` whose last metadata record is `hearthlog_contents`.
 
-    The record is left out where there would be nothing to say, where it would be large, and where
-    a message cannot be read.
+    The record is left out where there would be nothing to say, where it or a chunk would be large,
+    and where a message cannot be read.
 
     Parameters
     ----------
@@ -67,23 +67,27 @@ class CountedWriter(ChunkWriter):
         self._size += chunk.size + length
         if self._size // BATCH_SIZE != batch:
             self._count_waiting()
+        if chunk.size > BATCH_SIZE:
+            self._give_up()  # no recorder's, and too large to be kept
         if self._contents is not None:
             self._waiting.append(chunk)
-        if chunk.size > BATCH_SIZE:  # which is not kept until the next one comes
-            self._count_waiting()
         return length
 
     def _count_waiting(self) -> None:
-        chunks, self._waiting = self._waiting, []
-        if self._contents is None or not chunks:
+        if self._contents is None or not self._waiting:
             return
         try:
-            self._contents.add(_messages(chunks, *self._definitions()))
+            self._contents.add(_messages(self._waiting, *self._definitions()))
         except LogError:
-            self._contents = None
+            self._give_up()
         else:
+            self._waiting = []
             if as_metadata(self._contents) is None:
-                self._contents = None
+                self._give_up()
+
+    def _give_up(self) -> None:
+        self._contents = None
+        self._waiting = []
 
     def _definitions(self) -> tuple[dict[int, Channel], dict[int, Schema]]:
         if self._copied is not None:

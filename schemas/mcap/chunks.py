@@ -265,8 +265,11 @@ class _Batch(NamedTuple):
             identity: [self._entries(parts[parts[:, 1] == identity])]
             for identity in identities[np.argsort(firsts)].tolist()
         }
-        unknown = not entries_of.keys() <= self.file.channels.keys()
-        for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
+        channels = self.file.channels.keys()
+        known = entries_of.keys() <= channels
+        for number in np.flatnonzero(without).tolist() if known else range(len(self.chunks)):
+            if not without[number] and entries_of.keys() <= channels:
+                continue  # those before it define all
             made = self.index_records(number)
             for identity, entries in made.items() if without[number] else ():
                 of_chunk = np.full(len(entries), number)
