@@ -2,7 +2,10 @@
 
 import hashlib
 import json
+import math
 from dataclasses import replace
+from io import BytesIO
+from itertools import chain
 from threading import Event
 
 import pytest
@@ -28,6 +31,7 @@ from hearthlog.schemas.logs.contents_record import (
     stated_contents,
 )
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.logs.log_stream import LogStreamWriter
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -105,6 +109,9 @@ def test_what_is_made_of_logs_says_what_its_messages_say(logs, hearthlog, tmp_pa
     thin_log(logs[0], made[3], 2)
     for path in made:
         check(path)
+        with LogFile(path) as file:
+            records = [file.record(place) for place in file.record_locations]
+        assert sum(getattr(record, "name", "") == METADATA for record in records) == 1
     assert len(stated(made[0]).gaps) == 2
     assert "/hall/features" not in stated(made[3]).topics
 
@@ -132,7 +139,7 @@ def test_a_summary_of_finished_logs_reads_no_messages(logs, monkeypatch, tmp_pat
     assert same(replace(summary, **ours), replace(expected, **ours))
 
 
-@pytest.mark.parametrize("name", [b"topics", b"version", b"sha256"])
+@pytest.mark.parametrize("name", [b"version", b"sha256", b"silence"])
 def test_a_damaged_record_is_not_believed(logs, tmp_path, name):
     path, data = tmp_path / logs[0].name, logs[0].read_bytes()
     start = data.rindex(METADATA.encode(), 0, data.rindex(b"topics"))
@@ -155,35 +162,56 @@ def test_a_record_of_a_later_version_is_not_read(logs, tmp_path):
     assert stated(with_record(logs[0], tmp_path / logs[0].name, record)) is None
 
 
-VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text(max_size=3)
-    | st.just(10**400),
-    lambda inner: (
-        st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
-    ),
-    max_leaves=8,
-)
+@pytest.fixture(scope="module")
+def values(logs):
+    """What a record says, with something in every place."""
+    found = json.loads(as_metadata(stated(logs[0]))["contents"])
+    assert all(found.values())
+    return found
 
 
-@settings(max_examples=300, deadline=None)
+ODD = (None, True, -1, 1.5, 10**400, 2**63, float("nan"), float("inf"), "a", [], {}, [1], {"a": 1})
+
+
+@settings(max_examples=500, deadline=None)
 @given(st.data())
-def test_whatever_a_record_holds_it_is_counts_and_names_or_nothing(data):
-    fields = ("topics", "frames", "segments", "seconds", "unsure", "gaps", "streams", "health")
-    values = {name: {} for name in fields[:5]} | {"gaps": [], "streams": [], "health": None}
-    for name in data.draw(st.lists(st.sampled_from(fields), max_size=3)):
-        values[name] = data.draw(VALUES)
-    contents = from_metadata(record_of(json.dumps(values)))
+def test_whatever_a_record_holds_it_is_counts_and_names_or_nothing(values, data):
+    changed = json.loads(json.dumps(values))
+    place, path = changed, []
+    while isinstance(place, dict | list) and place:
+        keys = sorted(place) if isinstance(place, dict) else range(len(place))
+        path.append((place, data.draw(st.sampled_from(keys))))
+        place = path[-1][0][path[-1][1]]
+    parent, key = data.draw(st.sampled_from(path))
+    parent[key] = data.draw(st.sampled_from(ODD))
+    contents = from_metadata(record_of(json.dumps(changed)))
     if contents is not None:
-        text = as_metadata(contents)
-        assert text is not None
-        assert from_metadata(text) == contents
-        assert all(isinstance(name, str) for name in contents.topics)
-        assert all(abs(n) < 2**63 for row in contents.topics.values() for n in row)
-        assert all(type(n) is int for row in contents.frames.values() for n in row.values())
+        assert from_metadata(as_metadata(contents)) == contents
+        assert all(type(n) is int and -(2**63) <= n < 2**63 for n in counts(contents))
+        assert all(math.isfinite(n) and abs(n) < 2**63 for n in amounts(contents))
+        assert all(isinstance(text, str) for text in texts(contents))
+
+
+def counts(contents):
+    for rows in (contents.frames, contents.segments):
+        yield from chain.from_iterable(row.values() for row in rows.values())
+    yield from chain.from_iterable(contents.topics.values())
+    yield from chain.from_iterable((gap.start, gap.frames_lost) for gap in contents.gaps)
+    yield from () if contents.health is None else contents.health[1:3]
+
+
+def amounts(contents):
+    for rows in (contents.seconds, contents.unsure):
+        yield from chain.from_iterable(row.values() for row in rows.values())
+    yield from (gap.seconds for gap in contents.gaps)
+    yield from (stream["frame_seconds"] for stream in contents.streams)
+
+
+def texts(contents):
+    yield from chain.from_iterable((gap.microphone, gap.reason) for gap in contents.gaps)
+    for stream in contents.streams:
+        yield from (value for name, value in stream.items() if name != "frame_seconds")
+    yield from () if contents.health is None else contents.health[::3]
 
 
 def record_of(text):
@@ -229,3 +257,13 @@ def test_the_doctor_finds_a_record_that_says_otherwise(logs, tmp_path):
     assert summarise([lying]).label_seconds != summarise([logs[0]]).label_seconds
     other = with_record(logs[0], tmp_path / "c.mcap", as_metadata(stated(logs[1])))
     assert "contents" in rules(other)
+
+
+def test_a_long_log_is_counted_without_being_kept(monkeypatch):
+    batches = []
+    monkeypatch.setattr(Contents, "add", lambda _, batch: batches.append(len(batch[0].buffer)))
+    writer = LogStreamWriter(BytesIO(), [Topic("/mic/audio", message_types.RAW_AUDIO)])
+    for number in range(1000):
+        writer.write("/mic/audio", START + number, bytes(20_000))
+    writer.finish("long.mcap")
+    assert max(batches) < 5 << 20 < 19 << 20 < sum(batches)
