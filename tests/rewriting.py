@@ -58,11 +58,11 @@ class Log:
     """The data section of a log: records, chunks as lists of records.
 
     What refers to other parts of the file (chunks, indexes, statistics, the counts of rosbag2) is
-    made anew when it is written; what the log says of its messages is left out, for they change. A
-    log without an end is written without one.
+    made anew when it is written. What the log says of its messages is left out, for they change,
+    unless `contents` is true. A log without an end is written without one.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, contents: bool = False) -> None:
         self.items: list = []
         self._finished = False
         with path.open("rb") as stream, suppress(EndOfFile):
@@ -72,7 +72,9 @@ class Log:
                 elif isinstance(record, DataEnd):
                     self._finished = True
                     break
-                elif not isinstance(record, MessageIndex) and not _is_contents(record):
+                elif not isinstance(record, MessageIndex) and (
+                    contents or not _is_contents(record)
+                ):
                     self.items.append(record)
         self._counted = self._count()
 
