@@ -1,15 +1,17 @@
 """The classes of sound: one table of their names, colours and durations."""
 
-import re
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
-SILENCE, SPEECH, MUSIC, PHONE_RING = "silence", "speech", "music", "phone_ring"
+from hearthlog.schemas.messages import labels
+from hearthlog.schemas.messages.labels import spelt
+
+SILENCE, SPEECH, MUSIC, PHONE_RING = labels.SILENCE, "speech", "music", "phone_ring"
 COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing"
 FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
 OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no scenario that is built in
-OTHER, UNKNOWN = "other", "unknown"  # for models and people; no training sound has these labels
+OTHER, UNKNOWN = "other", labels.UNKNOWN  # for models and people; never learned
 
 
 class SoundClass(NamedTuple):
@@ -89,7 +91,7 @@ def find_class(label: str) -> SoundClass | None:
     SoundClass or None
         None if the class is not in the table.
     """
-    return _BY_NAME.get(_spelt(label))
+    return _BY_NAME.get(spelt(label))
 
 
 def in_words(label: str) -> str:
@@ -137,7 +139,7 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
         return [label]
     row = find_class(label)
     same = [name for name in names if row is not None and find_class(name) == row]
-    return [name for name in same if _spelt(name) == _spelt(label)] or same
+    return [name for name in same if spelt(name) == spelt(label)] or same
 
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
@@ -157,7 +159,3 @@ def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]
     """
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}
-
-
-def _spelt(label: str) -> str:
-    return re.sub("[ ,-]+", "_", label.lower())

@@ -14,7 +14,6 @@ from logreader import LogMessage
 from mcap.records import Channel, Message, Metadata, Schema
 from rewriting import Log
 
-from hearthlog.analyzer.logs import typed_columns as known
 from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import SUFFIX, is_layer
 from hearthlog.schemas.logs.provenance import METADATA
@@ -98,7 +97,7 @@ def _forget() -> None:
         message_types.type_hash,
         type_definitions.message_type,
         schema_fields.fields_of,
-        known._lacking,
+        schema_fields.missing_fields,
     ):
         remembered.cache_clear()
 

@@ -32,6 +32,7 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.contents_record import METADATA as CONTENTS
 from hearthlog.schemas.mcap.formats import MAGIC
 from hearthlog.schemas.messages.message_types import decode, encode
 
@@ -57,10 +58,11 @@ class Log:
     """The data section of a log: records, chunks as lists of records.
 
     What refers to other parts of the file (chunks, indexes, statistics, the counts of rosbag2) is
-    made anew when it is written. A log without an end is written without one.
+    made anew when it is written. What the log says of its messages is left out, for they change,
+    unless `contents` is true. A log without an end is written without one.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, contents: bool = False) -> None:
         self.items: list = []
         self._finished = False
         with path.open("rb") as stream, suppress(EndOfFile):
@@ -70,7 +72,9 @@ class Log:
                 elif isinstance(record, DataEnd):
                     self._finished = True
                     break
-                elif not isinstance(record, MessageIndex):
+                elif not isinstance(record, MessageIndex) and (
+                    contents or not _is_contents(record)
+                ):
                     self.items.append(record)
         self._counted = self._count()
 
@@ -305,3 +309,7 @@ def split(data: bytes) -> list[Raw]:
 def parsed(raw: Raw, kind):
     """Parse a record."""
     return kind.read(ReadDataStream(BytesIO(raw.content)))
+
+
+def _is_contents(record) -> bool:
+    return isinstance(record, Metadata) and record.name == CONTENTS

@@ -28,11 +28,13 @@ from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning, LogError
+from hearthlog.schemas.logs import merged_reading
 from hearthlog.schemas.logs.columns import iterate_columns, read_columns
 from hearthlog.schemas.logs.files import active_path
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.mcap import chunks as chunk_reading
+from hearthlog.schemas.mcap import logfile
 from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD
@@ -42,6 +44,7 @@ from hearthlog.schemas.mcap.records import read_footer
 from hearthlog.schemas.mcap.statistics import time_span
 from hearthlog.schemas.mcap.stored_chunk import StoredChunk
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.gaps import encode_gap
 from hearthlog.schemas.messages.message_types import definition, encode, header, message, typestore
 from hearthlog.schemas.messages.topics import Topic
 from hearthlog.schemas.times import NANOSECONDS
@@ -233,6 +236,86 @@ def test_a_log_that_is_being_written_is_read_up_to_its_last_flush(tmp_path):
         assert columns["frame"].tolist() == list(range(block * 5 + 5))
     columns = read_columns([writer.finish()])["/mic/features"]
     assert columns["frame"].tolist() == list(range(15))
+
+
+def begun(path, first, chunks):
+    """Begin a log of a frame a second, each in a chunk of its own."""
+    writer = LogWriter(path, [Topic("/mic/gap", message_types.GAP)], {})
+    go_on(writer, first, chunks)
+    return writer
+
+
+def go_on(writer, first, chunks):
+    for second in range(first, first + chunks):
+        gap = encode_gap("mic", second * SECOND, second * SECOND, "overrun", second)
+        writer.write("/mic/gap", second * SECOND, gap)
+        writer.flush()
+
+
+def test_an_unfinished_log_is_walked_through_once_and_its_definitions_are_sought_once(
+    tmp_path, monkeypatch
+):
+    walked, searched = [], []
+    walk, search = logfile.walk_records, chunk_reading._index_records
+    monkeypatch.setattr(
+        logfile,
+        "walk_records",
+        lambda *a: (walked.append(record[0]) or record for record in walk(*a)),
+    )
+    monkeypatch.setattr(
+        chunk_reading, "_index_records", lambda *a: searched.append(a) or search(*a)
+    )
+    writer = begun(tmp_path / "home.mcap", 0, 50)
+    columns = read_columns([writer.active_path], ["/mic/gap"])["/mic/gap"]
+    writer.abandon()
+    assert columns["frames_lost"].tolist() == list(range(50))
+    assert walked.count(Opcode.CHUNK) == 50
+    assert len(searched) <= 2  # the first chunk, and the last, whose index may not be whole
+
+
+def test_what_is_written_between_the_search_for_spans_and_the_reading_is_read(
+    tmp_path, monkeypatch
+):
+    writer = begun(tmp_path / "home.mcap", 0, 3)
+    search = merged_reading.time_spans
+
+    def search_and_write(*arguments):
+        spans = search(*arguments)
+        go_on(writer, 3, 2)
+        return spans
+
+    monkeypatch.setattr(merged_reading, "time_spans", search_and_write)
+    columns = read_columns([writer.active_path])["/mic/gap"]
+    writer.abandon()
+    assert columns["frames_lost"].tolist() == list(range(5))
+
+
+def test_of_many_unfinished_logs_few_stay_open_and_none_in_the_end(tmp_path, monkeypatch):
+    writers = [begun(tmp_path / f"{n}.mcap", 10 * n, 3) for n in range(40)]
+    for writer in writers:
+        writer.abandon()
+    logs = [writer.active_path for writer in writers]
+    before, opened = open_files(), []
+    search = merged_reading.time_spans
+
+    def search_and_count(*arguments):
+        spans = search(*arguments)
+        opened.append(open_files() - before)
+        return spans
+
+    monkeypatch.setattr(merged_reading, "time_spans", search_and_count)
+    columns = read_columns(logs)["/mic/gap"]
+    expected = [10 * n + second for n in range(40) for second in range(3)]
+    assert columns["frames_lost"].tolist() == expected
+    assert len(read_columns(logs, start=390 * SECOND)["/mic/gap"]) == 3
+    with pytest.raises(LogError):
+        read_columns([*logs, tmp_path / "none.mcap"])
+    assert max(opened) <= 8
+    assert open_files() == before
+
+
+def open_files():
+    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def test_a_log_that_is_finished_after_its_name_was_found_is_read(tmp_path):

@@ -101,7 +101,8 @@ def test_what_the_recorder_said_of_itself_is_said_once(hearthlog, tmp_path):
     assert "the microphone clips: turn its volume down [health]" in str(findings.shown[0])
 
 
-def test_a_log_that_was_put_together_again_is_the_same(recorded, log, tmp_path):
+def test_a_log_that_was_put_together_again_is_the_same(recorded, tmp_path):
+    log = Log(recorded, contents=True)
     assert log.write(tmp_path / NAME).stat().st_size == recorded.stat().st_size
     assert found(tmp_path / NAME) == {("warning", GAP)}
 

@@ -115,8 +115,8 @@ def cut(path, folder):
 
 
 def damaged(path, folder):
-    """Copy a log with a few bytes overwritten in the middle, in a chunk's records."""
-    data = bytearray(path.read_bytes())
+    """Copy a log with a few bytes overwritten in the middle, and one of what it says of itself."""
+    data = bytearray(path.read_bytes().replace(b'"topics"', b'"Topics"'))
     middle = len(data) // 2
     data[middle : middle + 3000] = bytes(3000)
     copy = folder / path.name

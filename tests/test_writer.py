@@ -162,10 +162,11 @@ def label(time, frame, name, values):
 
 
 def content(path):
-    """Return all bytes up to the last metadata record, which has the name of the file in it."""
+    """Return all bytes before the index but the `rosbag2` record, which has the file's name."""
     with LogFile(path) as file:
-        last = max(place.offset for place in file.record_locations)
-        return file.read(0, last)
+        bag, contents = file.record_locations[-2:]
+        rest = bag.offset + bag.length
+        return file.read(0, bag.offset) + file.read(rest, contents.offset + contents.length - rest)
 
 
 @pytest.mark.parametrize("source", ["simulated home", "real household"])

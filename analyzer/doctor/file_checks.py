@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.findings import DISTRUST, RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.mcap.byte_source import ByteSource
 from hearthlog.analyzer.doctor.mcap.checked_definitions import ROS_ENCODINGS
@@ -22,9 +22,13 @@ from hearthlog.analyzer.doctor.metadata_checks import ATTACHMENTS, MetadataCheck
 from hearthlog.analyzer.doctor.topic_types import ALWAYS, LOG_NAME, split_topic
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import decode
+from hearthlog.schemas.logs.contents import Contents
+from hearthlog.schemas.logs.contents_record import METADATA as CONTENTS
+from hearthlog.schemas.logs.contents_record import stated_contents
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.provenance import METADATA, provenance_records, unknown_version
 from hearthlog.schemas.logs.rosbag2 import METADATA as ROSBAG2
+from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.formats import FOOTER_SIZE, HEAD, MAGIC
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.records import read_footer
@@ -32,7 +36,7 @@ from hearthlog.schemas.progress import Progress, ignore_progress
 
 LIBRARY = "hearthlog"
 _LAYER = re.compile(r".+_\d{8}T\d{6}Z\.[^.]+\.mcap(\.active)?")
-_KEPT = {METADATA, ROSBAG2, *ATTACHMENTS}
+_KEPT = {METADATA, ROSBAG2, CONTENTS, *ATTACHMENTS}
 
 
 @dataclass
@@ -104,6 +108,8 @@ def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> 
         MetadataChecks(data, checks, findings, finished=complete, whole=whole).check()
         examined.ours, examined.frames = True, checks.frames
         examined.node = data.metadata.get(METADATA, [{}])[0].get("node", "")
+    if CONTENTS in data.metadata and complete and data.whole and not walk.damaged:
+        _check_contents(findings)
     examined.span = data.span
 
 
@@ -194,6 +200,23 @@ def _check_end(source: ByteSource, findings: Findings) -> None:
     elif rest > len(MAGIC):
         what = f"{rest - len(MAGIC)} bytes follow the end"
         findings.error("after-end", what, REINDEX, offset=offset + len(MAGIC))
+
+
+def _check_contents(findings: Findings) -> None:
+    """Compare what the file says of its messages with what they say."""
+    try:
+        with LogFile(findings.path) as file:
+            stated, actual = stated_contents(file), Contents()
+            for batch in read_in_batches(file, file.chunks):
+                actual.add(batch)
+    except LogError:
+        return  # is reported already
+    if stated is None:
+        what = f"metadata {CONTENTS} is damaged, or of other messages"
+        findings.warning("contents", what, "it is not read: the messages tell what is in the file")
+    elif differing := stated.differing(actual):
+        what = f"metadata {CONTENTS} says otherwise than the messages: {', '.join(differing)}"
+        findings.error("contents", what, DISTRUST)
 
 
 def _report_unfinished(findings: Findings, *, active: bool) -> None:

@@ -19,9 +19,9 @@ from hearthlog.analyzer.export.repeats import without_repeats
 from hearthlog.analyzer.logs.selection import Described, Selection, identity
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs import rosbag2
+from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -142,7 +142,7 @@ class _Log:
     """The log being written."""
 
     def __init__(self, stream: BinaryIO, selection: Selection) -> None:
-        self._writer = ChunkWriter(stream)
+        self._writer = CountedWriter(stream)
         self._schemas: dict[Hashable, int] = {}
         self._channels: dict[Hashable, int] = {}
         self._described: dict[int, Described] = {}

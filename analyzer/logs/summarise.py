@@ -8,39 +8,20 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.health import statuses_of
-from hearthlog.analyzer.logs.summary import GapSummary, Summary, TopicSummary, worse
-from hearthlog.analyzer.logs.typed_columns import decode_types, is_compatible
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.analyzer.logs.health import Status
+from hearthlog.analyzer.logs.summary import GapSummary, Summary, TopicSummary
+from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.contents import Contents, has_contents, is_review
+from hearthlog.schemas.logs.contents_record import stated_contents
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.logs.provenance import read_provenance, version_text
 from hearthlog.schemas.mcap.chunk_table import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.formats import HEAD
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import REVIEW
-from hearthlog.schemas.times import NANOSECONDS
 
-_STREAM = {
-    "microphone": "header.frame_id",
-    "device": "device",
-    "feature_set": "feature_set",
-    "frame_seconds": "frame_seconds",
-    "model": "model",
-    "model_sha256": "model_sha256",
-}
-_FIELDS = {
-    message_types.STREAM_INFO: _STREAM.values(),
-    message_types.LABEL: ("label",),
-    message_types.SEGMENT: ("label", "duration", "confidence"),
-    message_types.GAP: ("header.stamp", "duration", "reason", "frames_lost"),
-    message_types.DIAGNOSTICS: ("status",),
-}
-_UNSURE = 0.5  # of a segment with a lower confidence another label is likelier than its own
 _NAME_LENGTH = struct.Struct("<I")
 _NAME_LIMIT = 1000
 _TIMES = 16  # bytes of an attachment before its name
@@ -71,15 +52,11 @@ def summarise(paths: Iterable[Path]) -> Summary:
 def _summarise(path: Path) -> Summary:
     with LogFile(path) as file:
         summary = _without_messages(file)
-        ours = any(
-            is_compatible(*channel, *fields)
-            for channel in _channels(file)
-            for fields in _FIELDS.items()
-        )
-        if _is_counted(file) and not ours:
+        ours = [has_contents(*channel, is_compatible) for channel in _channels(file)]
+        if _is_counted(file) and not any(ours):
             _count_by_index(file, summary)
         else:
-            _read_through(file, summary)
+            _add_contents(summary, _stated(file, summary) or _read(file, summary))
     return summary
 
 
@@ -141,22 +118,28 @@ def _count_by_index(file: LogFile, summary: Summary) -> None:
             topic.add(count, None, (int(chunks["start"].min()), int(chunks["end"].max())))
 
 
-def _read_through(file: LogFile, summary: Summary) -> None:
+def _stated(file: LogFile, summary: Summary) -> Contents | None:
+    """Read what a finished log says of its messages."""
+    contents = stated_contents(file)
+    if contents is not None:
+        for channel in _channels(file):
+            _topic(summary, *channel)
+    return contents
+
+
+def _read(file: LogFile, summary: Summary) -> Contents:
+    """Read all messages of a log."""
     for channel in _channels(file):
         _topic(summary, *channel)
-    frames: dict[str, Counter[str]] = {}
+    contents = Contents()
     for batch in read_in_batches(file, file.chunks):
         for raw in batch:
-            times = raw.log_times
-            topic = _topic(summary, raw.channel, raw.schema)
-            topic.add(len(raw), int(raw.sizes.sum()), (int(times[0]), int(times[-1])))
-        for columns in decode_types(file.path, batch, _FIELDS):
-            _note(summary, frames, columns)
-    lengths = {stream["microphone"]: stream["frame_seconds"] for stream in summary.streams}
-    for microphone, counts in frames.items():
-        length = lengths.get(microphone.partition("/")[0], FRAME_SECONDS)
-        seconds = {label: round(count * length, 3) for label, count in counts.items()}
-        summary.label_seconds[microphone] = Counter(seconds)
+            _topic(summary, raw.channel, raw.schema)
+        try:
+            contents.add(batch, is_compatible)
+        except LogError as error:
+            raise LogError(f"{file.path}: {error}") from error
+    return contents
 
 
 def _topic(summary: Summary, channel: Channel, schema: Schema | None) -> TopicSummary:
@@ -164,45 +147,20 @@ def _topic(summary: Summary, channel: Channel, schema: Schema | None) -> TopicSu
     return summary.topics.setdefault(channel.topic, new)
 
 
-def _note(summary: Summary, frames: dict[str, Counter[str]], columns: Columns) -> None:
-    microphone = columns.topic.strip("/").rpartition("/")[0]
-    if columns.type == message_types.LABEL:
-        frames.setdefault(microphone, Counter()).update(columns["label"].tolist())
-    elif columns.type == message_types.SEGMENT:
-        summary.segments.setdefault(microphone, Counter()).update(columns["label"].tolist())
-        if microphone.endswith(f"/{REVIEW}"):  # which has no labels frame by frame
-            _note_marks(summary.label_seconds.setdefault(microphone, Counter()), columns)
-        else:
-            _note_segments(summary, microphone, columns)
-    elif columns.type == message_types.GAP:
-        starts, seconds = columns["header.stamp"], columns["duration"] / NANOSECONDS
-        fields = starts, seconds, columns["reason"], columns["frames_lost"]
-        rows = zip(*(column.tolist() for column in fields), strict=True)
-        summary.gaps += [GapSummary(microphone, *row) for row in rows]
-    elif columns.type == message_types.STREAM_INFO:
-        for row in zip(*(columns[path].tolist() for path in _STREAM.values()), strict=True):
-            stream = dict(zip(_STREAM, row, strict=True))
-            if stream not in summary.streams:
-                summary.streams.append(stream)
-    else:
-        for status in statuses_of(columns):
-            summary.health = worse(summary.health, status)
-
-
-def _note_segments(summary: Summary, microphone: str, columns: Columns) -> None:
-    seconds = summary.segment_seconds.setdefault(microphone, Counter())
-    unsure = summary.unsure.setdefault(microphone, Counter())
-    durations = (columns["duration"] / NANOSECONDS).tolist()
-    doubtful = (columns["confidence"] < _UNSURE).tolist()
-    for label, duration, doubted in zip(
-        columns["label"].tolist(), durations, doubtful, strict=True
-    ):
-        seconds[label] += duration
-        if doubted and class_name(label) not in {SILENCE, UNKNOWN}:
-            unsure.update({"segments": 1, "seconds": duration})
-
-
-def _note_marks(seconds: Counter[str], columns: Columns) -> None:
-    durations = (columns["duration"] / NANOSECONDS).tolist()
-    for label, duration in zip(columns["label"].tolist(), durations, strict=True):
-        seconds[label] += duration
+def _add_contents(summary: Summary, contents: Contents) -> None:
+    for name, counted in contents.topics.items():
+        span = counted.start, counted.end
+        summary.topics[name].add(counted.messages, counted.bytes, span)
+    summary.segments = contents.segments
+    summary.unsure = contents.unsure
+    for microphone, seconds in contents.seconds.items():
+        of_review = is_review(microphone)  # which has no labels frame by frame
+        (summary.label_seconds if of_review else summary.segment_seconds)[microphone] = seconds
+    lengths = {stream["microphone"]: stream["frame_seconds"] for stream in contents.streams}
+    for microphone, counts in contents.frames.items():
+        length = lengths.get(microphone.partition("/")[0], FRAME_SECONDS)
+        frames = {label: round(count * length, 3) for label, count in counts.items()}
+        summary.label_seconds[microphone] = Counter(frames)
+    summary.gaps = [GapSummary(*gap) for gap in contents.gaps]
+    summary.streams = contents.streams
+    summary.health = None if contents.health is None else Status(*contents.health)

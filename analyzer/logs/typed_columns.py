@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.log_stream import ENCODING
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.messages.fields import Field, fields_of, lacking
+from hearthlog.schemas.messages.fields import Field, fields_of, missing_fields
 from hearthlog.schemas.messages.type_definitions import message_type
 
 
@@ -116,17 +115,8 @@ def is_compatible(
     """
     if schema is None or schema.name != type_ or channel.message_encoding != ENCODING:
         return False
-    missing = _lacking(type_, schema.encoding, schema.data, frozenset(fields))
+    missing = missing_fields(type_, schema.encoding, schema.data, frozenset(fields))
     if missing:
         text = f"{type_} is defined without {missing} as hearthlog has it: not read"
         warnings.warn(HearthlogWarning(text, channel.topic), stacklevel=2)
     return not missing
-
-
-@lru_cache
-def _lacking(type_: str, encoding: str, text: bytes, fields: frozenset[str]) -> str:
-    """Say which fields cannot be read; empty if all can."""
-    try:
-        return ", ".join(lacking(message_type(type_, encoding, text), fields))
-    except LogError:
-        return "any field"

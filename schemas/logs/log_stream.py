@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs import rosbag2
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
+from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.mcap.message_blocks import Block, message_blocks
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages.cdr_codec import Column, encode_groups
@@ -61,7 +61,7 @@ class LogStreamWriter:
         self._channels: dict[str, int] = {}
         self._counts: dict[str, rosbag2.TopicCount] = {}
         self._span: tuple[int, int] | None = None
-        self._writer = ChunkWriter(stream)
+        self._writer = CountedWriter(stream)
         self._writer.start(profile=PROFILE, library="hearthlog")
         schemas: dict[str, int] = {}
         for topic in topics:

@@ -16,12 +16,14 @@ from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
-from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.mcap.statistics import stated_span, time_span
 from hearthlog.schemas.storage.byte_ranges import map_logs
 from hearthlog.schemas.storage.prefetch import prefetch
 
 _BATCH = 5 << 20  # bytes, stored and decompressed together, that are read at once
 _READERS = 2  # threads: more than these wait for each other's Python
+_WALKED = 4  # unfinished logs that stay open from the search for their spans on
+_WALKED_ROWS = 1 << 18  # of all their tables: about 20 MB
 _FIRST, _LAST = 0, (1 << 63) - 1  # log times
 
 
@@ -75,8 +77,8 @@ def time_spans(
 class _Log:
     """A log that is open, and its chunks that a query asks for, by their start times."""
 
-    def __init__(self, path: Path, query: "_Query") -> None:
-        self.file = LogFile(path)
+    def __init__(self, file: LogFile, query: "_Query") -> None:
+        self.file = file
         self.chunks = query.chunks(self.file)
         sizes = self.chunks["size"] + self.chunks["length"]
         self._ends = np.cumsum(np.clip(sizes, 0, LIMIT))
@@ -251,21 +253,27 @@ class _Queue:
 
     def __init__(self, logs: Iterable[Path], query: _Query) -> None:
         self._query = query
-        self._closed = [
-            (first, path)
-            for first, last, path in reversed(time_spans(logs))
-            if last >= query.start and first < query.end
-        ]
         self._open: list[_Log] = []
         self._finished: list[LogFile] = []
         self._files: set[LogFile] = set()
-        self._open_next()
+        self._walked = _WalkedLogs()
+        try:
+            self._closed = [
+                (first, path)
+                for first, last, path in reversed(time_spans(logs, self._walked.span))
+                if last >= query.start and first < query.end
+            ]
+            self._open_next()
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close(self._files)
+        self._walked.close()
 
     @property
     def start(self) -> int:
@@ -300,9 +308,50 @@ class _Queue:
         self._finished += [log.file for log in self._open if log.start == _LAST]
         self._open = [log for log in self._open if log.start < _LAST]
         while self._closed and (not self._open or self._closed[-1][0] <= self.start):
-            log = _Log(self._closed.pop()[1], self._query)
-            self._files.add(log.file)
+            file = self._walked.open(self._closed.pop()[1])
+            self._files.add(file)
+            log = _Log(file, self._query)
             if log.start == _LAST:
                 self._finished.append(log.file)
             else:
                 self._open.append(log)
+
+
+class _WalkedLogs:
+    """A few unfinished logs that were walked through for their spans, so that once is enough."""
+
+    def __init__(self) -> None:
+        self._logs: dict[Path, LogFile] = {}
+        self._rows = 0
+
+    def span(self, path: Path) -> tuple[int, int] | None:
+        """Find the first and the last log time of a log, as `time_span` does."""
+        stated = stated_span(path)
+        if stated is not None:
+            return stated[0]
+        log = LogFile(path)
+        rows = len(log.chunks) + sum(map(len, log.channel_sets))
+        is_full = len(self._logs) == _WALKED or self._rows + rows > _WALKED_ROWS
+        if log.complete or is_full or path in self._logs:
+            log.close()
+        else:
+            self._logs[path] = log
+            self._rows += rows
+        return log.span
+
+    def open(self, path: Path) -> LogFile:
+        """Open a log, with what was written to it since it was walked through."""
+        log = self._logs.pop(path, None)
+        if log is None:
+            return LogFile(path)
+        try:
+            log.scan_new()
+        except BaseException:
+            log.close()
+            raise
+        return log
+
+    def close(self) -> None:
+        """Close the logs that were not asked for."""
+        for log in self._logs.values():
+            log.close()

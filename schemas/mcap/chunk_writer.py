@@ -288,8 +288,8 @@ class ChunkWriter:
             schema_count=len(self._schemas),
         )
 
-    def _put(self, chunk: StoredChunk) -> None:
-        """Write a chunk and its message index."""
+    def _put(self, chunk: StoredChunk) -> int:
+        """Write a chunk and its message index; return the bytes of the first."""
         text = len(chunk.compression)
         head = formats.CHUNK.pack(chunk.start, chunk.end, chunk.size, chunk.crc, text)
         head += chunk.compression + formats.UINT64.pack(len(chunk.data))
@@ -320,6 +320,7 @@ class ChunkWriter:
         self._chunk_count += 1
         start, end = self._file_span
         self._file_span = min(start, chunk.start), max(end, chunk.end)
+        return first - offset
 
     def _append(self, messages: MessageRecords) -> None:
         """Cut message records into chunks."""

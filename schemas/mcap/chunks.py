@@ -25,7 +25,7 @@ from hearthlog.schemas.mcap.records import LIMIT, ChunkHead, chunk_head, decompr
 _WRONG_INDEX = "the index of a chunk does not belong to it"
 _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
-_BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
+BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
 Entries = tuple[Int64, NDArray[np.void]]  # which chunk, and the entry of its index, in each row
 
@@ -96,7 +96,7 @@ def read_in_batches(
         If the log cannot be read, a chunk is damaged, its index does not belong to it, or a message
         is of a channel that no sound chunk defines.
     """
-    batches = np.cumsum(chunks["size"] + chunks["length"]) // _BATCH_SIZE
+    batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
         yield read_chunks(file, batch, topics)
 
@@ -265,8 +265,11 @@ class _Batch(NamedTuple):
             identity: [self._entries(parts[parts[:, 1] == identity])]
             for identity in identities[np.argsort(firsts)].tolist()
         }
-        unknown = not entries_of.keys() <= self.file.channels.keys()
-        for number in range(len(self.chunks)) if unknown else np.flatnonzero(without).tolist():
+        channels = self.file.channels.keys()
+        known = entries_of.keys() <= channels
+        for number in np.flatnonzero(without).tolist() if known else range(len(self.chunks)):
+            if not without[number] and entries_of.keys() <= channels:
+                continue  # those before it define all
             made = self.index_records(number)
             for identity, entries in made.items() if without[number] else ():
                 of_chunk = np.full(len(entries), number)

@@ -111,6 +111,13 @@ class LogFile:
         """Bytes of the file: one of this machine may grow, one of a store does not."""
         return self._file.size
 
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time of the chunks that were met; None if there are none."""
+        if not len(self.chunks):
+            return None
+        return int(self.chunks["start"].min()), int(self.chunks["end"].max())
+
     def is_at(self, path: Path) -> bool:
         """Tell whether a path leads to this open file, and not to another one or none."""
         return self._file.is_at(path)

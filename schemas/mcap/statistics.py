@@ -39,19 +39,42 @@ def time_span(path: Path) -> tuple[int, int] | None:
     LogError
         If it cannot be read, is no MCAP file, or is damaged.
     """
+    stated = stated_span(path)
+    if stated is not None:
+        return stated[0]
+    with LogFile(path) as log:
+        return log.span
+
+
+def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
+    """Read the first and the last log time of a log from its statistics alone.
+
+    Parameters
+    ----------
+    path : Path
+        On this machine, or a `upath.UPath` of a store.
+
+    Returns
+    -------
+    tuple or None
+        Holds the two log times in nanoseconds of UTC, or None if the log has no messages. None if
+        the log is unfinished or its index is damaged: then only walking through it tells.
+
+    Raises
+    ------
+    LogError
+        If it cannot be read.
+    """
     try:
         _, opened = open_log(path)
         with closing(opened) as file:
             statistics = _statistics(file) if _is_summary_sound(file) else None
     except (McapError, UnicodeDecodeError, struct.error):
-        statistics = None
-    if statistics is not None:
-        times = statistics.message_start_time, statistics.message_end_time
-        return times if statistics.message_count else None
-    with LogFile(path) as log:
-        if not len(log.chunks):
-            return None
-        return int(log.chunks["start"].min()), int(log.chunks["end"].max())
+        return None
+    if statistics is None:
+        return None
+    times = statistics.message_start_time, statistics.message_end_time
+    return (times if statistics.message_count else None,)
 
 
 def topic_counts(path: Path) -> Counter[str]:

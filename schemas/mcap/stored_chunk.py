@@ -29,6 +29,7 @@ class StoredChunk(NamedTuple):
     entries: Mapping[
         int, bytes | bytearray | memoryview
     ]  # the message index, `INDEX_ENTRIES` by channel
+    raw: bytes | bytearray | memoryview | None = None  # records, uncompressed, where they are kept
 
     def times(self, channel: int) -> Int64:
         """Return the log times of a channel's messages, as the message index has them."""
@@ -164,4 +165,4 @@ def compress_chunk(
         Its message index, by channel: rows of dtype `INDEX_ENTRIES`.
     """
     data, crc = _LOCAL.zstd.compress(content), zlib.crc32(content)
-    return StoredChunk(b"zstd", data, len(content), crc, *span, entries)
+    return StoredChunk(b"zstd", data, len(content), crc, *span, entries, content)

@@ -105,6 +105,25 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
     return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))
 
 
+@lru_cache
+def missing_fields(type_: str, encoding: str, text: bytes, paths: frozenset[str]) -> str:
+    """Say which fields of ours cannot be read by a definition; empty if all can.
+
+    Parameters
+    ----------
+    type_, encoding : str
+        Name of the message type, and what its definition is written in.
+    text : bytes
+        The definition.
+    paths : frozenset of str
+        Of fields that this version of the type has.
+    """
+    try:
+        return ", ".join(lacking(message_type(type_, encoding, text), paths))
+    except LogError:
+        return "any field"
+
+
 def _fits(theirs: Field, ours: Field | None) -> bool:
     """Tell whether what is read of one field has all that is read of the other."""
     return (

@@ -8,8 +8,8 @@ from typing import BinaryIO, Protocol
 from mcap.records import Channel, Header, Message
 
 from hearthlog.schemas.logs import provenance, rosbag2
+from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.definitions import Definition
 from hearthlog.schemas.messages.gaps import LOG_DAMAGED, encode_gap
 from hearthlog.schemas.progress import Progress
@@ -92,7 +92,7 @@ class SalvagedCopy:
         self._chunk_span = chunk_span
         self._selection = selection
         self._search = FrameSearch(salvage)
-        self._writer = ChunkWriter(stream)
+        self._writer = CountedWriter(stream, salvage.definitions)
         self._begun = False
         self._counted: dict[str, int] = {}  # messages by topic, as the `rosbag2` record has them
         self._written: set[tuple[type, int]] = set()

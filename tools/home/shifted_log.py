@@ -13,8 +13,8 @@ from rosbags.interfaces import Nodetype
 
 from hearthlog.schemas.arrays import Bytes, Int64, scatter
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.counted_writer import CountedWriter
 from hearthlog.schemas.logs.log_stream import ENCODING, PROFILE
-from hearthlog.schemas.mcap.chunk_writer import ChunkWriter
 from hearthlog.schemas.mcap.formats import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD
 from hearthlog.schemas.mcap.raw_messages import gather_heads
 from hearthlog.schemas.mcap.records import parse
@@ -151,7 +151,7 @@ class ShiftedLog:
         entries["time"] += time
         chunks = self._moved_chunks(buffer, entries.view(np.uint8).data, time)
         with path.open("xb") as stream:
-            writer = ChunkWriter(stream)
+            writer = CountedWriter(stream, self._definitions)
             writer.start(self._profile, self._library)
             defined: set[tuple[type, int]] = set()
             for piece in self._pieces:
@@ -242,7 +242,7 @@ class ShiftedLog:
             yield compress_chunk(content[base : base + stored.size], span, index)
 
     def _define(
-        self, writer: ChunkWriter, piece: WholeChunk, defined: set[tuple[type, int]]
+        self, writer: CountedWriter, piece: WholeChunk, defined: set[tuple[type, int]]
     ) -> None:
         """Write what defines the channels of a chunk before it, unless it stands in it."""
         defined.update((type(record), record.id) for record in piece.definitions[: piece.leading])
@@ -280,7 +280,7 @@ def _spans(nanoseconds: Int64) -> NDArray[Any]:
     return spans
 
 
-def _copy_attachment(writer: ChunkWriter, piece: WholeAttachment, time: int) -> None:
+def _copy_attachment(writer: CountedWriter, piece: WholeAttachment, time: int) -> None:
     record = parse(Opcode.ATTACHMENT, piece.record[HEAD.size :])
     assert isinstance(record, Attachment)
     created, logged = (each + time if each else 0 for each in (record.create_time, record.log_time))
