@@ -184,8 +184,8 @@ def _parsed(data: bytes, *, is_timed: bool) -> SpanIndex:
 
 def _split(paths: bytes, count: int) -> list[str]:
     """Take the names of folders apart."""
-    names = paths.decode(*_CODING).split("\0")[:-1] if paths.count(_END) == count else []
-    if len(set(names)) != count or any(".." in name.split("/") for name in names):
+    names = paths.decode(*_CODING).split("\0")[:-1]
+    if len({*names}) != count or any(".." in name.split("/") for name in names):
         raise ValueError("its parts do not fit")
     return names
 
