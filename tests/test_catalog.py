@@ -399,14 +399,6 @@ def test_logs_outside_of_a_span_are_not_opened_where_a_catalogue_knows_theirs(fl
         select([fleet / "north"], (), None, end - SECOND)  # where there is no catalogue
 
 
-def test_a_selection_asks_the_file_where_the_catalogue_is_out_of_date(fleet):
-    write_catalog(fleet)
-    first, second, *_ = find_logs(fleet / "north")
-    shutil.copyfile(second, first)
-    start, end = time_span(second)
-    assert first in select([fleet], (), start, end).logs
-
-
 def sealed_bytes(table: pa.Table, **options) -> bytes:
     """Make a file that has the digest of a catalogue."""
     buffer = pa.BufferOutputStream()

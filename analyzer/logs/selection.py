@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.log_spans import LogSpan, find_spans
+from hearthlog.analyzer.logs.log_spans import LogSpans, find_spans
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs.log_stream import ENCODING
@@ -43,14 +43,12 @@ class Selection:
     start: int | None  # log times in nanoseconds: from `start` on, before `end`
     end: int | None
     span: tuple[int, int]  # log times of the first and the last message
-    spans: Sequence[LogSpan] = field(compare=False, repr=False)  # of all logs
+    spans: LogSpans = field(compare=False, repr=False)  # of all logs
 
     @property
     def earlier(self) -> Iterator[Path]:
         """The logs with messages before the span, the last first."""
-        start = 0 if self.start is None else self.start
-        spans = [each for each in self.spans if each.first < start]
-        return (each.path for each in sorted(spans, key=_in_time, reverse=True))
+        return self.spans.before(0 if self.start is None else self.start)
 
     def messages(self, progress: Progress = ignore_progress) -> Iterator[list[RawMessages]]:
         """Read the messages of the selection, still encoded, in the order of time.
@@ -212,13 +210,8 @@ def select(
             silent.append(path)
         return span
 
-    spans = find_spans(paths, sound(span_of))
-    within = [
-        each
-        for each in spans
-        if (start is None or each.last >= start) and (end is None or each.first < end)
-    ]
-    chosen = [(each.first, each.last, each.path) for each in sorted(within, key=_in_time)]
+    spans = find_spans(paths, sound(span_of), start, end)
+    chosen = spans.within(start, end)
     read = map_logs(sound(_Content), [path for _, _, path in chosen])
     contents = [content for content in read if content is not None]
     for path, error in damages.items():
@@ -249,11 +242,6 @@ def select(
         ),
         spans=spans,
     )
-
-
-def _in_time(span: LogSpan) -> tuple[int, int, tuple[str, ...]]:
-    # Paths of this machine and of a store do not compare; their parts do.
-    return span.first, span.last, span.path.parts
 
 
 def _warn(path: Path, error: LogError) -> None:

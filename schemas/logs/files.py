@@ -21,6 +21,7 @@ AUDIO_SUFFIX = f".{AUDIO_LAYER}{SUFFIX}"
 _NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER}))?", re.DOTALL)
 _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
 CATALOG = "catalog.parquet"  # of the logs in a folder, in that folder: itself a folder of parts
+CATALOG_INDEX = "catalog.index"  # of their spans of time, beside it
 ENROLLED = "enrolled"  # folder of sounds to learn from, among the logs of a home
 
 
@@ -273,15 +274,49 @@ def walk_logs(folder: Path) -> Iterator["os.DirEntry[str]"]:
     """
     waiting = [os.fspath(folder)]
     while waiting:
-        try:
-            with os.scandir(waiting.pop()) as entries:
-                for entry in entries:
-                    if entry.is_dir(follow_symlinks=False):
-                        waiting.append(entry.path)
-                    elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)) and _may_be_log(entry):
-                        yield entry
-        except OSError:  # as Path.rglob does
-            continue
+        inside = look_into(waiting.pop())
+        waiting += [entry.path for entry in inside.folders]
+        yield from inside.logs
+
+
+class Inside(NamedTuple):
+    """What a folder of this machine has in it.
+
+    Attributes
+    ----------
+    folders, logs : list of os.DirEntry
+        As `walk_logs` finds them.
+    is_all : bool
+        Whether there is more or less only after a change of this folder. What a link leads to may
+        change elsewhere.
+    """
+
+    folders: list["os.DirEntry[str]"]
+    logs: list["os.DirEntry[str]"]
+    is_all: bool
+
+
+def look_into(folder: str) -> Inside:
+    """List the folders and the logs in one folder of this machine.
+
+    Parameters
+    ----------
+    folder : str
+        If it cannot be read, there is nothing in it.
+    """
+    folders: list[os.DirEntry[str]] = []
+    named: list[os.DirEntry[str]] = []
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry)
+                elif entry.name.endswith((SUFFIX, ACTIVE_SUFFIX)):
+                    named.append(entry)
+        is_all = not any(entry.is_symlink() for entry in named)
+    except OSError:  # as Path.rglob does
+        is_all = False
+    return Inside(folders, [entry for entry in named if _may_be_log(entry)], is_all)
 
 
 def _may_be_log(entry: "os.DirEntry[str]") -> bool:

@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 from hearthlog.analyzer.logs.catalog.file import SCHEMA, without_times
 from hearthlog.analyzer.logs.catalog.known_files import KnownFiles
 from hearthlog.analyzer.logs.catalog.parts import read_parts
+from hearthlog.analyzer.logs.span_index import what_is_wrong
 
 LOG = "log"  # the kind of a file that is no layer
 FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"
@@ -131,4 +132,5 @@ def read_catalog(folder: Path) -> Catalog | None:
     if parts is None:
         return None
     table = pa.concat_tables([SCHEMA.empty_table(), *parts.tables.values()])
-    return Catalog(folder, table, parts.unusable)
+    wrong = what_is_wrong(folder)
+    return Catalog(folder, table, parts.unusable if wrong is None else [*parts.unusable, wrong])

@@ -117,20 +117,18 @@ def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
     return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
 
 
-def read_table(stream: BinaryIO, names: Sequence[str] | None = None) -> pa.Table:
+def read_table(stream: BinaryIO) -> pa.Table:
     """Read the table of a part of a catalogue, and check it.
 
     Parameters
     ----------
     stream : binary file
         Is read from where it is, up to 1 GiB.
-    names : sequence of str, optional
-        Columns to read, none of which is a list; all by default.
 
     Returns
     -------
     pa.Table
-        Of `SCHEMA`, with the columns that were asked for.
+        Of `SCHEMA`.
 
     Raises
     ------
@@ -150,17 +148,16 @@ def read_table(stream: BinaryIO, names: Sequence[str] | None = None) -> pa.Table
         raise ValueError("it is of another version of hearthlog")
     room = _ROOM + _GROWTH * len(data)
     _check_size(parquet, room)
-    schema = SCHEMA if names is None else pa.schema(map(SCHEMA.field, names), SCHEMA.metadata)
-    tables = [schema.empty_table()]
+    tables = [SCHEMA.empty_table()]
     with pq.ParquetFile(pa.BufferReader(data), metadata=parquet, read_dictionary=_TEXTS) as file:
-        for batch in file.iter_batches(_BATCH, columns=schema.names):
+        for batch in file.iter_batches(_BATCH):
             room -= _size(batch)
             if room < 0:
                 raise ValueError("it is too large")
-            always = [batch.column(name) for name in schema.names if name in _ALWAYS]
+            always = [batch.column(name) for name in _ALWAYS]
             if any(part.null_count for part in [*always, *_parts(batch)]):
                 raise ValueError("a value is missing")
-            tables.append(pa.Table.from_batches([batch]).select(schema.names).cast(schema))
+            tables.append(pa.Table.from_batches([batch]).select(SCHEMA.names).cast(SCHEMA))
     return pa.concat_tables(tables)
 
 
@@ -196,7 +193,5 @@ def _size(batch: pa.RecordBatch) -> int:
 
 def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
     """Return what is in the lists."""
-    if "labels" not in batch.schema.names:
-        return []
     labels = batch.column("labels").flatten()
     return [labels, *labels.flatten(), batch.column("microphones").flatten()]

@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, Catalog
+from hearthlog.analyzer.logs.catalog.catalog import DAMAGED, FINISHED, Catalog
 from hearthlog.analyzer.logs.catalog.file import SCHEMA
-from hearthlog.analyzer.logs.catalog.listing import ListedLog, list_logs
 from hearthlog.analyzer.logs.catalog.parts import divided, write_parts
 from hearthlog.analyzer.logs.catalog.rows import read_rows
+from hearthlog.analyzer.logs.listing import ListedLog, list_logs
+from hearthlog.analyzer.logs.span_index import NEVER, SPAN, write_index
 from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
 from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.progress import Progress, ignore_progress
 
 _TASK = 100  # files
@@ -52,7 +56,8 @@ def write_catalog(
     KeyboardInterrupt
         If interrupted; the catalogue then has what was read so far.
     """
-    listed = list_logs(folder)
+    listing = list_logs(folder)
+    listed = listing.logs
     kept, new = _divided(listed, before)
     tables = [SCHEMA.empty_table() if before is None else before.table.take(kept)]
     stopped: BaseException | None = None
@@ -65,10 +70,25 @@ def write_catalog(
     parts = dict(divided(pa.concat_tables(tables)))
     old = {} if before is None else dict(divided(before.table))
     write_parts(folder, parts, old)
+    ordered = [parts[name] for name in sorted(parts)]
+    catalog = Catalog(folder, pa.concat_tables([SCHEMA.empty_table(), *ordered]))
+    write_index(folder, listing, _spans(listed, catalog))
     if stopped is not None:
         raise stopped
-    ordered = [parts[name] for name in sorted(parts)]
-    return Catalog(folder, pa.concat_tables([SCHEMA.empty_table(), *ordered]))
+    return catalog
+
+
+def _spans(listed: Sequence[ListedLog], catalog: Catalog) -> NDArray[np.void]:
+    """Tell the spans of files as they were listed; what was not read, or was changed, has none."""
+    numbers = catalog.files.rows_of(listed)
+    read = [place for place, number in enumerate(numbers) if number is not None]
+    rows = catalog.table.take(pa.array((n for n in numbers if n is not None), pa.int64()))
+    spans = np.full(len(listed), NEVER, SPAN)
+    for name in ("start", "end", "size", "mtime"):
+        spans[name][read] = pc.fill_null(rows[name].cast(pa.int64()), NEVER).to_numpy()
+    spans["finished"] = [not log.name.endswith(ACTIVE_SUFFIX) for log in listed]
+    spans["finished"][read] &= pc.equal(rows["state"], FINISHED).to_numpy()
+    return spans
 
 
 def _divided(

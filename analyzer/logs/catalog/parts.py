@@ -33,7 +33,7 @@ def part_of(home: str) -> str:
     return f"home-{name}{_SUFFIX}"
 
 
-def read_parts(folder: Path, columns: tuple[str, ...] | None = None) -> Parts | None:
+def read_parts(folder: Path) -> Parts | None:
     """Read the catalogue of a folder; None if there is none.
 
     An older catalogue, which is one file, is one part.
@@ -41,8 +41,6 @@ def read_parts(folder: Path, columns: tuple[str, ...] | None = None) -> Parts | 
     Parameters
     ----------
     folder : Path
-    columns : tuple of str, optional
-        Of `SCHEMA`; all by default.
 
     Raises
     ------
@@ -56,7 +54,7 @@ def read_parts(folder: Path, columns: tuple[str, ...] | None = None) -> Parts | 
     if not paths:
         return None
     parts = Parts({}, [])
-    for path, read in zip(paths, map_logs(lambda path: _read(path, columns), paths), strict=True):
+    for path, read in zip(paths, map_logs(_read, paths), strict=True):
         if isinstance(read, str):
             parts.unusable.append(f"{path}: cannot be used as a catalogue ({read})")
         else:
@@ -64,10 +62,10 @@ def read_parts(folder: Path, columns: tuple[str, ...] | None = None) -> Parts | 
     return parts
 
 
-def _read(path: Path, columns: tuple[str, ...] | None) -> pa.Table | str:
+def _read(path: Path) -> pa.Table | str:
     try:
         with path.open("rb") as stream:
-            return read_table(stream, columns)
+            return read_table(stream)
     except (pa.ArrowException, OSError, ValueError) as error:
         return str(error).partition("\n")[0]
 

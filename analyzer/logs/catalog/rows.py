@@ -11,7 +11,7 @@ import pyarrow as pa
 from hearthlog.analyzer.logs.catalog.catalog import FINISHED, LOG, UNFINISHED, CatalogRow
 from hearthlog.analyzer.logs.catalog.contents import Contents, read_contents
 from hearthlog.analyzer.logs.catalog.file import table_of
-from hearthlog.analyzer.logs.catalog.listing import catalogued_name, size_and_time
+from hearthlog.analyzer.logs.listing import catalogued_name, size_and_time
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import log_name, log_of_layer
 from hearthlog.schemas.messages.topics import LIVE, RELABEL, REVIEW
