@@ -104,21 +104,21 @@ def test_the_number_of_blas_threads_changes_nothing(classes):
 def test_the_order_of_sums_changes_no_bit_of_a_distance(seed, width, spread):
     rng = np.random.default_rng(seed)
     rows, vectors = spread * rng.standard_normal((2, 40, width))
-    distances = RoundedDistances(0.5 / width, 64)
+    distances = RoundedDistances(0.5 / width, 50)
     one, other = (
         distances.between(distances.rows(rows[:, order]), distances.vectors(vectors[:, order]))
         for order in (np.arange(width), rng.permutation(width))
     )
     np.testing.assert_array_equal(one, other)
-    whole = in_steps(rows, 64).astype(int), in_steps(vectors, 64).astype(int)
+    whole = in_steps(rows, 50).astype(int), in_steps(vectors, 50).astype(int)
     squares = ((whole[0][:, np.newaxis] - whole[1]) ** 2).sum(axis=-1)
-    np.testing.assert_allclose(one, -0.5 / width * squares / 64**2, rtol=1e-9)
+    np.testing.assert_allclose(one, -0.5 / width * squares / 50**2, rtol=1e-9)
 
 
 @pytest.mark.parametrize("spread", [1.0, 100.0])
 def test_a_row_far_away_changes_no_bit_of_the_others(spread):
     rows, vectors = spread * np.random.default_rng(5).standard_normal((2, 40, 195))
-    distances = RoundedDistances(0.5 / 195, 64)
+    distances = RoundedDistances(0.5 / 195, 50)
     near, by = distances.rows(rows[1:]), distances.vectors(vectors)
     rows[0] *= 1000.0
     together = distances.between(distances.rows(rows), by)

@@ -137,7 +137,11 @@ def test_a_merged_log_has_the_records_of_its_sources_once(recorded, hearthlog, t
     assert merged.attachments == source.attachments
     with output.open("rb") as stream:
         reader = make_reader(stream)
-        assert [record.name for record in reader.iter_metadata()] == ["hearthlog", "rosbag2"]
+        assert [record.name for record in reader.iter_metadata()] == [
+            "hearthlog",
+            "rosbag2",
+            "hearthlog_contents",
+        ]
         assert reader.get_header().profile == "ros2"
         topics = [channel.topic for channel in reader.get_summary().channels.values()]
     assert len(topics) == len(set(topics))

@@ -64,7 +64,7 @@ class SvmMethod(Method):
 
     cost: float = 4.0
     gamma: float = 1.0
-    steps: int | None = 64
+    steps: int | None = 50
     most_windows: int = 12_000
     scaling: Scaling | None = field(default=None, compare=False)
 

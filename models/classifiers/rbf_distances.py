@@ -1,15 +1,15 @@
 """Squared distances of windows to the vectors of a machine, as its kernel takes them."""
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.arrays import Float64
 
-_NONE = np.empty(0)
-_EXACT = 1 << 24  # the largest whole number to which float32 holds all
-_FARTHEST = 1 << 20  # steps: with 8192 of them, sums of squares are exact in float64
+_EXACT = 4096  # steps: the square, 2^24, is the largest whole number up to which float32 has all
+_FARTHEST = 1 << 20  # steps: with a thousand inputs, sums of squares are exact in float64
 
 
 class Prepared(NamedTuple):
@@ -17,16 +17,13 @@ class Prepared(NamedTuple):
 
     Attributes
     ----------
-    values : np.ndarray [shape=(n, k) or (k, m)], float32 or float64
+    values : np.ndarray [shape=(n, width + 2) or (width + 2, m)], float32 or float64
         Windows in rows, vectors in columns.
-    terms : np.ndarray [shape=(n, 1) or (m,)], float64
-        Of the exponents; empty where the values have them.
     longest : float
         Length of the longest, in steps; 0 without steps.
     """
 
-    values: Float32 | Float64
-    terms: Float64
+    values: NDArray[Any]
     longest: float
 
 
@@ -40,7 +37,7 @@ class Distances(Protocol):
         """Prepare scaled vectors, of shape (m, width)."""
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m); by rounding, they may be a little above 0."""
+        """Return the exponents, of shape (n, m), none of them above 0."""
 
 
 class RoundedDistances:
@@ -63,27 +60,21 @@ class RoundedDistances:
 
     def rows(self, scaled: Float64) -> Prepared:
         """Prepare scaled inputs, of shape (n, width)."""
-        values, terms, longest = self._whole(scaled)
-        return Prepared(values, terms[:, np.newaxis], longest)
+        whole = in_steps(scaled, self._steps)
+        return _exact(_as_rows(whole), whole)
 
     def vectors(self, scaled: Float64) -> Prepared:
         """Prepare scaled vectors, of shape (m, width)."""
-        values, terms, longest = self._whole(scaled)
-        return Prepared(aligned(values.T), terms, longest)
-
-    def _whole(self, scaled: Float64) -> tuple[Float32, Float64, float]:
         whole = in_steps(scaled, self._steps)
-        squares = np.vecdot(whole, whole)
-        longest = float(squares.max(initial=0.0)) ** 0.5
-        return whole.astype(np.float32), -self._factor * squares, longest
+        values, longest = _exact(_as_columns(whole, 1.0), whole)
+        return Prepared(aligned(values), longest)
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m); by rounding, they may be a little above 0."""
-        type_ = np.float32 if rows.longest * vectors.longest <= _EXACT else np.float64
+        """Return the exponents, of shape (n, m), none of them above 0."""
+        # No sum of some of the products is above (|x| + |s|)^2.
+        type_ = np.float32 if rows.longest + vectors.longest <= _EXACT else np.float64
         product = rows.values.astype(type_, copy=False) @ vectors.values.astype(type_, copy=False)
-        exponents: Float64 = np.multiply(product, 2.0 * self._factor, dtype=np.float64)
-        exponents += vectors.terms
-        exponents += rows.terms
+        exponents: Float64 = np.multiply(product, self._factor, dtype=np.float64)
         return exponents
 
 
@@ -100,22 +91,17 @@ class UnroundedDistances:
         self._gamma = gamma
 
     def rows(self, scaled: Float64) -> Prepared:
-        """Prepare scaled inputs x as (x, |x|^2, 1)."""
-        square = np.vecdot(scaled, scaled)[:, np.newaxis]
-        return Prepared(np.concatenate([scaled, square, np.ones_like(square)], axis=1), _NONE, 0.0)
+        """Prepare scaled inputs, of shape (n, width)."""
+        return Prepared(_as_rows(scaled), 0.0)
 
     def vectors(self, scaled: Float64) -> Prepared:
-        """Prepare scaled vectors as columns whose product with (x, |x|^2, 1) is the exponent."""
-        gamma, square = self._gamma, np.vecdot(scaled, scaled)[:, np.newaxis]
-        parts = 2.0 * gamma * scaled, np.full_like(square, -gamma), -gamma * square
-        return Prepared(aligned(np.concatenate(parts, axis=1).T), _NONE, 0.0)
+        """Prepare scaled vectors, of shape (m, width)."""
+        return Prepared(aligned(_as_columns(scaled, self._gamma)), 0.0)
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
-        """Return the exponents, of shape (n, m); by rounding, they may be a little above 0."""
-        return rowwise_matmul(
-            rows.values.astype(np.float64, copy=False),
-            vectors.values.astype(np.float64, copy=False),
-        )
+        """Return the exponents, of shape (n, m), none of them above 0."""
+        product = rowwise_matmul(rows.values, vectors.values)
+        return np.minimum(product, 0.0, out=product)  # by rounding, a few are above
 
 
 def in_steps(scaled: Float64, steps: int) -> Float64:
@@ -134,3 +120,22 @@ def in_steps(scaled: Float64, steps: int) -> Float64:
         Whole numbers, from -2^20 to 2^20.
     """
     return np.clip(np.rint(steps * scaled), -_FARTHEST, _FARTHEST)
+
+
+def _as_rows(inputs: Float64) -> Float64:
+    """Return inputs x as (x, |x|^2, 1)."""
+    square = np.vecdot(inputs, inputs)[:, np.newaxis]
+    return np.concatenate([inputs, square, np.ones_like(square)], axis=1)
+
+
+def _as_columns(vectors: Float64, gamma: float) -> Float64:
+    """Return columns whose product with (x, |x|^2, 1) is -gamma |x - s|^2."""
+    square = np.vecdot(vectors, vectors)[:, np.newaxis]
+    parts = 2.0 * gamma * vectors, np.full_like(square, -gamma), -gamma * square
+    return np.concatenate(parts, axis=1).T
+
+
+def _exact(values: Float64, whole: Float64) -> Prepared:
+    """Take float32 for values that it holds exactly."""
+    longest = float(np.vecdot(whole, whole).max(initial=0.0)) ** 0.5
+    return Prepared(values if longest > _EXACT else values.astype(np.float32), longest)

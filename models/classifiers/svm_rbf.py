@@ -196,6 +196,7 @@ class SvmMachine:
         self._scale = model.arrays["scaler_scale"]
         self._intercepts = model.arrays["intercepts"]
         self._count = len(model.classes)
+        self._tells_novelty = model.description.novelty == "machine"
         self._distances = _distances(model)
         self._blocks = self._support(model)
         self._home_blocks = self._of_home(model)
@@ -213,14 +214,15 @@ class SvmMachine:
         -------
         decisions : np.ndarray [shape=(n, C)], float64
         novelty : np.ndarray [shape=(n,)], float64
-            One minus the kernel of the nearest support vector, 0 to 1.
+            One minus the kernel of the nearest support vector, 0 to 1; NaN for a model whose
+            novelty comes from its probabilities.
         """
         rows = self._distances.rows(self._scaled(inputs))
         pairs, others, nearest = self._pairs(rows)
         decision = weakest_pairs(pairs, self._count)
         if self._home_blocks:
             decision += home_votes(self._home(rows), others)
-        return decision, -np.expm1(np.minimum(nearest, 0.0))
+        return decision, -np.expm1(nearest)
 
     def _scaled(self, inputs: Float32) -> Float64:
         return (inputs - self._mean) / self._scale
@@ -234,18 +236,16 @@ class SvmMachine:
         others : np.ndarray [shape=(n, 1)]
             Sums of the sharp kernels of the support vectors; zeros without home vectors.
         nearest : np.ndarray [shape=(n,)]
-            Logarithm of the kernel of the nearest support vector.
+            Logarithm of the kernel of the nearest support vector; NaN if novelty is not told.
         """
         count = len(rows.values)
-        nearest = np.full(count, -np.inf)
+        nearest = np.full(count, -np.inf if self._tells_novelty else np.nan)
         against = np.zeros((self._count, count, self._count - 1))
         others = np.zeros((count, 1))
         for vectors, parts in self._blocks:
             exponents = self._distances.between(rows, vectors)
-            largest = exponents[np.arange(count), exponents.argmax(axis=1)]
-            if largest.max() > 0.0:  # by rounding
-                np.minimum(exponents, 0.0, out=exponents)
-            np.maximum(nearest, largest, out=nearest)
+            if self._tells_novelty:
+                np.maximum(nearest, exponents.max(axis=1), out=nearest)
             if self._home_blocks:
                 sharp = np.exp(HOME_SHARPNESS * exponents)
                 others += rowwise_matmul(sharp, np.ones((sharp.shape[1], 1)))
@@ -260,7 +260,7 @@ class SvmMachine:
         """Return the sums of the sharp kernels of the home vectors by class, shape (n, C)."""
         home = np.zeros((len(rows.values), self._count))
         for vectors, one_hot in self._home_blocks:
-            exponents = np.minimum(self._distances.between(rows, vectors), 0.0)
+            exponents = self._distances.between(rows, vectors)
             home += rowwise_matmul(np.exp(HOME_SHARPNESS * exponents), one_hot)
         return home
 
@@ -275,9 +275,7 @@ class SvmMachine:
             for index, (start, end) in enumerate(pairwise([0, *ends])):
                 first, last = max(start, low), min(end, high)
                 if first < last:
-                    coefficients: Float64 = aligned(
-                        model.arrays["dual_coefficients"][:, first:last].T
-                    )
+                    coefficients = aligned(model.arrays["dual_coefficients"][:, first:last].T)
                     parts.append((index, slice(first - low, last - low), coefficients))
             blocks.append((self._distances.vectors(vectors[low:high]), parts))
         return blocks

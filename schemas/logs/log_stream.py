@@ -59,8 +59,7 @@ class LogStreamWriter:
 
     def __init__(self, stream: BinaryIO, topics: Sequence[Topic]) -> None:
         self._channels: dict[str, int] = {}
-        self._counts: dict[str, rosbag2.TopicCount] = {}
-        self._span: tuple[int, int] | None = None
+        self._topics: dict[str, rosbag2.TopicCount] = {}
         self._writer = CountedWriter(stream)
         self._writer.start(profile=PROFILE, library="hearthlog")
         schemas: dict[str, int] = {}
@@ -72,7 +71,7 @@ class LogStreamWriter:
             names = {f"{key}_names": json.dumps([*n]) for key, n in topic.array_names.items()}
             ros = rosbag2.channel_metadata(type_hash(topic.type), topic.quality)
             channel_metadata = ros | names
-            self._counts[topic.name] = rosbag2.TopicCount(topic.type, channel_metadata)
+            self._topics[topic.name] = rosbag2.TopicCount(topic.type, channel_metadata)
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, ENCODING, schemas[topic.type], channel_metadata
             )
@@ -113,7 +112,6 @@ class LogStreamWriter:
             CDR.
         """
         self._writer.add_message(self._channels[topic], log_time, data, log_time)
-        self._count(topic, 1, log_time, log_time)
 
     def write_columns(
         self, batch: Sequence[TopicBatch], encoded: Sequence[RawMessages] = ()
@@ -138,21 +136,16 @@ class LogStreamWriter:
         blocks: list[Block] = []
         first = 0
         for messages in encoded:
-            topic, times = messages.channel.topic, messages.log_times
-            blocks += message_blocks(messages, self._channels[topic], first)
+            blocks += message_blocks(messages, self._channels[messages.channel.topic], first)
             first += len(messages)
-            self._count(topic, len(messages), int(times[0]), int(times[-1]))
         for part in batch:
             count = len(part.log_times)
-            for rows, payloads in encode_groups(self._counts[part.topic].type, part.fields, count):
+            for rows, payloads in encode_groups(self._topics[part.topic].type, part.fields, count):
                 times = part.log_times[rows]
                 sequences = np.zeros(len(rows), np.uint32)
                 channel = self._channels[part.topic]
                 blocks.append(Block(channel, times, times, sequences, payloads, first + rows))
             first += count
-            if count:
-                span = int(part.log_times.min()), int(part.log_times.max())
-                self._count(part.topic, count, *span)
         self._writer.write(blocks)
 
     def flush(self) -> None:
@@ -167,11 +160,9 @@ class LogStreamWriter:
         name : str
             Name that its file will have.
         """
-        metadata = rosbag2.file_metadata(name, self._counts, self._span or (0, 0))
+        self._writer.flush()
+        for topic, channel in self._channels.items():
+            self._topics[topic].messages = self._writer.message_counts.get(channel, 0)
+        metadata = rosbag2.file_metadata(name, self._topics, self._writer.span)
         self._writer.add_metadata(rosbag2.METADATA, metadata)
         self._writer.finish()
-
-    def _count(self, topic: str, messages: int, first: int, last: int) -> None:
-        self._counts[topic].messages += messages
-        start, end = self._span or (first, last)
-        self._span = min(start, first), max(end, last)

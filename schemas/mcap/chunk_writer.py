@@ -5,7 +5,7 @@ The file is, byte for byte, what `mcap.writer.Writer` makes of the same messages
 
 import zlib
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import BinaryIO
 
@@ -274,8 +274,18 @@ class ChunkWriter:
         self._stream.write(summary)
         self._stream.write(footer + formats.UINT32.pack(crc) + formats.MAGIC)
 
+    @property
+    def message_counts(self) -> Mapping[int, int]:
+        """Messages in the chunks that were written, by number of the channel."""
+        return self._counts
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last log time in the chunks that were written, in ns; (0, 0) without any."""
+        return self._file_span if self._chunk_count else (0, 0)
+
     def _statistics(self) -> records.Statistics:
-        start, end = self._file_span
+        start, end = self.span
         return records.Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
@@ -283,7 +293,7 @@ class ChunkWriter:
             chunk_count=self._chunk_count,
             message_count=sum(self._counts.values()),
             message_end_time=end,
-            message_start_time=start if self._chunk_count else 0,
+            message_start_time=start,
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )

@@ -2,6 +2,7 @@
 
 import threading
 import zlib
+from collections import defaultdict
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ class ChunkBuilder:
 
     def __init__(self) -> None:
         self.content = bytearray()
-        self.entries: dict[int, bytearray] = {}
+        self.entries: defaultdict[int, bytearray] = defaultdict(bytearray)
         self.start, self.end = LATEST, 0
 
     def add_message(self, channel: int, log_time: int, head: bytes, payload: bytes) -> None:
@@ -91,10 +92,14 @@ class ChunkBuilder:
             Beginning of its record, up to the payload (`MESSAGE`).
         payload : bytes
         """
-        entry = INDEX_ENTRY.pack(log_time, len(self.content))
-        self.entries.setdefault(channel, bytearray()).extend(entry)
-        self.content += head + payload
-        self.start, self.end = min(self.start, log_time), max(self.end, log_time)
+        self.entries[channel] += INDEX_ENTRY.pack(log_time, len(self.content))
+        self.content += head
+        self.content += payload
+        # min and max would take as long as all the rest
+        if log_time < self.start:  # noqa: PLR1730
+            self.start = log_time
+        if log_time > self.end:  # noqa: PLR1730
+            self.end = log_time
 
     def add_messages(self, data: Bytes, channels: Int64, entries: NDArray[np.void]) -> None:
         """Append message records.
@@ -112,7 +117,7 @@ class ChunkBuilder:
         numbers, firsts = np.unique(channels, return_index=True)
         for channel in numbers[np.argsort(firsts)].tolist():
             same = entries[channels == channel].tobytes()
-            self.entries.setdefault(channel, bytearray()).extend(same)
+            self.entries[channel] += same
         times = entries["time"]
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
 
@@ -136,7 +141,7 @@ class ChunkBuilder:
         for channel, rows in kept.items():
             moved = np.frombuffer(rows, INDEX_ENTRIES).copy()
             moved["offset"] += len(self.content) - before[starts.searchsorted(moved["offset"])]
-            self.entries.setdefault(channel, bytearray()).extend(moved.tobytes())
+            self.entries[channel] += moved.tobytes()
             self.start = min(self.start, int(moved["time"].min()))
             self.end = max(self.end, int(moved["time"].max()))
         firsts, lasts = [0, *(starts + sizes).tolist()], [*starts.tolist(), len(content)]
