@@ -96,7 +96,8 @@ def draw(path: Path, picture: Path) -> None:
         figure.text(0.5, 0.5, "no run has been recorded", ha="center")
     for place, name in enumerate(names, start=1):
         _draw_panel(figure.add_subplot(rows, _COLUMNS, place), name, runs)
-    with mpl.rc_context({"svg.hashsalt": "hearthlog"}):  # the same runs give the same bytes
+    # A salt, so that the same runs give the same bytes.
+    with mpl.rc_context({"svg.hashsalt": "hearthlog", "svg.fonttype": "none"}):
         figure.savefig(picture, format="svg", metadata={"Date": None})
 
 
