@@ -364,6 +364,17 @@ def test_a_damaged_chunk_of_a_file_cut_in_the_head_of_the_next_record(log, recov
     assert result.some_lost
 
 
+@pytest.mark.parametrize("left", [9, 26, 30])
+def test_a_chunk_of_which_only_a_few_bytes_are_left_is_missed(log, recover, left):
+    data, records = log
+    chunks = [record for record in records if record.opcode == CHUNK]
+    gone = chunks[len(chunks) // 2]
+    behind = next(record.start for record in chunks if record.start > gone.start)
+    end = next(record.start for record in records if record.opcode == DATA_END)
+    recovery, _ = recover(data[: gone.start + left] + data[behind:end])
+    assert [damage.exact for damage in recovery.damages if not damage.cut] == [False]
+
+
 def test_messages_whose_channel_nothing_defines_are_counted(log, recover):
     data, records = log
     chunks = [r for r in records if r.opcode == CHUNK]

@@ -259,7 +259,8 @@ def loss_in(reader: RecordVerifier, damaged: DamagedRange, index: Index | None) 
 
 def _loss_by_neighbours(reader: RecordVerifier, damaged: DamagedRange) -> Loss:
     start, end, opcode, ends = damaged
-    if end - start < MESSAGE.size and (end < reader.end or opcode != Opcode.CHUNK):
+    is_cut_chunk = opcode == Opcode.CHUNK and (end == reader.end or max(ends, default=0) > end)
+    if end - start < MESSAGE.size and not is_cut_chunk:
         return _NOTHING
     is_record = end in ends or end == reader.end
     if end in ends and reader.like_message_index(start):
