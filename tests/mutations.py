@@ -173,6 +173,7 @@ MUTATIONS = (
     chunk_left_out, chunk_and_indexes_left_out, chunk_twice, chunk_twice_far_away, swapped_chunks,
     bytes_out_of_an_index, record_left_out,
 )  # fmt: skip
+FLIPS = {flipped_bit, flipped_bits}
 
 
 # The verbs, and what they say of a file.
@@ -487,8 +488,10 @@ def main():
     counts, wrong = Counter(), Counter()
     for name, path in files.items():
         data, victim = path.read_bytes(), begin(name, path, options.folder / "victims" / name)
+        # What `rosbags` writes has no checksums: of a bit that changed nobody can know.
+        kinds = [one for one in MUTATIONS if name != "rosbags" or one not in FLIPS]
         for number in range(options.count // len(files)):
-            mutation = MUTATIONS[number % len(MUTATIONS)]
+            mutation = kinds[number % len(kinds)]
             changed = mutation(rng, data)
             counts[mutation.__name__] += 1
             if said := victim.read(changed, path.name):
