@@ -1238,6 +1238,14 @@ def test_logs_of_one_node_that_overlap_are_found(folder, recorded):
     assert "overlap" in errors(folder)
 
 
+def test_logs_of_two_homes_may_be_of_one_time(tmp_path, recorded):
+    for home in ("anna", "bert"):
+        place = tmp_path.joinpath(home, *recorded.parts[-4:])
+        place.parent.mkdir(parents=True)
+        shutil.copy(recorded, place)
+    assert errors(tmp_path) == set()
+
+
 @pytest.mark.parametrize("name", [NAME + ".damaged", NAME + ".recovering", f".{NAME}.7.tmp"])
 def test_what_was_left_behind_is_found(folder, name):
     (folder / name).write_bytes(b"")

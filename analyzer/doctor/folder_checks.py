@@ -1,5 +1,6 @@
 """The logs of a folder, compared with each other."""
 
+import re
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +13,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX
 from hearthlog.schemas.times import NANOSECONDS, millisecond_text
 
+_DAY = re.compile(r"\d{4}/\d{2}/\d{2}")
 _TOLERANCE = 0.01  # of the time between two files, that a sound card's clock may be off by
 _LEFT = {
     f"{SUFFIX}.damaged": "is what could not be recovered whole; `hearthlog recover` may save more",
@@ -43,22 +45,29 @@ def check_leftovers(folder: Path) -> Iterator[Findings]:
 
 
 def check_series(files: Sequence[ExaminedFile]) -> None:
-    """Compare the logs of each node with each other, and add to their findings.
+    """Compare the logs of each node of a home with each other, and add to their findings.
 
     Parameters
     ----------
     files : sequence of ExaminedFile
         In any order; those that are not ours, or have no messages, are passed over.
     """
-    nodes: dict[str, list[ExaminedFile]] = {}
+    homes = {home for file in files if (home := _folder_of_days(file.findings.path)) is not None}
+    nodes: dict[tuple[Path | None, str], list[ExaminedFile]] = {}
     for file in files:
         if file.ours and file.span is not None:
-            nodes.setdefault(file.node, []).append(file)
+            home = next((each for each in file.findings.path.parents if each in homes), None)
+            nodes.setdefault((home, file.node), []).append(file)
     for same in nodes.values():
         same.sort(key=_start)
         _check_overlaps(same)
         for microphone in {name for file in same for name in file.frames}:
             _check_frames(microphone, [file for file in same if microphone in file.frames])
+
+
+def _folder_of_days(path: Path) -> Path | None:
+    """Return the folder of a home, which has a log in YYYY/MM/DD; None if it is not in one."""
+    return path.parents[3] if _DAY.fullmatch("/".join(path.parts[-4:-1])) else None
 
 
 def _start(file: ExaminedFile) -> int:
