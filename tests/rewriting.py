@@ -226,7 +226,7 @@ class _Layout:
                 entries.setdefault(record.channel_id, []).append(entry)
             content += joined([record if isinstance(record, Raw) else as_raw(record)], ends=False)
         times = [time for found in entries.values() for time, _ in found] or [0]
-        data = zstandard.compress(bytes(content))
+        data = zstandard.compress(bytes(content), level=1)
         chunk = Chunk("zstd", data, max(times), min(times), zlib.crc32(content), len(content))
         offset, length = self._put(chunk)
         first = self._offset
