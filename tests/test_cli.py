@@ -101,7 +101,7 @@ def test_info_says_in_json_what_the_files_are_and_carry(logs, hearthlog):
     found = json.loads(hearthlog("info", logs, "--json").stdout)
     assert found["profiles"] == ["ros2"]
     assert found["libraries"] == ["hearthlog"]
-    assert found["metadata"] == ["hearthlog", "rosbag2"]
+    assert found["metadata"] == ["hearthlog", "hearthlog_contents", "rosbag2"]
     assert len(found["attachments"]) == 3
     assert found["chunks"] > 10
     assert found["compression_ratio"] > 1
@@ -160,6 +160,8 @@ def test_info_names_a_damaged_log_and_shows_the_others_with_status_3(logs, heart
     data = bytearray(other.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 3000] = bytes(3000)
+    said = data.rindex(b"hearthlog_contents", 0, data.rindex(b'"topics"'))
+    data[data.index(b"sha256", said)] ^= 1  # so that its messages are read
     bad.write_bytes(data)
     alone = json.loads(hearthlog("info", whole, "--json").stdout)
     result = hearthlog("info", tmp_path, "--json")

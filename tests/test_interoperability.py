@@ -188,7 +188,7 @@ def test_the_file_has_the_profile_the_metadata_and_the_attachments_of_the_contra
             attachments = {record.name: record for record in reader.iter_attachments()}
             counts = reader.get_summary().statistics.channel_message_counts
             channels = reader.get_summary().channels
-        assert metadata.keys() == {"hearthlog", "rosbag2"}
+        assert metadata.keys() == {"hearthlog", "rosbag2", "hearthlog_contents"}
         assert metadata["hearthlog"]["node"] == "home"
         assert metadata["hearthlog"]["feature_set"] == model.description.feature_set
         assert metadata["hearthlog"]["model_sha256"] == model.sha256

@@ -151,7 +151,7 @@ def test_the_index_says_what_is_in_the_file(logs):
         }
         assert said["metadata"] == log.metadata
         assert said["attachments"] == {k: data.decode() for k, data in log.attachments.items()}
-        assert (len(log.metadata), len(log.attachments)) == (2, 3)
+        assert (len(log.metadata), len(log.attachments)) == (3, 3)
 
 
 def flipped(path, place, folder):
