@@ -4,7 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 from blobs import blobs, with_arrays
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.pipeline import make_pipeline
@@ -100,6 +100,7 @@ def test_the_number_of_blas_threads_changes_nothing(classes):
     assert np.array_equal(*results)
 
 
+@example(seed=1, width=195, spread=5.0)  # exact one by one, not together
 @given(seed=st.integers(0, 1 << 32), width=st.integers(1, 300), spread=st.floats(1e-3, 1e4))
 def test_the_order_of_sums_changes_no_bit_of_a_distance(seed, width, spread):
     rng = np.random.default_rng(seed)
