@@ -16,7 +16,11 @@ from hearthlog.analyzer.training.method import softmax
 from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm, in_whole_steps, rounded
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances, in_steps
+from hearthlog.models.classifiers.rbf_distances import (
+    RoundedDistances,
+    UnroundedDistances,
+    in_steps,
+)
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.progress import ignore_progress
 
@@ -114,6 +118,13 @@ def test_the_order_of_sums_changes_no_bit_of_a_distance(seed, width, spread):
     whole = in_steps(rows, 50).astype(int), in_steps(vectors, 50).astype(int)
     squares = ((whole[0][:, np.newaxis] - whole[1]) ** 2).sum(axis=-1)
     np.testing.assert_allclose(one, -0.5 / width * squares / 50**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("distances", [RoundedDistances(0.1, 50), UnroundedDistances(0.1)])
+def test_nothing_is_nearer_than_itself(distances):
+    same = np.random.default_rng(5).standard_normal((200, 42))
+    exponents = distances.between(distances.rows(same), distances.vectors(same))
+    assert exponents.max() == 0.0
 
 
 @pytest.mark.parametrize("spread", [1.0, 100.0])
