@@ -18,7 +18,6 @@ from rosbags.rosbag2 import Writer as BagWriter
 
 from hearthlog.analyzer.logs.health import Status
 from hearthlog.analyzer.logs.summarise import summarise
-from hearthlog.analyzer.logs.summary import GapSummary
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
@@ -26,6 +25,7 @@ from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.logs.contents import Gap
 from hearthlog.schemas.logs.files import active_path, find_logs
 from hearthlog.schemas.logs.log_stream import TopicBatch
 from hearthlog.schemas.logs.writer import LogWriter
@@ -162,7 +162,7 @@ def test_labels_segments_and_gaps_are_those_of_the_messages(logs, model_file):
         sum(nanoseconds(m.duration) for m in doubtful) / SECOND
     )
     assert summary.gaps == [
-        GapSummary(
+        Gap(
             "hall",
             nanoseconds(m.header.stamp),
             nanoseconds(m.duration) / SECOND,
@@ -367,7 +367,7 @@ def test_a_type_of_ours_with_another_field_is_understood(tmp_path):
         channel = writer.register_channel("/mic/gap", "cdr", schema)
         writer.add_message(channel, START, encode(gap) + bytes(4), START)
         writer.finish()
-    assert summarise([path]).gaps == [GapSummary("mic", START, 2.0, "overrun", 40)]
+    assert summarise([path]).gaps == [Gap("mic", START, 2.0, "overrun", 40)]
 
 
 def test_a_message_that_is_not_of_its_type_is_damage_in_its_file(tmp_path):

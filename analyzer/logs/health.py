@@ -7,6 +7,7 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.statuses import Status
 from hearthlog.schemas.messages.topics import LIVE, parse_topic
 
 _LONGEST = 200  # characters
@@ -19,18 +20,6 @@ class Trouble(NamedTuple):
     text: str
     start: int
     end: int
-
-
-class Status(NamedTuple):
-    """What a part of the box said of itself, at a log time (ns of UTC).
-
-    `level` is that of `diagnostic_msgs/DiagnosticStatus`: 0 is well, higher is worse.
-    """
-
-    name: str
-    time: int
-    level: int
-    message: str
 
 
 class MicrophoneState(NamedTuple):
@@ -71,29 +60,6 @@ def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
     for start, nanoseconds, reason in rows:
         if nanoseconds > 0:
             yield Trouble(f"{node}/{columns.topic}", reason, start, start + nanoseconds)
-
-
-def statuses_of(columns: Columns) -> Iterator[Status]:
-    """Yield each status of diagnostic messages.
-
-    Parameters
-    ----------
-    columns : Columns
-        Messages of type `diagnostic_msgs/DiagnosticArray`, with the field `status`.
-
-    Yields
-    ------
-    Status
-        In the order of the messages, at their log times.
-
-    Raises
-    ------
-    LogError
-        If the field is missing.
-    """
-    for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
-        for status in statuses:
-            yield Status(status["name"], time, int(status["level"]), status["message"])
 
 
 def microphone_states(columns: Columns) -> Iterator[MicrophoneState]:

@@ -8,8 +8,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.health import Status
-from hearthlog.analyzer.logs.summary import GapSummary, Summary, TopicSummary
+from hearthlog.analyzer.logs.summary import Summary, TopicSummary
 from hearthlog.analyzer.logs.typed_columns import is_compatible
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -161,6 +160,6 @@ def _add_contents(summary: Summary, contents: Contents) -> None:
         length = lengths.get(microphone.partition("/")[0], FRAME_SECONDS)
         frames = {label: round(count * length, 3) for label, count in counts.items()}
         summary.label_seconds[microphone] = Counter(frames)
-    summary.gaps = [GapSummary(*gap) for gap in contents.gaps]
+    summary.gaps = contents.gaps
     summary.streams = contents.streams
-    summary.health = None if contents.health is None else Status(*contents.health)
+    summary.health = contents.health

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hearthlog.analyzer.logs.health import Status
+from hearthlog.schemas.logs.contents import Gap
+from hearthlog.schemas.logs.statuses import Status
 from hearthlog.schemas.times import NANOSECONDS
 
 Span = tuple[int, int]
@@ -46,17 +47,6 @@ class TopicSummary:
         self.span = _hull(self.span, span)
 
 
-@dataclass(frozen=True)
-class GapSummary:
-    """Audio that was not heard: when (ns of UTC), for how long (s), and why."""
-
-    microphone: str
-    start: int
-    seconds: float
-    reason: str
-    frames_lost: int
-
-
 @dataclass
 class Summary:
     """What is in some logs."""
@@ -82,7 +72,7 @@ class Summary:
     segment_seconds: dict[str, Counter[str]] = field(default_factory=dict)  # but for reviews
     # `segments` and `seconds` of them whose labels are likelier wrong than right, likewise
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
-    gaps: list[GapSummary] = field(default_factory=list)
+    gaps: list[Gap] = field(default_factory=list)
     # what the files say of themselves: microphone, device, feature set, model
     streams: list[dict[str, Any]] = field(default_factory=list)
     health: Status | None = None  # the worst that was said, and of that the last

@@ -8,7 +8,7 @@ import numpy as np
 from hearthlog.analyzer.accuracy.reviewed_labels import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.channel_names import array_names
-from hearthlog.analyzer.logs.health import Status, Trouble, gaps_of, statuses_of, troubles_of
+from hearthlog.analyzer.logs.health import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (
     MOST_CLASSES,
@@ -27,6 +27,7 @@ from hearthlog.models.classifiers.description import CLASS_NAME
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
 from hearthlog.schemas.logs.files import RELABEL_LAYER, REVIEW_LAYER, log_of_layer
+from hearthlog.schemas.logs.statuses import Status, statuses_of
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     DIAGNOSTICS,

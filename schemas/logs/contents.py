@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from mcap.records import Channel, Schema
 
 from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.statuses import Status, statuses_of
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.fields import missing_fields
@@ -54,15 +55,6 @@ class Gap(NamedTuple):
     frames_lost: int
 
 
-class Health(NamedTuple):
-    """A status of diagnostics: whose, at what log time (ns), how bad, and in words."""
-
-    name: str
-    time: int
-    level: int
-    message: str
-
-
 @dataclass
 class Contents:
     """What the messages of a log say, by microphone; of a layer, by the name of its topic."""
@@ -75,7 +67,7 @@ class Contents:
     unsure: dict[str, Counter[str]] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     streams: list[dict[str, Any]] = field(default_factory=list)  # with the keys of `STREAM`
-    health: Health | None = None  # the worst that was said, and of that the last
+    health: Status | None = None  # the worst that was said, and of that the last
 
     def add(self, batch: Sequence[RawMessages], readable: IsReadable | None = None) -> None:
         """Count some messages.
@@ -152,8 +144,7 @@ class Contents:
 
     def _add_health(self, columns: Columns) -> None:
         said = [] if self.health is None else [self.health]
-        for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
-            said += [Health(s["name"], time, int(s["level"]), s["message"]) for s in statuses]
+        said += statuses_of(columns)
         self.health = max(said, key=lambda status: (status.level, status.time), default=None)
 
 

@@ -10,7 +10,8 @@ from typing import Any
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from hearthlog.schemas.logs.contents import STREAM, Contents, Gap, Health, TopicContents
+from hearthlog.schemas.logs.contents import STREAM, Contents, Gap, TopicContents
+from hearthlog.schemas.logs.statuses import Status
 from hearthlog.schemas.mcap.logfile import LogFile
 
 METADATA = "hearthlog_contents"
@@ -109,8 +110,8 @@ def _contents(values: Any) -> Contents:
     )
 
 
-def _health(name: Any, time: Any, level: Any, message: Any) -> Health:
-    return Health(_text(name), _count(time), _count(level), _text(message))
+def _health(name: Any, time: Any, level: Any, message: Any) -> Status:
+    return Status(_text(name), _count(time), _count(level), _text(message))
 
 
 def _stream(values: Any) -> dict[str, Any]:

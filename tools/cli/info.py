@@ -3,7 +3,6 @@
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -148,7 +147,7 @@ def _as_json(summary: "Summary") -> dict[str, Any]:
             microphone: {"minutes": amounts["seconds"] / 60, "segments": int(amounts["segments"])}
             for microphone, amounts in summary.unsure.items()
         },
-        "gaps": [asdict(gap) | {"start": moment(gap.start)} for gap in summary.gaps],
+        "gaps": [gap._asdict() | {"start": moment(gap.start)} for gap in summary.gaps],
         "gap_seconds": summary.gap_seconds,
         "health": _health(summary),
         "attachments": sorted(summary.attachments),
