@@ -320,7 +320,7 @@ DOUBLING = b"\n".join(  # 2 to the power of 30 fields
 @pytest.mark.parametrize(
     "line",
     [b"hearthlog_msgs/AudioSegment inner", b"other/Unknown thing", b"wstring w", DOUBLING],
-    ids=["contains itself", "is not defined", "is not supported", "doubles"],
+    ids=["contains itself", "is not defined", "is wide", "doubles"],
 )
 @pytest.mark.parametrize("place", ["appended", "at the beginning"])
 def test_a_definition_may_be_hostile(golden, capfd, line, place):

@@ -195,12 +195,75 @@ module demo {{
     }
 
 
+WIDE = """uint8 a
+wstring text
+uint8 b
+wstring<=8 bounded
+uint8 c
+wstring[] several
+float64 d
+wstring[2] two
+string narrow
+wstring greeting "hi"
+"""
+WIDE_IDL = """module demo { module msg { struct Wide {
+  uint8 a; wstring text; uint8 b; wstring<8> bounded; uint8 c; sequence<wstring> several;
+  double d; wstring two[2]; string narrow; wstring greeting;
+}; }; };"""
+# What a subscriber of Jazzy and one of Kilted got, with Fast DDS.
+WIDE_MESSAGE = bytes.fromhex(
+    "00010000010000000500000061000000ac20000034d800001edd00007a000000020000000200000078000000"
+    "7900000003000000030000000000000001000000710000000300000072000000730000007400000000000000"
+    "0000f83f01000000750000000100000076000000020000006e000000020000006800000069000000"
+)
+WIDE_VALUES = {
+    "a": 1, "text": "a€𝄞z", "b": 2, "bounded": "xy", "c": 3, "several": ["", "q", "rst"],
+    "d": 1.5, "two": ["u", "v"], "narrow": "n", "greeting": "hi",
+}  # fmt: skip
+
+
+def decoded_wide(kind, payloads):
+    sizes = np.array([len(payload) for payload in payloads])
+    joined = np.frombuffer(b"".join(payloads), np.uint8)
+    return decode_rows(kind, joined, np.cumsum(sizes) - sizes, sizes)
+
+
+@pytest.mark.parametrize(("encoding", "text"), [("ros2msg", WIDE), ("ros2idl", WIDE_IDL)])
+def test_texts_of_two_bytes_a_letter_are_read_as_ros_sends_them(encoding, text):
+    kind = message_type("demo/msg/Wide", encoding, text.encode())
+    rows = decoded_wide(kind, [WIDE_MESSAGE])
+    assert {path: values.tolist()[0] for path, values in rows.items()} == WIDE_VALUES
+
+
+@given(st.lists(st.text(max_size=9), min_size=1, max_size=9), st.sampled_from("<>"))
+def test_any_texts_of_two_bytes_a_letter_come_out_as_they_went_in(texts, order):
+    kind = message_type("demo/msg/One", "ros2msg", b"uint8 first\nwstring text\nuint8 last")
+    start = {"<": b"\0\1\0\0", ">": b"\0\0\0\0"}[order]
+    payloads = []
+    for text in texts:
+        utf16 = text.encode("utf-16-le")
+        units = struct.unpack(f"<{len(utf16) // 2}H", utf16)
+        fields = 7, len(units), *units, 9
+        payloads.append(start + struct.pack(f"{order}B3xI{len(units)}IB", *fields))
+    rows = decoded_wide(kind, payloads)
+    assert rows["text"].tolist() == texts
+    assert set(rows["first"]) == {7}
+    assert set(rows["last"]) == {9}
+
+
+@pytest.mark.parametrize(("unit", "what"), [(0x10000, "words of four bytes"), (0xD800, "UTF-16")])
+def test_units_that_are_no_utf_16_are_refused(unit, what):
+    kind = message_type("demo/msg/One", "ros2msg", b"wstring text")
+    with pytest.raises(LogError, match=f"text: .*{what}"):
+        decoded_wide(kind, [b"\0\1\0\0" + struct.pack("<II", 1, unit)])
+
+
 @pytest.mark.parametrize(
     ("text", "what"),
     [
         (b"int32 a\nNowhere b", "cannot be read|not defined"),
         (b"float128 a", "cannot be read|not supported|not defined"),
-        (b"int32 b\nwstring a", "a is of type wstring, which is not supported"),
+        (b"wstring[4000000000] a", "too many"),
         (b"test/msg/Loop a\n" + b"=" * 80 + b"\nMSG: test/msg/Loop\ntest/msg/Loop a", "itself"),
         (b"uint8[4000000000] a", "ends before"),
         (b"std_msgs/Header[4000000000] a", "too many"),

@@ -23,6 +23,7 @@ from hearthlog.schemas.times import NANOSECONDS
 
 Column = NDArray[Any] | Sequence[str] | str
 Fields = dict[str, NDArray[Any]]
+_LAST_UNIT = 0xFFFF  # of UTF-16
 _TRIED = 64  # layouts, before rows are looked at one by one
 
 
@@ -316,19 +317,28 @@ def _texts(block: NDArray[np.void], name: str) -> NDArray[np.object_]:
     if name not in block.dtype.names:
         texts.fill("")
         return texts
-    raw = np.ascontiguousarray(block[name])
+    raw, encoding = np.ascontiguousarray(block[name]), "utf-8"
+    if raw.dtype.kind == "u":  # a wstring
+        raw, encoding = _utf16(raw, name), "utf-16-le"
     if (raw == raw[:1]).all():
-        texts.fill(_text(raw[0], name))
+        texts.fill(_text(raw[0], name, encoding))
         return texts
     distinct, which = np.unique(raw, return_inverse=True)
-    return np.array([_text(value, name) for value in distinct], object)[which]
+    return np.array([_text(value, name, encoding) for value in distinct], object)[which]
 
 
-def _text(value: np.void, name: str) -> str:
+def _utf16(units: NDArray[Any], name: str) -> NDArray[np.void]:
+    """Turn each row of words of four bytes, which hold one unit each, into UTF-16."""
+    if (units > _LAST_UNIT).any():
+        raise LogError(f"{name}: a wstring is not UTF-16 in words of four bytes")
+    return units.astype("<u2").view(f"V{2 * units.shape[1]}")[:, 0]
+
+
+def _text(value: np.void, name: str, encoding: str) -> str:
     try:
-        return value.tobytes().decode()
+        return value.tobytes().decode(encoding)
     except UnicodeDecodeError as error:
-        raise LogError(f"{name}: a string is not UTF-8") from error
+        raise LogError(f"{name}: a string is not {error.encoding.upper()}") from error
 
 
 def _messages(array: MessageArray, block: NDArray[np.void]) -> NDArray[np.object_]:

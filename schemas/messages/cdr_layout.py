@@ -23,6 +23,7 @@ _FORMATS = {
     "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+TEXTS = {"string", "wstring"}
 _STAMPS = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 _FIELDS_LIMIT = 10_000
 _DEPTH_LIMIT = 32
@@ -135,7 +136,7 @@ def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -
     row: NDArray[Any]
     if node is Nodetype.NAME:
         row = np.zeros(1, np.int64)
-    elif node is Nodetype.BASE and kind[0] == "string":
+    elif node is Nodetype.BASE and kind[0] in TEXTS:
         row = np.array([value or ""], object)
     elif node is Nodetype.BASE:
         row = np.array([value or 0], number_type(kind[0]))
@@ -145,7 +146,7 @@ def _defaults(path: str, node: Nodetype, kind: Any, value: float | str | None) -
         if element is Nodetype.NAME:
             row = np.empty(1, object)
             row[0] = []
-        elif base[0] == "string":
+        elif base[0] in TEXTS:
             row = np.full((1, length), "", object)
         else:
             row = np.zeros((1, length), number_type(base[0]))
@@ -170,7 +171,7 @@ class LayoutWalk:
         Byte order, as numpy has it: "<" or ">".
     length_at : callable
         Told the path of a string or sequence and the offset of its length word in bytes; returns
-        its length. That of a string is in bytes, with its end.
+        its length. That of a string is in bytes, with its end; that of a wstring in UTF-16 units.
     size : int
         Bytes of the message, at most.
 
@@ -237,10 +238,6 @@ class LayoutWalk:
             the message ends before one of its fields, or has too many of them.
         """
         if name not in self._types:
-            if name.endswith("/wstring"):
-                raise LogError(
-                    f"{self._name}: {prefix[:-1]} is of type wstring, which is not supported"
-                )
             raise LogError(f"{self._name}: builds on {name}, which is not defined")
         self._step()
         self._depth += 1
@@ -262,8 +259,8 @@ class LayoutWalk:
         if node is Nodetype.NAME:
             return self.message(kind, f"{path}.")
         if node is Nodetype.BASE:
-            if kind[0] == "string":
-                self._text(path)
+            if kind[0] in TEXTS:
+                self._text(path, kind[0])
                 return (Leaf(path, "text", (path,)),)
             self._numbers(path, kind[0])
             return (Leaf(path, "number", (path,)),)
@@ -276,10 +273,10 @@ class LayoutWalk:
         if element is Nodetype.NAME:
             elements = [self.message(base, f"{path}[{i}].") for i in self._range(path, count)]
             return MessageArray(path, tuple(elements))
-        if base[0] == "string":
+        if base[0] in TEXTS:
             names = tuple(f"{path}[{i}]" for i in self._range(path, count))
             for name in names:
-                self._text(name)
+                self._text(name, base[0])
             return Leaf(path, "texts", names)
         self._numbers(path, base[0], count)
         return Leaf(path, "number", (path,))
@@ -301,10 +298,15 @@ class LayoutWalk:
         else:
             self._add(path, f"({count},){form}", alignment if count else 1)
 
-    def _text(self, path: str) -> None:
+    def _text(self, path: str, base: str) -> None:
         length = self._length(path)
         if length > self._size:
             raise LogError(f"{self._name}: a message ends before its field {path}")
+        if base == "wstring":
+            # As the middlewares of ROS 2 have it: UTF-16, a word of four bytes a unit, no end.
+            if length:
+                self._add(path, f"({length},){self._order}u4", 4)
+            return
         if length > 1:
             self._add(path, f"V{length - 1}", 1)
         if length:

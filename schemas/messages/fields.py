@@ -8,6 +8,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.messages.cdr_layout import TEXTS
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
 from hearthlog.schemas.messages.versions import APPENDED
@@ -64,7 +65,7 @@ def _fields(
             raise LogError(f"{kind.name}: has too many fields")
         path = f"{prefix}{field}"
         if node is Nodetype.BASE:
-            yield path, Field(details[0])
+            yield path, Field(_type(details[0]))
         elif node is Nodetype.NAME and details in {TIME, DURATION}:
             yield path, Field(details)
         elif node is Nodetype.NAME:
@@ -75,7 +76,11 @@ def _fields(
             if element is Nodetype.NAME:
                 yield path, Field("", size, dict(_fields(kind, base, "", depth + 1, left)))
             else:
-                yield path, Field(base[0], size)
+                yield path, Field(_type(base[0]), size)
+
+
+def _type(base: str) -> str:
+    return "string" if base in TEXTS else base
 
 
 def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:

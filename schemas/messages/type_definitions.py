@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from hearthlog.schemas.errors import LogError
@@ -25,6 +26,7 @@ _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
 # How MCAP's registry joins the files of a type, and lines of them that rosbags does not read.
 _IDL_FILE = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
+_WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")
 _INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
 
 
@@ -164,7 +166,7 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         raise LogError(f"the definition of {name} is too long")
     try:
         if encoding == "ros2msg":
-            types = get_types_from_msg(text.decode(), name)
+            types = _types_from_msg(text.decode(), name)
         elif encoding == "ros2idl":
             types = _types_from_idl(text.decode())
         else:
@@ -178,6 +180,23 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
         if key.startswith(f"{PACKAGE}/") and key in ours and fields != ours[key]
     }
     return MessageType(name, ours | theirs, growth)
+
+
+def _types_from_msg(text: str, name: str) -> dict[str, Any]:
+    """Read a definition; a wstring, which rosbags takes for a message, is a wstring."""
+    types = get_types_from_msg(_WSTRING_BOUND.sub("", text), name)
+    return {
+        key: (constants, [(field, _with_wstring(*described)) for field, described in fields])
+        for key, (constants, fields) in types.items()
+    }
+
+
+def _with_wstring(node: Nodetype, details: Any) -> tuple[Nodetype, Any]:
+    if node is Nodetype.NAME and details.endswith("/wstring"):
+        return Nodetype.BASE, ("wstring", 0)
+    if node in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+        return node, (_with_wstring(*details[0]), details[1])
+    return node, details
 
 
 def _types_from_idl(text: str) -> dict[str, Any]:
