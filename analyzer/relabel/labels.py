@@ -1,4 +1,4 @@
-"""The task of a worker: the labels and segments of one log."""
+"""The tasks of a worker: the labels and segments of logs, and the layers that hold them."""
 
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ from hearthlog.models.labels.labeller import segment_columns
 from hearthlog.models.labels.segments import Run, Segment
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.logs.digest import log_digest
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.log_stream import LogStreamWriter, TopicBatch
@@ -129,37 +129,62 @@ class UnfinishedLayer(NamedTuple):
         sounds = [sound.with_start(open_at_start.get(sound.microphone)) for sound in self.sounds]
         return self._replace(sounds=sounds)
 
+    def delete(self) -> None:
+        """Delete the file of the labels, if it is there."""
+        with suppress(OSError):
+            self.part.unlink()
 
-def label_log(job: Job) -> UnfinishedLayer:
-    """Write the labels of a log, and find its segments.
+
+_Labellers = dict[str, StreamLabeller]  # by microphone
+
+
+def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | HearthlogError]:
+    """Write the labels of logs, and find their segments.
 
     The whole parts of a damaged log are labelled.
 
     Parameters
     ----------
-    job : Job
+    jobs : sequence of Job
+        Of logs of one chain, each the next of the one before it.
 
     Returns
     -------
-    UnfinishedLayer
-        The labels are in its file `part`, which belongs to the caller.
-
-    Raises
-    ------
-    LogError
-        If the log has no features, or those of another set than the model's; if nothing of it is
-        whole; if the labels cannot be written.
-    ModelError
-        If the file of the model is missing or damaged, or holds another model.
+    list of UnfinishedLayer or HearthlogError
+        One for each log. The labels are in the file `part` of a layer, which belongs to the caller.
+        A LogError if the log has no features, or those of another set than the model's; if nothing
+        of it is whole; if the labels cannot be written. A ModelError if the file of the model is
+        missing or damaged, or holds another model.
     """
+    layers: list[UnfinishedLayer | HearthlogError] = []
+    labellers: _Labellers = {}
+    try:
+        for job in jobs:
+            try:
+                layer, labellers = _label_log(job, labellers)
+                layers.append(layer)
+            except HearthlogError as error:
+                layers.append(error)
+                labellers = {}
+    except BaseException:
+        for unclaimed in layers:
+            if isinstance(unclaimed, UnfinishedLayer):
+                unclaimed.delete()
+        raise
+    return layers
+
+
+def _label_log(job: Job, before: "_Labellers") -> tuple[UnfinishedLayer, "_Labellers"]:
+    """Label a log; return also the labellers at its end, if the next log may go on with them."""
     model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:
         try:
-            return _label(job, job.log, model, classifier)
+            return _label(job, job.log, before, model, classifier)
         except UnreadableError:
             copy, loss = recover_copy(job.log, Path(folder))
         try:
-            return _label(job, copy, model, classifier)._replace(loss=loss)
+            layer, _ = _label(job, copy, {}, model, classifier)
+            return layer._replace(loss=loss), {}
         except UnreadableError as error:
             raise LogError(str(error).replace(str(copy), str(job.log))) from error
 
@@ -263,36 +288,52 @@ class _Begun(NamedTuple):
     lacks_start: bool
 
 
-def _label(job: Job, log: Path, model: Model, classifier: Classifier) -> UnfinishedLayer:
+def _label(
+    job: Job, log: Path, before: _Labellers, model: Model, classifier: Classifier
+) -> tuple[UnfinishedLayer, _Labellers]:
     """Label a log, or the copy that was saved of it."""
     infos, left_out = infos_for_model(log, model, job.log)
-    begun = [_begin(job, info, classifier) for info in infos]
+    begun = [_begin(job, info, before.get(info.microphone), classifier) for info in infos]
     part = part_path(job.layer)
     frames = _write_labels(part, job, begun, model)
     following = [_goes_on(job, each) for each in begun]
     ends = zip(begun, frames, following, strict=True)
     sounds = [_end(each, count, goes_on=bool(goes_on)) for each, count, goes_on in ends]
-    before = stem(job.earlier[0]) if job.earlier else ""
+    earlier = stem(job.earlier[0]) if job.earlier else ""
     behind = "" if job.next_log is None or None in following else stem(job.next_log)
-    return UnfinishedLayer(
+    layer = UnfinishedLayer(
         part=part,
-        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), before, behind),
+        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), earlier, behind),
         node=infos[0].node,
         provenance=infos[0].metadata,
         sounds=sounds,
         left_out=left_out,
         loss="" if infos[0].complete else "it is cut off",
     )
+    return layer, {each.info.microphone: each.labeller for each in begun}
 
 
-def _begin(job: Job, info: RecorderInfo, classifier: Classifier) -> _Begun:
-    labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
+def _begin(
+    job: Job, info: RecorderInfo, before: StreamLabeller | None, classifier: Classifier
+) -> _Begun:
+    """Take the labeller at the end of the log before, or one that comes to the same labels."""
+    if before is not None and _leads_up_to(before, job, info):
+        labeller = before
+        labeller.segments = []  # the others are those of the log before
+    else:
+        labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
     open_at_start = labeller.open_run
     lacks_start = job.continues_layer and open_at_start is not None
     if lacks_start:
         labeller.discard_open()
         open_at_start = None
     return _Begun(info, labeller, open_at_start, lacks_start)
+
+
+def _leads_up_to(labeller: StreamLabeller, job: Job, info: RecorderInfo) -> bool:
+    first = info.first_frame
+    follows = first is not None and labeller.is_followed_by(first)
+    return follows and job.continues_layer and labeller.states_converged
 
 
 def _goes_on(job: Job, begun: _Begun) -> bool | None:

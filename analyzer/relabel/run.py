@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from hearthlog.analyzer.errors import LostClusterError
 from hearthlog.analyzer.logs.layers import Chain, find_chains
 from hearthlog.analyzer.relabel.jobs import Job, is_current, make_job
-from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_log
+from hearthlog.analyzer.relabel.labels import UnfinishedLayer, complete_layer, label_logs
 from hearthlog.analyzer.relabel.layer import (
     LayerMetadata,
     OpenRuns,
@@ -89,6 +88,9 @@ def relabel(
     return work.result
 
 
+_LONGEST_STRETCH = 8  # logs, which are labelled in one task
+
+
 class _State(Enum):
     CURRENT = auto()  # the layer may stay, if it continues the layer before
     WAITING = auto()  # for a worker
@@ -134,24 +136,24 @@ class _Relabelling:
         self._model = model
         self._model_path = model_path
         self._workers = workers
-        self._running: dict[Future[Any], tuple[_ChainQueue, _Task]] = {}
-        self._parts: set[Path] = set()  # unfinished layers
+        self._running: dict[Future[Any], tuple[_ChainQueue, Sequence[_Task]]] = {}
+        self._unfinished: dict[Path, UnfinishedLayer] = {}  # by their files
 
     def run(self, progress: Callable[[int], None]) -> None:
         """Label all logs; `progress` is told how many are done."""
-        waiting = self._waiting_tasks()
+        waiting = self._stretches()
         try:
             while True:
-                while len(self._running) < self._most_running and (task := next(waiting, None)):
-                    self._submit(*task)
+                while len(self._running) < self._most_running and (some := next(waiting, None)):
+                    self._submit(*some)
                 progress(self.result.logs)
                 if not self._running:
                     return
                 for future in wait(self._running, return_when=FIRST_COMPLETED).done:
                     self._receive(future)
         finally:
-            for part in tuple(self._parts):  # none, unless an error stopped the run
-                self._delete(part)
+            for layer in self._unfinished.values():  # none, unless an error stopped the run
+                layer.delete()
 
     @property
     def _most_running(self) -> int:
@@ -159,18 +161,35 @@ class _Relabelling:
         parallel = self._workers.parallel
         return 2 * parallel if parallel > 1 else 1
 
-    def _waiting_tasks(self) -> Iterator[tuple[_ChainQueue, _Task]]:
-        """Look at the logs of one chain after the other, and yield those to be labelled."""
+    def _stretches(self) -> Iterator[tuple[_ChainQueue, Sequence[_Task]]]:
+        """Look at the logs of one chain after the other, and yield those to be labelled.
+
+        Logs that follow each other are yielded together, since the sound before the first of them
+        has to be labelled, too. Towards the end of a chain they are fewer, so that the workers come
+        to its end together.
+        """
         for chain in self._chains:
             queue = _ChainQueue(chain)
             layers = map_logs(self._look_at, list(chain.asked.values()))
+            stretch: list[_Task] = []
+            left = len(chain.asked)
             for place, layer in zip(chain.asked, layers, strict=True):
                 task = self._task(chain, place, layer)
+                waits = task is not None and task.state is _State.WAITING
+                longest = min(-(-left // self._most_running), _LONGEST_STRETCH)
+                if stretch and not (
+                    waits and stretch[-1].place == place - 1 and len(stretch) < longest
+                ):
+                    left -= len(stretch)
+                    yield queue, stretch
+                    stretch = []
                 if task is not None:
                     queue.tasks.append(task)
-                    if task.state is _State.WAITING:
-                        yield queue, task
+                    if waits:
+                        stretch.append(task)
                     self._advance(queue)
+            if stretch:
+                yield queue, stretch
 
     def _look_at(self, log: Path) -> tuple[LayerMetadata | None, str] | HearthlogError:
         """Read the metadata of a log's layer, and the digest of the log."""
@@ -204,25 +223,40 @@ class _Relabelling:
             chain, place, self._model, self._model_path, continues_layer=continues_layer
         )
 
-    def _submit(self, queue: _ChainQueue, task: _Task) -> None:
-        task.state = _State.RUNNING
-        self._running[self._workers.submit(label_log, task.job)] = queue, task
+    def _submit(self, queue: _ChainQueue, tasks: Sequence[_Task]) -> None:
+        for task in tasks:
+            task.state = _State.RUNNING
+        future = self._workers.submit(label_logs, [task.job for task in tasks])
+        self._running[future] = queue, tasks
 
     def _receive(self, future: Future[Any]) -> None:
         """Take the result of a worker."""
-        queue, task = self._running.pop(future)
+        queue, tasks = self._running.pop(future)
         error = future.exception()
         if error is not None:
             if isinstance(error, LostClusterError) or not isinstance(error, Exception):
                 raise error
-            self._fail(queue, task, error)
-        elif isinstance(labelled := future.result(), UnfinishedLayer):
-            task.state, task.labelled = _State.LABELLED, labelled
-            check_version(labelled.provenance, task.job.log)
-            self._parts.add(labelled.part)
+            if len(tasks) == 1:
+                self._fail(queue, tasks[0], error)
+            else:
+                for task in tasks:  # one of them is to blame
+                    self._submit(queue, [task])
+        elif (layers := future.result()) is None:
+            self._note_layer(tasks[0])
         else:
-            self._note_layer(task)
+            for task, layer in zip(tasks, layers, strict=True):
+                self._take(queue, task, layer)
         self._advance(queue)
+
+    def _take(
+        self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer | HearthlogError
+    ) -> None:
+        if isinstance(labelled, HearthlogError):
+            self._fail(queue, task, labelled)
+            return
+        task.state, task.labelled = _State.LABELLED, labelled
+        check_version(labelled.provenance, task.job.log)
+        self._unfinished[labelled.part] = labelled
 
     def _fail(self, queue: _ChainQueue, task: _Task, error: Exception) -> None:
         """Note that a log was not relabelled; the others go on."""
@@ -233,7 +267,7 @@ class _Relabelling:
         if task in queue.tasks:  # it is not, if its layer was to be completed
             queue.tasks.remove(task)
         if task.labelled is not None:
-            self._delete(task.labelled.part)
+            self._delete(task.labelled)
 
     def _advance(self, queue: _ChainQueue) -> None:
         """Complete layers, in the order of time, up to the first log that is not labelled."""
@@ -248,7 +282,7 @@ class _Relabelling:
             else:
                 assert task.metadata is not None  # it is current
                 if follows and task.metadata.open_at_start != queue.open_runs:
-                    self._submit(queue, task)
+                    self._submit(queue, [task])
                 else:
                     self.result.current.append(task.job.layer)
                     queue.pop(task.metadata.open_at_end)
@@ -256,24 +290,23 @@ class _Relabelling:
     def _complete(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
         task.labelled = labelled
         queue.pop(labelled.open_at_end)
-        self._running[self._workers.submit(complete_layer, task.job, labelled)] = queue, task
+        self._running[self._workers.submit(complete_layer, task.job, labelled)] = queue, [task]
 
     def _label_alone(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
         """Label a log once more, by itself: the layer before, which it should continue, failed."""
-        self._delete(labelled.part)
+        self._delete(labelled)
         job = self._job(queue.chain, task.place, continues_layer=False)
         task.job = job._replace(replaces=task.job.replaces)
         task.labelled = None
-        self._submit(queue, task)
+        self._submit(queue, [task])
 
-    def _delete(self, part: Path) -> None:
-        self._parts.discard(part)
-        with suppress(OSError):
-            part.unlink()
+    def _delete(self, labelled: UnfinishedLayer) -> None:
+        self._unfinished.pop(labelled.part, None)
+        labelled.delete()
 
     def _note_layer(self, task: _Task) -> None:
         assert task.labelled is not None
-        self._parts.discard(task.labelled.part)
+        self._unfinished.pop(task.labelled.part, None)
         self.result.layers.append(task.job.layer)
         self.result.frames += task.labelled.frames
         self.result.left_out |= task.labelled.left_out

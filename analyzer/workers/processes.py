@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from importlib import import_module
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any, ParamSpec, TypeVar
@@ -39,15 +40,21 @@ class Processes:
     ----------
     count : int
         Number of processes, at least 1.
+    module : str, optional
+        Name of the module of the tasks. The processes are started at once and import it while there
+        is no task yet; without it each is started by its first task.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, module: str | None = None) -> None:
         self.parallel = count
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._mine = threading.local()
         self._lock = threading.Lock()
         self._alive: set[_Process] = set()
         self._closed = False
+        if module is not None:
+            for _ in range(count):
+                self.submit(import_module, module)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a function once a process is free.

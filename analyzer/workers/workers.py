@@ -42,7 +42,9 @@ class Workers(Protocol):
 
 
 @contextmanager
-def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Workers]:
+def open_workers(
+    count: int = 1, scheduler: str | None = None, module: str | None = None
+) -> Iterator[Workers]:
     """Open workers; tasks that are not done when the block ends are given up.
 
     Parameters
@@ -52,6 +54,9 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
         submitted.
     scheduler : str, optional
         Address of a running Dask cluster, as `tcp://host:port`; its workers are used instead.
+    module : str, optional
+        Name of the module of the tasks: processes start and import it at once, not with the first
+        task.
 
     Yields
     ------
@@ -69,7 +74,7 @@ def open_workers(count: int = 1, scheduler: str | None = None) -> Iterator[Worke
     elif count == 1:
         yield InlineWorkers()
     else:
-        with closing(Processes(count)) as processes:
+        with closing(Processes(count, module)) as processes:
             yield processes
 
 

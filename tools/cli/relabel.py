@@ -14,6 +14,8 @@ from hearthlog.tools.cli.text import first_of, number, tell
 if TYPE_CHECKING:
     from hearthlog.analyzer.relabel.run import Relabelled
 
+_TASKS = "hearthlog.analyzer.relabel.labels"
+
 
 def relabel(
     logs: Logs,
@@ -38,19 +40,19 @@ def relabel(
 
     Exit status 3: a log is damaged, or was not relabelled; the others are done.
     """
-    from hearthlog.analyzer.relabel.run import relabel as run
     from hearthlog.analyzer.workers import open_workers
-    from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.tools.cli.progress import share_done
 
-    loaded = load_model(model)
     where = model.resolve() if model.exists() else model  # the name of a starter model
     count = workers or os.cpu_count() or 1
-    with (
-        open_workers(count, scheduler) as pool,
-        share_done("labelling logs", announce=True) as report,
-    ):
-        result = run(logs, loaded, where, pool, report)
+    with open_workers(count, scheduler, _TASKS) as pool:
+        # Here, since it takes as long as the workers take to be ready.
+        from hearthlog.analyzer.relabel.run import relabel as run
+        from hearthlog.models.modelfile.modelfile import load_model
+
+        loaded = load_model(model)
+        with share_done("labelling logs", announce=True) as report:
+            result = run(logs, loaded, where, pool, report)
     if as_json:
         print(json.dumps(_as_json(result, loaded.name, loaded.sha256), indent=2))
     else:
