@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event as Flag
 
@@ -27,10 +27,13 @@ from stores import put
 from together import record_together
 
 from hearthlog.analyzer.doctor import examine
+from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.logs.layers import find_chains
+from hearthlog.analyzer.relabel.labels import label_logs
 from hearthlog.analyzer.relabel.layer import read_layer_metadata
 from hearthlog.analyzer.relabel.run import relabel
 from hearthlog.analyzer.workers import open_workers
+from hearthlog.analyzer.workers.workers import InlineWorkers
 from hearthlog.models.classifiers.timing import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
@@ -575,6 +578,31 @@ def test_a_log_that_cannot_be_labelled_costs_nothing_but_its_own_layer(
     assert done.returncode == 3
     assert f"{log}: has no features" in done.stderr
     assert set(written(logs)) == set(layers) - {relabel_path(log, load_model(model).name).name}
+
+
+class DeadlyWorkers(InlineWorkers):
+    """Lose the worker of each task that has a certain log."""
+
+    def __init__(self, victim):
+        self.victim = victim
+
+    def submit(self, function, *args):
+        if function is label_logs and self.victim in {job.log for job in args[0]}:
+            lost = Future()
+            lost.set_exception(WorkerError("the task lost its worker 3 times"))
+            return lost
+        return super().submit(function, *args)
+
+
+def test_a_log_that_kills_its_worker_costs_nothing_but_its_own_layer(model, night, tmp_path):
+    logs = Path(shutil.copytree(night, tmp_path / "night"))
+    whole = Path(shutil.copytree(night, tmp_path / "whole"))
+    relabelled(model, whole)
+    victim = recorded_logs(logs)[2]
+    done = relabel([logs], load_model(model), model, DeadlyWorkers(victim))
+    assert done.failed == {victim: "the task lost its worker 3 times"}
+    layer = relabel_path(victim, load_model(model).name).name
+    assert written(logs) == {k: v for k, v in written(whole).items() if k != layer}
 
 
 def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, capfd):

@@ -138,7 +138,7 @@ class UnfinishedLayer(NamedTuple):
 _Labellers = dict[str, StreamLabeller]  # by microphone
 
 
-def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | HearthlogError]:
+def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
     """Write the labels of logs, and find their segments.
 
     The whole parts of a damaged log are labelled.
@@ -150,25 +150,33 @@ def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | HearthlogError]:
 
     Returns
     -------
-    list of UnfinishedLayer or HearthlogError
+    list of UnfinishedLayer or None
         One for each log. The labels are in the file `part` of a layer, which belongs to the caller.
-        A LogError if the log has no features, or those of another set than the model's; if nothing
-        of it is whole; if the labels cannot be written. A ModelError if the file of the model is
-        missing or damaged, or holds another model.
+        None if one of several logs failed: alone, it raises its error.
+
+    Raises
+    ------
+    LogError
+        If the log has no features, or those of another set than the model's; if nothing of it is
+        whole; if the labels cannot be written.
+    ModelError
+        If the file of the model is missing or damaged, or holds another model.
     """
-    layers: list[UnfinishedLayer | HearthlogError] = []
+    layers: list[UnfinishedLayer | None] = []
     labellers: _Labellers = {}
     try:
         for job in jobs:
             try:
                 layer, labellers = _label_log(job, labellers)
                 layers.append(layer)
-            except HearthlogError as error:
-                layers.append(error)
+            except HearthlogError:
+                if len(jobs) == 1:
+                    raise
+                layers.append(None)
                 labellers = {}
     except BaseException:
         for unclaimed in layers:
-            if isinstance(unclaimed, UnfinishedLayer):
+            if unclaimed is not None:
                 unclaimed.delete()
         raise
     return layers
@@ -317,7 +325,8 @@ def _begin(
     job: Job, info: RecorderInfo, before: StreamLabeller | None, classifier: Classifier
 ) -> _Begun:
     """Take the labeller at the end of the log before, or one that comes to the same labels."""
-    if before is not None and _leads_up_to(before, job, info):
+    first = info.first_frame
+    if before is not None and first is not None and before.is_followed_by(first):
         labeller = before
         labeller.segments = []  # the others are those of the log before
     else:
@@ -328,12 +337,6 @@ def _begin(
         labeller.discard_open()
         open_at_start = None
     return _Begun(info, labeller, open_at_start, lacks_start)
-
-
-def _leads_up_to(labeller: StreamLabeller, job: Job, info: RecorderInfo) -> bool:
-    first = info.first_frame
-    follows = first is not None and labeller.is_followed_by(first)
-    return follows and job.continues_layer and labeller.states_converged
 
 
 def _goes_on(job: Job, begun: _Begun) -> bool | None:

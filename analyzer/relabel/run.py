@@ -245,15 +245,13 @@ class _Relabelling:
             self._note_layer(tasks[0])
         else:
             for task, layer in zip(tasks, layers, strict=True):
-                self._take(queue, task, layer)
+                if layer is None:
+                    self._submit(queue, [task])  # its error may be that of a store for a moment
+                else:
+                    self._take(task, layer)
         self._advance(queue)
 
-    def _take(
-        self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer | HearthlogError
-    ) -> None:
-        if isinstance(labelled, HearthlogError):
-            self._fail(queue, task, labelled)
-            return
+    def _take(self, task: _Task, labelled: UnfinishedLayer) -> None:
         task.state, task.labelled = _State.LABELLED, labelled
         check_version(labelled.provenance, task.job.log)
         self._unfinished[labelled.part] = labelled
