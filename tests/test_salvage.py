@@ -329,6 +329,29 @@ def test_chunks_that_stand_elsewhere_or_twice_are_no_loss(log, recover):
     assert result.recovery.lossless
 
 
+def test_frames_behind_the_end_are_saved_and_said_to_be_out_of_place(log, recover):
+    data, records = log
+    moved = [r for r in records if r.opcode == CHUNK][4]
+    result = recover(data[: moved.start] + data[moved.end :] + data[moved.start : moved.end])
+    assert sorted(result.messages) == sorted(messages_of(records))
+    assert all(damage.lossless for damage in result.recovery.damages)
+    assert result.recovery.losses == [
+        "frames are missing, or lie elsewhere in the log: see its gaps"
+    ]
+    assert not result.recovery.lossless
+
+
+def test_a_chunk_without_a_checksum_whose_times_are_not_those_of_its_head_is_no_proof(recover):
+    data, messages = written(CompressionType.NONE, crcs=False)
+    _, time, payload = messages[0]
+    assert recover(data).recovery.lossless
+    times = data.index(struct.pack("<QQ", time, 0) + payload)  # of the first message
+    result = recover(data[:times] + bytes(8) + data[times + 8 :])
+    assert len(result.messages) == len(messages)
+    (loss,) = result.recovery.losses
+    assert "the head of a chunk is wrong" in loss
+
+
 def test_a_metadata_record_or_an_attachment_that_is_cut_out_is_missed(log, recover):
     data, records = log
     for opcode, name in ((METADATA, "the metadata 'hearthlog'"), (ATTACHMENT, "the attachment")):

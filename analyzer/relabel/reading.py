@@ -134,8 +134,7 @@ def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
         recovery = recover_log(source, copy, log.name)
     except OSError as error:
         raise LogError(f"{log}: what is whole cannot be copied ({error.strerror})") from error
-    losses = [str(damage) for damage in recovery.damages if not damage.lossless]
-    return copy, "; ".join(losses)[:_LONGEST_LOSS_TEXT]
+    return copy, "; ".join(recovery.losses)[:_LONGEST_LOSS_TEXT]
 
 
 def warm_up(

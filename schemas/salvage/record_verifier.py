@@ -261,11 +261,13 @@ class RecordVerifier:
         definitions = whole_records.read_definitions(content, others)
         entries = index_messages(content, messages)
         span = whole_records.span_of(entries)
-        wrong = "" if exact and (not entries or span == (start, end)) else "the head of a chunk"
+        agrees = not entries or span == (start, end)
+        wrong = "" if exact and agrees else "the head of a chunk"
         chunk = StoredChunk(compression, data, size, checksum, *span, entries)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
         whole = WholeChunk(chunk, definitions, leading)
-        return WholeRecord(offset, outer if padded else offset + first + number, whole, wrong)
+        behind = outer if padded else offset + first + number
+        return WholeRecord(offset, behind, whole, wrong, proved=bool(crc) or agrees)
 
     def _is_padded(self, inner: int, outer: int) -> bool:
         """Tell whether a record holds more than this version of the format knows.

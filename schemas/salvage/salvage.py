@@ -163,7 +163,8 @@ class Salvage:
                 self.offset = self._pass(offset, str(error))
                 continue
             if whole.corrected:
-                self._damages.add(Damage(offset, whole.end, f"{whole.corrected} is wrong"))
+                why = f"{whole.corrected} is wrong"
+                self._damages.add(Damage(offset, whole.end, why, exact=whole.proved))
             self.offset = whole.end
             self._last_index = offset if whole.record is None else None
             self._compare_index(whole)

@@ -47,7 +47,15 @@ class Recovery:
     @property
     def lossless(self) -> bool:
         """Whether nothing was lost."""
-        return all(damage.lossless for damage in self.damages)
+        return not self.losses
+
+    @property
+    def losses(self) -> list[str]:
+        """What was lost: a text for each damage, or one where only the frames tell of it."""
+        losses = [str(damage) for damage in self.damages if not damage.lossless]
+        if not losses and any(topic.stated for topic in self.topics.values()):
+            return ["frames are missing, or lie elsewhere in the log: see its gaps"]
+        return losses
 
 
 class Selection(Protocol):

@@ -44,6 +44,7 @@ class WholeRecord(NamedTuple):
     end: int
     record: McapRecord | WholeChunk | WholeAttachment | None  # None for a message index
     corrected: str = ""  # what of its head was wrong
+    proved: bool = True  # False: without a checksum, what is in it may be wrong instead
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:

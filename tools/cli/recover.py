@@ -79,8 +79,8 @@ def _say(log: Path, recovery: "Recovery") -> None:
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
     tell(f"{log}: {recovery.messages}{of} messages saved{end}")
-    for damage in recovery.damages:
-        tell(f"{log}: {damage}")
+    for text in dict.fromkeys([*map(str, recovery.damages), *recovery.losses]):
+        tell(f"{log}: {text}")
 
 
 def _as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:
