@@ -243,3 +243,39 @@ def test_messages_of_several_channels_are_put_in_order_of_time(tmp_path):
     message = message_types.decode(part.payload(row), part.schema.name)
     assert message.frame == 150
     assert list(in_order_of_time([])) == []
+
+
+def test_topics_may_be_chosen_by_what_tells_one(tmp_path):
+    topics = [Topic(f"/{name}/features", message_types.FEATURES) for name in ("one", "two", "six")]
+    finished = LogWriter(tmp_path / "home_0.mcap", topics, {})
+    growing = LogWriter(tmp_path / "home_1.mcap", topics, {})
+    for writer in (finished, growing):
+        for topic in topics:
+            fields = {
+                "header.stamp": np.arange(1),
+                "header.frame_id": "mic",
+                "frame": np.arange(1),
+                "values": np.zeros((1, 3), np.float32),
+            }
+            writer.write_columns([TopicBatch(topic.name, np.arange(1), fields)])
+        writer.flush()
+    finished.finish()
+    followed = follow(tmp_path, lambda name: name.startswith("/t"), start=0)
+    names = [[columns.topic for columns in next(followed)] for _ in range(2)]
+    assert names == [["/two/features"]] * 2
+    growing.abandon()
+
+
+def test_while_nothing_is_written_there_are_ticks_and_only_then(tmp_path):
+    writer = log(tmp_path, "home.mcap")
+    write(writer, 0)
+    followed = follow_messages(tmp_path, start=0, ticks=True)
+    path, messages = next(followed)
+    assert (path.name, len(messages)) == ("home.mcap.active", 1)
+    for first in (20, 40):
+        assert next(followed) == (tmp_path, [])
+        write(writer, first)
+        (columns,) = decode(next(followed)[1])
+        assert columns["frame"].tolist() == list(range(first, first + 20))
+    writer.abandon()
+    followed.close()

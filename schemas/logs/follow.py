@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from threading import Event
@@ -11,7 +11,12 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import ENROLLED, SUFFIX, is_active, is_log, stem
 from hearthlog.schemas.logs.merged_reading import iterate_messages
-from hearthlog.schemas.mcap.chunks import read_chunks, read_definitions, read_in_batches
+from hearthlog.schemas.mcap.chunks import (
+    TopicChoice,
+    read_chunks,
+    read_definitions,
+    read_in_batches,
+)
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 
@@ -21,7 +26,7 @@ _SETTLED = 2_000_000_000  # ns after which a folder's time of change tells a fur
 
 def follow(
     folder: Path,
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
     start: int | None = None,
     fields: Collection[str] | None = None,
     stop: Event | None = None,
@@ -35,8 +40,8 @@ def follow(
     folder : Path
         Logs may lie at any depth. Files that are there but not being written are read first, if
         `start` asks for them.
-    topics : collection of str, optional
-        Names of the topics; all by default.
+    topics : collection of str or callable, optional
+        Names of the topics, or what tells whether one is read; all by default.
     start : int, optional
         Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
         written from now on.
@@ -69,12 +74,13 @@ def _refuse(error: LogError) -> None:
 
 def follow_messages(  # noqa: PLR0913
     folder: Path,
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
     start: int | None = None,
     stop: Event | None = None,
     damaged: Damaged = _refuse,
     *,
     infos: bool = False,
+    ticks: bool = False,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     """Read the messages of logs, still encoded, as they are written; as `follow` does.
 
@@ -82,8 +88,8 @@ def follow_messages(  # noqa: PLR0913
     ----------
     folder : Path
         Logs may lie at any depth.
-    topics : collection of str, optional
-        Names of the topics; all by default.
+    topics : collection of str or callable, optional
+        Names of the topics, or what tells whether one is read; all by default.
     start : int, optional
         Log time, in nanoseconds of UTC, from which on messages are read; by default those that are
         written from now on.
@@ -95,6 +101,9 @@ def follow_messages(  # noqa: PLR0913
     infos : bool
         Whether the `AudioStreamInfo` messages of the logs that are being written come first, also
         those that were written before.
+    ticks : bool
+        Whether the folder with an empty list comes five times a second while nothing is written,
+        when all that was written has been read: for who judges how long ago that was.
 
     Yields
     ------
@@ -113,15 +122,14 @@ def follow_messages(  # noqa: PLR0913
         raise LogError(f"{folder}: no such folder")
     watch = _Folder(folder)
     present = watch.new_logs()
-    if start is not None:
-        finished = [path for path in present if not is_active(path)]
-        yield from _read_finished(finished, topics, start, damaged)
+    finished = [path for path in present if start is not None and not is_active(path)]
+    yield from _read_finished(finished, topics, start, damaged)
     growing = [g for path in present if is_active(path) for g in _open(path)]
     try:
-        for log in growing if start is None else ():
-            log.file.scan_new()  # and forget what was written before
-        for log in growing if infos else ():
-            yield log.file.path, log.infos_before(start, damaged)
+        if start is None:
+            _forget(growing)
+        if infos:
+            yield from ((log.file.path, log.infos_before(start, damaged)) for log in growing)
         while not stop.is_set():
             has_news = False
             for log in growing:
@@ -131,14 +139,22 @@ def follow_messages(  # noqa: PLR0913
             growing = [log for log in growing if log.is_open()]
             growing += [log for path in watch.new_logs() for log in _open(path)]
             if not has_news:
+                if ticks:
+                    yield folder, []
                 stop.wait(_POLL_SECONDS)
     finally:
         for log in growing:
             log.file.close()
 
 
+def _forget(growing: "Iterable[_Growing]") -> None:
+    """Pass over what was written before now."""
+    for log in growing:
+        log.file.scan_new()
+
+
 def _read_finished(
-    paths: list[Path], topics: Collection[str] | None, start: int, damaged: Damaged
+    paths: list[Path], topics: TopicChoice | None, start: int | None, damaged: Damaged
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     for path in paths:
         try:
@@ -157,7 +173,7 @@ class _Growing:
         self._replaced = False
 
     def read(
-        self, topics: Collection[str] | None, start: int | None, damaged: Damaged
+        self, topics: TopicChoice | None, start: int | None, damaged: Damaged
     ) -> Iterator[list[RawMessages]]:
         """Read what was written since the last time."""
         # Replaced by a recorder that was started again: asked first, so nothing comes in between.

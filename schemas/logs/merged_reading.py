@@ -1,6 +1,6 @@
 """The messages of several logs as one series, in the order of time and within bounded memory."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import chain
 from operator import attrgetter
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunk_table import not_empty
-from hearthlog.schemas.mcap.chunks import read_chunks
+from hearthlog.schemas.mcap.chunks import TopicChoice, is_chosen, read_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import LIMIT
@@ -106,7 +106,7 @@ class _Log:
 class _Query(NamedTuple):
     """What to read: topics, and log times from `start` on, before `end`."""
 
-    topics: Collection[str] | None
+    topics: TopicChoice | None
     start: int
     end: int
     every: int = 1
@@ -118,7 +118,9 @@ class _Query(NamedTuple):
         chunks = chunks[(chunks["end"] >= self.start) & (chunks["start"] < self.end)][:: self.every]
         if self.topics is None:
             return chunks
-        others = {i for i, channel in file.channels.items() if channel.topic not in self.topics}
+        others = {
+            i for i, channel in file.channels.items() if not is_chosen(channel.topic, self.topics)
+        }
         return file.with_channels(chunks, frozenset().union(*file.channel_sets) - others)
 
     def read(self, batch: "_Batch") -> list[RawMessages]:
@@ -151,7 +153,7 @@ class _Batch(NamedTuple):
 
 def iterate_messages(
     logs: Iterable[Path],
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
     start: int | None = None,
     end: int | None = None,
     *,
@@ -162,8 +164,8 @@ def iterate_messages(
     Parameters
     ----------
     logs : iterable of Path
-    topics : collection of str, optional
-        Names of the topics; all by default.
+    topics : collection of str or callable, optional
+        Names of the topics, or what tells whether one is read; all by default.
     start, end : int, optional
         Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
     on_damage : callable, optional
@@ -186,7 +188,7 @@ def iterate_messages(
 
 def iterate_pieces(  # noqa: PLR0913
     logs: Iterable[Path],
-    topics: Collection[str] | None,
+    topics: TopicChoice | None,
     start: int | None,
     end: int | None,
     function: Callable[[list[RawMessages]], list[Piece]],
@@ -198,8 +200,8 @@ def iterate_pieces(  # noqa: PLR0913
     Parameters
     ----------
     logs : iterable of Path
-    topics : collection of str or None
-        Names of the topics; None for all.
+    topics : collection of str, callable or None
+        Names of the topics, or what tells whether one is read; None for all.
     start, end : int or None
         Log times, in nanoseconds of UTC: from `start` on, before `end`. None for no limit.
     function : callable
@@ -220,7 +222,7 @@ def iterate_pieces(  # noqa: PLR0913
     return _iterate(logs, _query(topics, start, end)._replace(every=every), function)
 
 
-def _query(topics: Collection[str] | None, start: int | None, end: int | None) -> _Query:
+def _query(topics: TopicChoice | None, start: int | None, end: int | None) -> _Query:
     return _Query(topics, _FIRST if start is None else start, _LAST if end is None else end)
 
 

@@ -1,6 +1,6 @@
 """The messages of many chunks at once, still encoded, by the message indexes behind each chunk."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import pairwise
 from typing import NamedTuple
@@ -27,13 +27,15 @@ _ENTRY_SIZE = formats.INDEX_ENTRIES.itemsize
 _CHANNELS_LIMIT = 1 << 16
 BATCH_SIZE = 4 << 20  # bytes, stored and decompressed together
 
+TopicChoice = Collection[str] | Callable[[str], bool]  # names, or what tells whether one is chosen
+
 Entries = tuple[Int64, NDArray[np.void]]  # which chunk, and the entry of its index, in each row
 
 
 def read_chunks(
     file: LogFile,
     chunks: NDArray[np.void],
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
 ) -> list[RawMessages]:
     """Read the messages of some topics, or of all, from some chunks of a log.
 
@@ -43,8 +45,9 @@ def read_chunks(
         Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
-    topics : collection of str, optional
-        Topics to read: all of them if None; none if empty, which only adds definitions.
+    topics : collection of str or callable, optional
+        Topics to read, or what tells whether one is read: all of them if None; none if empty, which
+        only adds definitions.
 
     Returns
     -------
@@ -72,7 +75,7 @@ def read_chunks(
 def read_in_batches(
     file: LogFile,
     chunks: NDArray[np.void],
-    topics: Collection[str] | None = None,
+    topics: TopicChoice | None = None,
 ) -> Iterator[list[RawMessages]]:
     """Read chunks as `read_chunks` does, a few megabytes at a time.
 
@@ -82,8 +85,9 @@ def read_in_batches(
         Log of the chunks. Channels and schemas that the chunks define are added to its own.
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
-    topics : collection of str, optional
-        Topics to read: all of them if None; none if empty, which only adds definitions.
+    topics : collection of str or callable, optional
+        Topics to read, or what tells whether one is read: all of them if None; none if empty, which
+        only adds definitions.
 
     Yields
     ------
@@ -140,11 +144,18 @@ def read_definitions(file: LogFile) -> None:
             read_chunks(file, chunks[number : number + 1], topics=())
 
 
-def _other_channels(file: LogFile, topics: Collection[str] | None) -> list[int]:
+def _other_channels(file: LogFile, topics: TopicChoice | None) -> list[int]:
     """Return the channels of a file that are of other topics."""
+    return [
+        number for number, channel in file.channels.items() if not is_chosen(channel.topic, topics)
+    ]
+
+
+def is_chosen(topic: str, topics: TopicChoice | None) -> bool:
+    """Tell whether a topic is among those that are chosen; None chooses all."""
     if topics is None:
-        return []
-    return [number for number, channel in file.channels.items() if channel.topic not in topics]
+        return True
+    return topics(topic) if callable(topics) else topic in topics
 
 
 def _read(file: LogFile, chunks: NDArray[np.void]) -> "_Batch":
