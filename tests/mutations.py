@@ -25,6 +25,9 @@ MESSAGE, CHUNK, INDEX, METADATA, DATA_END = 5, 6, 7, 12, 15
 SECONDS = 120  # for all verbs; the machine may be busy
 LABELLED = {"finished", "live", "live-finished"}  # files that are relabelled
 RELABELLED = "general"  # a starter model
+# The writer of these has no checksums: which values are wrong nobody can know, and of a bit that
+# changed not even that some are.
+UNCHECKED = "rosbags"
 
 
 # Mutations: of the bytes of a file, whose records begin at certain bytes.
@@ -323,7 +326,7 @@ def compared(path, folder):
             wrong.append(f"{name}: status {status} without a line")
         elif text != own[1] and not status:
             wrong.append(f"{name}: other values without a word")
-        elif name == "recover" and text and json_more(text, own[1]):
+        elif name == "recover" and text and folder.name != UNCHECKED and json_more(text, own[1]):
             wrong.append(f"{name}: saved what was not there")
     assert not wrong, "; ".join(wrong)
 
@@ -371,7 +374,7 @@ def write_files(folder):
     for name, options in FOREIGN.items():
         files[name] = folder / f"{name}.mcap"
         files[name].write_bytes(foreign(**options))
-    files["rosbags"] = rosbag(folder / "bag")
+    files[UNCHECKED] = rosbag(folder / "bag")
     return files
 
 
@@ -488,8 +491,7 @@ def main():
     counts, wrong = Counter(), Counter()
     for name, path in files.items():
         data, victim = path.read_bytes(), begin(name, path, options.folder / "victims" / name)
-        # What `rosbags` writes has no checksums: of a bit that changed nobody can know.
-        kinds = [one for one in MUTATIONS if name != "rosbags" or one not in FLIPS]
+        kinds = [one for one in MUTATIONS if name != UNCHECKED or one not in FLIPS]
         for number in range(options.count // len(files)):
             mutation = kinds[number % len(kinds)]
             changed = mutation(rng, data)
