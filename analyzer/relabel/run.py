@@ -176,7 +176,7 @@ class _Relabelling:
             for place, layer in zip(chain.asked, layers, strict=True):
                 task = self._task(chain, place, layer)
                 waits = task is not None and task.state is _State.WAITING
-                longest = min(-(-left // self._most_running), _LONGEST_STRETCH)
+                longest = min(-(-left // self._workers.parallel), _LONGEST_STRETCH)
                 if stretch and not (
                     waits and stretch[-1].place == place - 1 and len(stretch) < longest
                 ):
