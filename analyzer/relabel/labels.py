@@ -182,7 +182,7 @@ def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
     return layers
 
 
-def _label_log(job: Job, before: "_Labellers") -> tuple[UnfinishedLayer, "_Labellers"]:
+def _label_log(job: Job, before: _Labellers) -> tuple[UnfinishedLayer, _Labellers]:
     """Label a log; return also the labellers at its end, if the next log may go on with them."""
     model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:

@@ -26,6 +26,8 @@ from hearthlog.schemas.logs.provenance import check_version
 from hearthlog.schemas.progress import Progress, ignore_progress
 from hearthlog.schemas.storage.byte_ranges import map_logs
 
+_LONGEST_STRETCH = 8  # logs that follow each other and are labelled in one task
+
 
 @dataclass
 class Relabelled:
@@ -86,9 +88,6 @@ def relabel(
     work = _Relabelling(chains, model, model_path, workers)
     work.run(lambda done: progress(done / max(total, 1)))
     return work.result
-
-
-_LONGEST_STRETCH = 8  # logs, which are labelled in one task
 
 
 class _State(Enum):
@@ -172,15 +171,13 @@ class _Relabelling:
             queue = _ChainQueue(chain)
             layers = map_logs(self._look_at, list(chain.asked.values()))
             stretch: list[_Task] = []
-            left = len(chain.asked)
-            for place, layer in zip(chain.asked, layers, strict=True):
+            for number, (place, layer) in enumerate(zip(chain.asked, layers, strict=True)):
                 task = self._task(chain, place, layer)
                 waits = task is not None and task.state is _State.WAITING
+                left = len(chain.asked) - number + len(stretch)
                 longest = min(-(-left // self._workers.parallel), _LONGEST_STRETCH)
-                if stretch and not (
-                    waits and stretch[-1].place == place - 1 and len(stretch) < longest
-                ):
-                    left -= len(stretch)
+                follows = bool(stretch) and stretch[-1].place == place - 1
+                if stretch and not (waits and follows and len(stretch) < longest):
                     yield queue, stretch
                     stretch = []
                 if task is not None:

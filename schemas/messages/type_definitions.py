@@ -26,8 +26,8 @@ _DEFINITION_LIMIT = 256 << 10  # bytes of text
 _LAYOUTS_KEPT = 256
 # How MCAP's registry joins the files of a type, and lines of them that rosbags does not read.
 _IDL_FILE = re.compile(r"^={80}\r?\nIDL: .*$", re.MULTILINE)
-_WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")
 _INCLUDE = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
+_WSTRING_BOUND = re.compile(r"(?<=wstring)<=\d+")  # which rosbags does not read either
 
 
 class MessageType:
