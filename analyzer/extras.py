@@ -1,9 +1,12 @@
 """What to install where a package is missing that the recorder alone does without."""
 
 _CLUSTER = ("dask", "distributed", "fsspec", "s3fs", "upath")
-_EXTRAS = {"rerun": "viewer", "rerun_cli": "viewer", "foxglove": "foxglove"} | dict.fromkeys(
-    _CLUSTER, "cluster"
-)
+_EXTRAS = {
+    "rerun": "viewer",
+    "rerun_cli": "viewer",
+    "foxglove": "foxglove",
+    "paho": "bridge",
+} | dict.fromkeys(_CLUSTER, "cluster")
 
 
 def remedy(module: str) -> str:

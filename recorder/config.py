@@ -40,6 +40,7 @@ from hearthlog.schemas.storage.small_file import read_toml
 ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]
 NO_MODEL = Path("none")  # in place of a model file: there are no labels
+BRIDGE = "bridge"  # the table of the file that is not the recorder's
 _LEAST_BAG_SIZE = 1_000_000  # so that no two files begin in one second
 
 
@@ -281,6 +282,7 @@ def load_with_origins(
         As `load_settings`.
     """
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
+    content.pop(BRIDGE, None)
     lines = {} if file is None else key_lines(file.read_text("utf-8"))
     origins = Origins(command_line, content, file, lines)
     try:
@@ -297,13 +299,24 @@ def load_with_origins(
         update = {"microphone": [MicrophoneSettings(**merged)]}
         return settings.model_copy(update=update), origins
     except ValidationError as error:
-        raise _refusal(error, origins) from error
+        raise refusal(error, origins) from error
 
 
-def _refusal(error: ValidationError, origins: Origins) -> ConfigurationError:
+def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> ConfigurationError:
+    """Say in one line what is wrong, and where.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Of which the first error is said.
+    origins : Origins
+        Of what was checked.
+    table : Key, optional
+        Where in the file that was.
+    """
     first = error.errors()[0]
-    where = _place(first["loc"], origins)
-    key = ".".join(str(part) for part in first["loc"])
+    where = _place((*table, *first["loc"]), origins)
+    key = ".".join(str(part) for part in (*table, *first["loc"]))
     if first["type"] == "extra_forbidden":
         return ConfigurationError(f"{where}: unknown key {key!r}")
     return ConfigurationError(f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 ENVIRONMENT = "HEARTHLOG_"
 DEFAULT = "default"
-_TABLE = re.compile(r"\s*(\[\[?)\s*([\w-]+)\s*\]\]?")
+_TABLE = re.compile(r"\s*(\[\[?)\s*([\w-]+(?:\.[\w-]+)*)\s*\]\]?")
 _KEY = re.compile(r"\s*([\w-]+)\s*=")
 
 Key = tuple[str | int, ...]  # such as ("microphone", 1, "device")
@@ -79,7 +79,7 @@ def key_lines(text: str) -> dict[Key, int]:
         if head := _TABLE.match(line):
             name, is_one_of_many = head[2], head[1] == "[["
             counts[name] = counts.get(name, -1) + 1
-            table = (name, counts[name]) if is_one_of_many else (name,)
+            table = (*name.split("."), counts[name]) if is_one_of_many else (*name.split("."),)
             lines.setdefault(table, number)
         elif key := _KEY.match(line):
             lines.setdefault((*table, key[1]), number)

@@ -9,6 +9,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.times import NANOSECONDS
 
 KEY = "timezone"  # in the `hearthlog` metadata record of a log
+EVENING, MORNING = 22, 7  # of the clock: between them is the night
 Span = tuple[int, int]
 
 

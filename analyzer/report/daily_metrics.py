@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.accuracy.events import MINUTE
-from hearthlog.analyzer.logs.local_time import at_hour, day_span, local_time
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, one, without
 from hearthlog.analyzer.report.home_metrics import HomeMetrics
 from hearthlog.analyzer.report.values import Clock, Count, Minutes, exactly
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.times import NANOSECONDS
 
-EVENING, MORNING = 22, 7  # of the clock: between them is the night
 _RISING = 4  # of the clock: what is heard before is of the night
 HOUR = 60 * MINUTE
 _STRETCH_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS

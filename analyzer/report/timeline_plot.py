@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import Spans, lengths, without
 from hearthlog.analyzer.report.baseline import Usual, usual
 from hearthlog.analyzer.report.class_words import short_day
-from hearthlog.analyzer.report.daily_metrics import EVENING, HOUR, MORNING, Day
+from hearthlog.analyzer.report.daily_metrics import HOUR, Day
 from hearthlog.analyzer.report.values import Minutes
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64

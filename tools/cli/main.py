@@ -18,6 +18,7 @@ import typer
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.tools.cli.annotate import annotate
+from hearthlog.tools.cli.bridge import bridge
 from hearthlog.tools.cli.cat import cat
 from hearthlog.tools.cli.catalog import catalog
 from hearthlog.tools.cli.config import config
@@ -70,7 +71,7 @@ _ON_LOGS = (
 )
 _LEARNING = (manifest, train, enrol)
 _NAMED = 10  # of many files with the same fault
-for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, report, replay, relabel, demo):
+for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, bridge, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)
 app.add_typer(annotate, name="annotate")
 app.add_typer(config, name="config")

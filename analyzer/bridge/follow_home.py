@@ -1,0 +1,100 @@
+"""Follow the log of one recorder from some time on, and then live, without a seam."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event as Flag
+
+import numpy as np
+
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.files import log_name
+from hearthlog.schemas.logs.follow import follow_messages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
+from hearthlog.schemas.times import NANOSECONDS
+
+_LATEST = 60 * NANOSECONDS  # of labels and diagnostics: of the older ones nothing is left
+_WAIT_SECONDS = 1.0
+
+
+def is_of_bridge(topic: str) -> bool:
+    """Tell whether what a home is told of needs a topic.
+
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    """
+    if topic == DIAGNOSTICS:
+        return True
+    name = parse_topic(topic)
+    return name is not None and name.labelling == LIVE and name.kind in {"label", "segment"}
+
+
+def follow_home(
+    folder: Path, node: str, start: int, stop: Flag, damaged: Callable[[LogError], None]
+) -> Iterator[tuple[HomeState, list[Event]]]:
+    """Follow the logs of a recorder, and keep the state of its home.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the logs; it may come later.
+    node : str
+        Name of the recorder.
+    start : int
+        Log time from which on the events are to be known, in nanoseconds of UTC.
+    stop : threading.Event
+        Ends it.
+    damaged : callable
+        Told the error of a log of which no more can be read, and that there is no folder yet.
+
+    Yields
+    ------
+    state : HomeState
+        The same one each time: after whatever was written, and five times a second while nothing
+        is.
+    begun : list of Event
+        Those that began since the last time.
+    """
+    state = HomeState()
+    while not folder.is_dir():
+        damaged(LogError(f"{folder}: no such folder yet; waiting for a recorder"))
+        yield state, []
+        if stop.wait(_WAIT_SECONDS):
+            return
+    messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
+    for path, batch in messages:
+        if path == folder:  # all that was written has been read
+            state.caught_up = True
+            yield state, []
+        elif log_name(path).node == node:
+            try:
+                begun = state.push(_decode(batch))
+            except LogError as error:
+                damaged(LogError(f"{path}: {error}"))
+                continue
+            yield state, begun
+        if stop.is_set():
+            return
+
+
+def _decode(batch: list[RawMessages]) -> list[Columns]:
+    columns: list[Columns] = []
+    for raw in batch:
+        if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
+            kind = raw.schema.name
+            if kind != message_types.SEGMENT:
+                raw = raw.between(int(np.max(raw.log_times)) - _LATEST, None)  # noqa: PLW2901
+            columns += decode([raw], FIELDS[kind])
+    return columns
+
+
+def history_start(zone_midnight: int, night: int, longest: int) -> int:
+    """Return the earliest of the times from which on events have to be known."""
+    return min(zone_midnight, night, time.time_ns() - longest)

@@ -1,0 +1,205 @@
+"""What the microphones of a home hear now, and what they heard of late, from the log alone."""
+
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from hearthlog.analyzer.bridge.event_record import PAUSE_SECONDS, Event, EventRecord
+from hearthlog.analyzer.bridge.heard_now import HeardNow
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import parse_topic
+from hearthlog.schemas.times import NANOSECONDS
+
+FIELDS = {
+    message_types.LABEL: ("label", "confidence"),
+    message_types.SEGMENT: ("header.stamp", "duration", "label", "confidence"),
+    message_types.DIAGNOSTICS: ("status",),
+}
+_AWAY_SECONDS = 15.0  # without a word
+_DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after its end no segment is added to an event
+_MOST_CLASSES = 256
+
+
+class Health(NamedTuple):
+    """The last word of a recorder on one thing; `level` is that of diagnostics, 0 for well."""
+
+    level: int
+    text: str
+
+
+class MicrophoneState:
+    """What one microphone hears and heard.
+
+    Parameters
+    ----------
+    name : str
+        Of the microphone.
+
+    Attributes
+    ----------
+    classes : list of str
+        Those of its newest labels, in their order.
+    heard : HeardNow
+    label, confidence : str, float
+        The newest label; empty before the first.
+    level_dbfs : float
+        Mean level of ten seconds; NaN where it is not known.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.classes: list[str] = []
+        self.heard = HeardNow([])
+        self.label, self.confidence = "", 0.0
+        self.level_dbfs = math.nan
+        self.seen = -math.inf  # when a label came, by CLOCK_MONOTONIC
+        self._records: dict[str, EventRecord] = {}
+        self._unended: set[str] = set()  # classes with an event that may go on
+
+    def is_listening(self) -> bool:
+        """Tell whether labels have come in the last fifteen seconds."""
+        return time.monotonic() - self.seen <= _AWAY_SECONDS
+
+    def events(self, label: str, since: int) -> list[Event]:
+        """Return the events of a class that began at a time or later, in nanoseconds of UTC."""
+        record = self._records.get(label)
+        return [] if record is None else record.since(since)
+
+    def last_event(self, label: str) -> Event | None:
+        """Return the last event of a class; None if none is known."""
+        record = self._records.get(label)
+        return record.events[-1] if record is not None and record.events else None
+
+    def push_labels(self, columns: Columns) -> None:
+        """Add labels, with the fields of `FIELDS`."""
+        classes = _class_names(columns)
+        if classes and classes != self.classes:
+            self.classes = classes
+            self.heard = HeardNow(classes)
+        self.heard.push(columns["label"].tolist(), columns.log_times)
+        self.label = str(columns["label"][-1])
+        self.confidence = float(columns["confidence"][-1])
+
+    def push_segments(self, columns: Columns) -> list[Event]:
+        """Add segments, with the fields of `FIELDS`; return the events that begin with them."""
+        begun = []
+        names = "header.stamp", "duration", "label", "confidence"
+        for start, duration, label, confidence in zip(
+            *(columns[name].tolist() for name in names), strict=True
+        ):
+            if label == SILENCE or (label not in self._records and self._is_full()):
+                continue
+            record = self._records.setdefault(label, EventRecord(self.name, label))
+            self._unended.add(label)
+            if record.push(start, start + max(duration, 0), confidence):
+                begun.append(record.events[-1])
+        return begun
+
+    def ended_events(self) -> list[Event]:
+        """Return the events that are over, each once."""
+        ended = []
+        for label in sorted(self._unended):
+            event = self._records[label].events[-1]
+            if self.heard.time - event.end > _DECIDED:
+                ended.append(event)
+        self._unended.difference_update(event.label for event in ended)
+        return ended
+
+    def forget_before(self, time: int) -> None:
+        """Forget the events that began before a time, but for the last one of each class."""
+        for record in self._records.values():
+            record.forget_before(time)
+
+    def _is_full(self) -> bool:
+        return len(self._records) >= _MOST_CLASSES
+
+
+class HomeState:
+    """What the microphones of one recorder hear and heard.
+
+    Attributes
+    ----------
+    microphones : dict of str to MicrophoneState
+    health : dict of str to Health
+        The last word on each thing: a microphone, the recorder, its disk …
+    caught_up : bool
+        Whether all that was written before has been read, so that what comes is new.
+    """
+
+    def __init__(self) -> None:
+        self.microphones: dict[str, MicrophoneState] = {}
+        self.health: dict[str, Health] = {}
+        self.caught_up = False
+        self._seen = -math.inf  # when anything came, by CLOCK_MONOTONIC
+
+    def is_recording(self) -> bool:
+        """Tell whether anything was written in the last fifteen seconds."""
+        return time.monotonic() - self._seen <= _AWAY_SECONDS
+
+    def push(self, columns: Sequence[Columns]) -> list[Event]:
+        """Add messages with the fields of `FIELDS`; return the events that begin with them.
+
+        Parameters
+        ----------
+        columns : sequence of Columns
+            Of one log, in the order in which it was written.
+        """
+        begun = []
+        for part in (each for each in columns if len(each)):
+            seen = self._time_seen(part)
+            self._seen = max(self._seen, seen)
+            if part.type == message_types.DIAGNOSTICS:
+                self._push_diagnostics(part)
+                continue
+            name = parse_topic(part.topic)
+            assert name is not None
+            microphone = self.microphones.setdefault(
+                name.microphone, MicrophoneState(name.microphone)
+            )
+            if name.kind == "label":
+                microphone.push_labels(part)
+                microphone.seen = max(microphone.seen, seen)
+            else:
+                begun += microphone.push_segments(part)
+        return begun
+
+    def _time_seen(self, columns: Columns) -> float:
+        """Tell when messages were written, by CLOCK_MONOTONIC.
+
+        What was written before is as old as its log times say; what comes then was written now,
+        whatever the clock of the recorder says.
+        """
+        if self.caught_up:
+            return time.monotonic()
+        age = (time.time_ns() - int(columns.log_times[-1])) / NANOSECONDS
+        return time.monotonic() - max(age, 0.0)
+
+    def _push_diagnostics(self, columns: Columns) -> None:
+        for status in (each for same in columns["status"] for each in same):
+            subject = str(status["name"]).removeprefix("hearthlog: ")
+            if subject in self.health or len(self.health) < _MOST_CLASSES:
+                self.health[subject] = Health(int(status["level"]), str(status["message"]))
+            microphone = self.microphones.get(subject)
+            if microphone is not None:
+                microphone.level_dbfs = next(_levels(status), math.nan)
+
+
+def _levels(status: Any) -> Iterator[float]:
+    for pair in status["values"]:
+        if pair["key"] == "level_dbfs":
+            with suppress(ValueError):
+                yield float(pair["value"])
+
+
+def _class_names(columns: Columns) -> list[str]:
+    """Return the names of a model's classes, which the channel of its labels has."""
+    with suppress(ValueError, RecursionError):
+        names = json.loads(columns.metadata.get("probabilities_names", ""))
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):
+            return names[:_MOST_CLASSES]
+    return []

@@ -1,0 +1,1 @@
+"""What is heard, for a broker of MQTT and for Home Assistant."""

@@ -1,0 +1,236 @@
+"""A connection to a broker that may come and go: what it has to say is said again, or in time."""
+
+import ssl
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from threading import Lock
+from typing import Any
+
+import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.schemas.storage.small_file import read_whole
+
+_KEEPALIVE = 20  # seconds: half as much again, and the broker takes a silent client for dead
+_QUEUED = 1000  # messages that wait for the broker, and events that wait for a connection
+_TIMELY_SECONDS = 60.0  # after which an event is no news
+_FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
+_CLOSE_SECONDS = 2.0
+_QOS = 1
+_TAKEN_OVER = 0x8E
+_LONGEST_PASSWORD = 4096
+
+Say = Callable[[str], None]
+Received = Callable[[mqtt.MQTTMessage], None]
+
+
+class Connection:
+    """Publishes values that are kept, and events that are not.
+
+    The broker never holds up who publishes: a value is remembered, the newest of each topic, and
+    said when there is a connection; an event is dropped when it is a minute old.
+
+    Parameters
+    ----------
+    settings : MqttSettings
+    client_id : str
+    alive_topic : str
+        Where the broker says `offline` when the connection is lost, and this one `online`.
+    say : callable
+        Told what is wrong with the connection, in a line.
+    subscriptions : sequence of str
+        Filters of topics.
+    received : callable
+        Told each message that comes, in the thread of the connection.
+
+    Raises
+    ------
+    BridgeError
+        If a file of the settings cannot be used.
+    """
+
+    def __init__(  # noqa: PLR0913
+        self,
+        settings: MqttSettings,
+        client_id: str,
+        alive_topic: str,
+        say: Say,
+        *,
+        subscriptions: Sequence[str],
+        received: Received,
+    ) -> None:
+        self._say = say
+        self._alive = alive_topic
+        self._subscriptions = subscriptions
+        self._received = received
+        self._client_id = client_id
+        self._place = f"{settings.host}:{_port(settings)}"
+        self._hint = ""
+        self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
+        self._unsent: dict[str, None] = {}  # topics, in order
+        self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
+        self._lock = Lock()
+        self._is_new = False  # a connection to which nothing was said yet
+        self._client = self._make_client(settings)
+
+    def keep(self, topic: str, value: str) -> None:
+        """Publish a value that the broker keeps, unless it is the one that was published last."""
+        if self._values.get(topic) != value:
+            self._values[topic] = value
+            self._unsent[topic] = None
+
+    def forget(self, topic: str) -> None:
+        """Have the broker forget the value of a topic."""
+        self.keep(topic, "")
+
+    def send(self, topic: str, payload: str) -> None:
+        """Publish an event, now or within a minute."""
+        self._events.append((time.monotonic(), topic, payload))
+
+    def repeat(self) -> None:
+        """Say all values again at the next `flush`."""
+        self._unsent = dict.fromkeys(self._values)
+
+    def flush(self) -> None:
+        """Hand what there is to say to the connection, if there is one."""
+        if not self._client.is_connected():
+            return
+        with self._lock:
+            is_new, self._is_new = self._is_new, False
+        if is_new:
+            self.repeat()
+        for topic in list(self._unsent):
+            if not self._publish(topic, self._values[topic], retain=True):
+                return
+            del self._unsent[topic]
+        while self._events:
+            known, topic, payload = self._events[0]
+            timely = time.monotonic() - known <= _TIMELY_SECONDS
+            if timely and not self._publish(topic, payload, retain=False):
+                return
+            self._events.popleft()
+
+    def close(self) -> None:
+        """Say `offline`, and end."""
+        if self._client.is_connected():
+            info = self._client.publish(self._alive, "offline", _QOS, retain=True)
+            with suppress(RuntimeError, ValueError):  # it is lost: then the broker says it
+                info.wait_for_publish(_CLOSE_SECONDS)
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _make_client(self, settings: MqttSettings) -> mqtt.Client:
+        client = mqtt.Client(
+            CallbackAPIVersion.VERSION2, client_id=self._client_id, protocol=mqtt.MQTTv5
+        )
+        client.will_set(self._alive, "offline", _QOS, retain=True)
+        client.max_queued_messages_set(_QUEUED)
+        client.reconnect_delay_set(_FIRST_PAUSE, _LONGEST_PAUSE)
+        if settings.user:
+            client.username_pw_set(settings.user, _password(settings))
+        if settings.tls:
+            self._use_tls(client, settings)
+        client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
+        client.on_disconnect = self._on_disconnect
+        client.on_publish = self._on_publish
+        client.on_subscribe = self._on_subscribe
+        client.on_message = lambda _client, _data, message: self._received(message)
+        client.connect_async(settings.host, _port(settings), _KEEPALIVE)
+        client.loop_start()
+        return client
+
+    def _use_tls(self, client: mqtt.Client, settings: MqttSettings) -> None:
+        names = "ca_file", "certificate_file", "key_file"
+        ca, certificate, key = (getattr(settings, name) for name in names)
+        try:
+            context = ssl.create_default_context(cafile=ca)
+            if certificate is not None:
+                context.load_cert_chain(certificate, key)
+        except (OSError, ValueError) as error:
+            files = ", ".join(str(path) for path in (ca, certificate, key) if path is not None)
+            what = getattr(error, "strerror", None) or error
+            raise BridgeError(f"bridge.mqtt: {files}: no certificates of use ({what})") from error
+        client.tls_set_context(context)
+        if certificate is None:
+            self._hint = "; does it want a client certificate? see certificate_file and key_file"
+
+    def _publish(self, topic: str, payload: str, *, retain: bool) -> bool:
+        """Hand a message over; False if it has to wait."""
+        properties = Properties(PacketTypes.PUBLISH)
+        if not retain:
+            properties.MessageExpiryInterval = round(_TIMELY_SECONDS)
+        info = self._client.publish(topic, payload, _QOS, retain=retain, properties=properties)
+        return info.rc in {mqtt.MQTT_ERR_SUCCESS, mqtt.MQTT_ERR_NO_CONN}  # the second is queued
+
+    def _on_connect(
+        self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
+    ) -> None:
+        if reason.is_failure:
+            self._say(f"{self._place}: refused: {reason}; see user, password_file and client_id")
+            return
+        client.reconnect_delay_set(_FIRST_PAUSE, _LONGEST_PAUSE)
+        for topic in self._subscriptions:
+            client.subscribe(topic, _QOS)
+        client.publish(self._alive, "online", _QOS, retain=True)
+        with self._lock:
+            self._is_new = True
+
+    def _on_connect_fail(self, _client: mqtt.Client, _data: Any) -> None:
+        error = sys.exc_info()[1]  # called while it is handled
+        if isinstance(error, ssl.SSLCertVerificationError):
+            what = f"its certificate is refused: {error.verify_message}; see ca_file"
+        else:
+            what = str(getattr(error, "strerror", None) or error)
+        self._say(f"{self._place}: no broker ({what}); trying again")
+
+    def _on_disconnect(
+        self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
+    ) -> None:
+        if reason.value == _TAKEN_OVER:
+            client.reconnect_delay_set(_LONGEST_PAUSE, _LONGEST_PAUSE)
+            self._say(
+                f"{self._place}: another client named {self._client_id} has connected: is a second "
+                "bridge of this recorder running? give one of them another client_id"
+            )
+        elif reason.is_failure:
+            self._say(f"{self._place}: the connection ended: {reason}{self._hint}; trying again")
+
+    def _on_publish(
+        self, _client: mqtt.Client, _data: Any, _number: int, reason: ReasonCode, _more: Any
+    ) -> None:
+        if reason.is_failure:
+            self._say(
+                f"{self._place}: a message was refused: {reason}; the broker must let this client "
+                f"write below {self._alive.rpartition('/')[0]}, and for Home Assistant below "
+                "its discovery topic"
+            )
+
+    def _on_subscribe(
+        self, _client: mqtt.Client, _data: Any, _number: int, reasons: list[ReasonCode], _more: Any
+    ) -> None:
+        for reason in reasons:
+            if reason.is_failure:
+                self._say(f"{self._place}: may not read some topics: {reason}")
+
+
+def _port(settings: MqttSettings) -> int:
+    return settings.port or (8883 if settings.tls else 1883)
+
+
+def _password(settings: MqttSettings) -> str | None:
+    if settings.password_file is None:
+        return None
+    data = read_whole(settings.password_file, "password file", _LONGEST_PASSWORD, BridgeError)
+    try:
+        return data.decode().split("\n", 1)[0].rstrip("\r")
+    except UnicodeDecodeError:
+        raise BridgeError(f"{settings.password_file}: holds no text in UTF-8") from None

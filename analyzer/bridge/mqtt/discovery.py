@@ -1,0 +1,178 @@
+"""What Home Assistant is told of a microphone: its device, and everything that it shows of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from hearthlog._version import __version__
+from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
+from hearthlog.models.classes import SILENCE, in_words
+
+_AGE = 60  # seconds after which what was not said again is unknown
+
+
+def device_id(node: str, microphone: str) -> str:
+    """Return what names the device of a microphone in Home Assistant."""
+    return f"hearthlog_{identifier(node)}_{microphone}"
+
+
+def discovery(
+    topics: Topics, microphone: str, classes: Sequence[str], gone: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Describe the device of a microphone, as Home Assistant 2024.11 and later read it.
+
+    Parameters
+    ----------
+    topics : Topics
+    microphone : str
+    classes : sequence of str
+        Those of its model.
+    gone : sequence of str, optional
+        Classes that an earlier model had, whose entities are removed.
+
+    Returns
+    -------
+    dict
+        The payload of the topic `<prefix>/device/<id>/config`, for JSON.
+    """
+    own = device_id(topics.node, microphone)
+    sounds = [name for name in classes if name != SILENCE]
+    components = _of_microphone(topics, microphone, sounds)
+    for name in sounds:
+        components |= _of_class(topics, microphone, name)
+    for key, component in components.items():
+        component["unique_id"] = f"{own}_{key}"
+    for name in gone:
+        removed = _of_class(topics, microphone, name)
+        components |= {key: {"p": component["p"]} for key, component in removed.items()}
+    return {
+        "device": {
+            "identifiers": [own],
+            "name": f"Hearthlog {topics.node} {microphone}",
+            "manufacturer": "hearthlog",
+            "model": "sounds of a home",
+        },
+        "origin": {"name": "hearthlog", "sw_version": __version__},
+        "availability": [
+            {"topic": topics.of_home("bridge")},
+            {"topic": topics.of_microphone(microphone, "listening")},
+        ],
+        "availability_mode": "all",
+        "qos": 1,
+        "components": components,
+    }
+
+
+def _of_microphone(
+    topics: Topics, microphone: str, sounds: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    def at(kind: str) -> str:
+        return topics.of_microphone(microphone, kind)
+
+    always = {"availability": [{"topic": topics.of_home("bridge")}]}
+    return {
+        "heard": {
+            "p": "sensor",
+            "name": "Heard",
+            "device_class": "enum",
+            "options": [SILENCE, *sounds],
+            "state_topic": at("heard"),
+            "value_template": "{{ value_json.label }}",
+            "json_attributes_topic": at("heard"),
+            "icon": "mdi:ear-hearing",
+        },
+        "sound": {
+            "p": "binary_sensor",
+            "name": "Any sound",
+            "device_class": "sound",
+            "state_topic": at("sound"),
+        },
+        "level": {
+            "p": "sensor",
+            "name": "Level",
+            "unit_of_measurement": "dBFS",
+            "state_class": "measurement",
+            "state_topic": at("level"),
+            "suggested_display_precision": 0,
+            "expire_after": _AGE,
+            "icon": "mdi:volume-high",
+        },
+        "event": {
+            "p": "event",
+            "name": "Event",
+            "event_types": list(sounds),
+            "state_topic": at("event"),
+            "icon": "mdi:waveform",
+        },
+        "listening": {
+            "p": "binary_sensor",
+            "name": "Listening",
+            "device_class": "connectivity",
+            "entity_category": "diagnostic",
+            "state_topic": at("listening"),
+            "payload_on": "online",
+            "payload_off": "offline",
+            **always,
+        },
+        "recorder": {
+            "p": "binary_sensor",
+            "name": "Recorder",
+            "device_class": "connectivity",
+            "entity_category": "diagnostic",
+            "state_topic": topics.of_home("recorder"),
+            "payload_on": "online",
+            "payload_off": "offline",
+            **always,
+        },
+        "problem": {
+            "p": "binary_sensor",
+            "name": "Problem",
+            "device_class": "problem",
+            "entity_category": "diagnostic",
+            "state_topic": at("problem"),
+            "value_template": "{{ value_json.state }}",
+            "json_attributes_topic": at("problem"),
+            **always,
+        },
+    }
+
+
+def _of_class(topics: Topics, microphone: str, name: str) -> dict[str, dict[str, Any]]:
+    words, key = in_words(name), identifier(name)
+
+    def at(kind: str) -> str:
+        return topics.of_class(microphone, name, kind)
+
+    def count(kind: str, what: str) -> dict[str, Any]:
+        return {
+            "p": "sensor",
+            "name": f"{words} {what}",
+            "state_class": "total_increasing",
+            "state_topic": at(kind),
+            "icon": "mdi:counter",
+        }
+
+    return {
+        f"on_{key}": {
+            "p": "binary_sensor",
+            "name": words,
+            "device_class": "sound",
+            "state_topic": at("on"),
+        },
+        f"count_today_{key}": count("count_today", "today"),
+        f"count_night_{key}": count("count_night", "last night"),
+        f"last_heard_{key}": {
+            "p": "sensor",
+            "name": f"{words} last heard",
+            "device_class": "timestamp",
+            "state_topic": at("last_heard"),
+        },
+        f"trigger_{key}": {
+            "p": "device_automation",
+            "automation_type": "trigger",
+            "topic": topics.of_microphone(microphone, "event"),
+            "value_template": "{{ value_json.event_type }}",
+            "type": "heard",
+            "subtype": words,
+            "payload": name,
+        },
+    }

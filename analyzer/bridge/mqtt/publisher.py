@@ -1,0 +1,204 @@
+"""What is heard, said to a broker."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from threading import Lock
+
+from paho.mqtt.client import MQTTMessage
+
+from hearthlog.analyzer.bridge.day import Today, iso_time
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
+from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.mqtt.connection import Connection
+from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.topics import Topics
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.text import shortened
+
+_ONLINE = {True: "online", False: "offline"}
+_ON = {True: "ON", False: "OFF"}
+_LONGEST = 200  # characters
+_BORN = b"online"  # of Home Assistant
+
+
+class MqttPublisher:
+    """Says everything that a broker is to know of a recorder.
+
+    Parameters
+    ----------
+    settings : MqttSettings
+    node : str
+        Name of the recorder.
+    say : callable
+        Told what is wrong, in a line.
+
+    Raises
+    ------
+    BridgeError
+        If a file of the settings cannot be used.
+    """
+
+    def __init__(self, settings: MqttSettings, node: str, say: Callable[[str], None]) -> None:
+        self._settings = settings
+        self._topics = topics = Topics(settings.topic, node)
+        self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
+        self._lock = Lock()
+        self._at_broker: set[tuple[str, str]] = set()  # microphones and classes with values there
+        self._others: set[str] = set()  # microphones with values there
+        self._is_born = False
+        subscriptions = [
+            topics.of_microphone("+", "listening"),
+            f"{topics.root}/+/class/+/on",
+        ]
+        if settings.home_assistant:
+            subscriptions.append(self._birth_topic)
+        client_id = settings.client_id or f"hearthlog-{node}"
+        self._connection = Connection(
+            settings,
+            client_id,
+            topics.of_home("bridge"),
+            say,
+            subscriptions=subscriptions,
+            received=self._take,
+        )
+
+    def update(self, news: News) -> None:
+        """Say what is new."""
+        self._connection.keep(self._topics.of_home("recorder"), _ONLINE[news.state.is_recording()])
+        for microphone in news.state.microphones.values():
+            if microphone.classes != self._classes.get(microphone.name, []):
+                self._describe(microphone)
+            self._say_state(microphone, news)
+            self._say_problem(microphone, news.state)
+        self._clear_others(news.state)
+        for events, kind in ((news.begun, "event"), (news.ended, "event_ended")):
+            for event in events:
+                topic = self._topics.of_microphone(event.microphone, kind)
+                self._connection.send(topic, json.dumps(event_fields(event, news)))
+        with self._lock:
+            is_born, self._is_born = self._is_born, False
+        if is_born:
+            self._connection.repeat()
+        self._connection.flush()
+
+    def close(self) -> None:
+        """Say `offline`, and end."""
+        self._connection.close()
+
+    @property
+    def _birth_topic(self) -> str:
+        return f"{self._settings.discovery_topic}/status"
+
+    def _take(self, message: MQTTMessage) -> None:
+        """Note what the broker has of earlier bridges, and that Home Assistant has started."""
+        topic, payload = message.topic, message.payload
+        with self._lock:
+            if topic == self._birth_topic:
+                self._is_born |= payload == _BORN and not message.retain
+            elif payload and (found := self._topics.parse_class(topic, "on")):
+                self._at_broker.add(found)
+            elif payload and (name := self._topics.parse_microphone(topic, "listening")):
+                self._others.add(name)
+
+    def _describe(self, microphone: MicrophoneState) -> None:
+        """Tell Home Assistant of the classes of a microphone, before the first value of one."""
+        name, classes = microphone.name, microphone.classes
+        self._classes[name] = list(classes)
+        self._tell_home_assistant(name)
+
+    def _tell_home_assistant(self, microphone: str, gone: tuple[str, ...] = ()) -> None:
+        if self._settings.home_assistant:
+            node = self._topics.node
+            topic = f"{self._settings.discovery_topic}/device/{device_id(node, microphone)}/config"
+            config = discovery(self._topics, microphone, self._classes[microphone], gone)
+            self._connection.keep(topic, json.dumps(config))
+
+    def _clear_others(self, state: HomeState) -> None:
+        """Have the broker forget the classes that earlier models had."""
+        with self._lock:
+            at_broker, others = set(self._at_broker), set(self._others)
+        for microphone in sorted(others - state.microphones.keys()):
+            topic = self._topics.of_microphone(microphone, "listening")
+            self._connection.keep(topic, _ONLINE[False])
+        for name, classes in self._classes.items():
+            gone = sorted(c for m, c in at_broker if m == name and c not in classes)
+            if not gone:
+                continue
+            self._tell_home_assistant(name, tuple(gone))
+            for label in gone:
+                for kind in ("on", "count_today", "count_night", "last_heard"):
+                    self._connection.forget(self._topics.of_class(name, label, kind))
+            with self._lock:
+                self._at_broker.difference_update((name, label) for label in gone)
+
+    def _say_state(self, microphone: MicrophoneState, news: News) -> None:
+        def say(kind: str, value: str) -> None:
+            self._connection.keep(self._topics.of_microphone(microphone.name, kind), value)
+
+        say("listening", _ONLINE[microphone.is_listening()])
+        if not microphone.label:
+            return
+        confidence = round(microphone.confidence, 3)
+        say("heard", json.dumps({"label": microphone.label, "confidence": confidence}))
+        say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
+        if math.isfinite(microphone.level_dbfs):
+            say("level", f"{microphone.level_dbfs:.1f}")
+        for label in microphone.classes:
+            if label != SILENCE:
+                for kind, value in class_values(microphone, label, news):
+                    topic = self._topics.of_class(microphone.name, label, kind)
+                    self._connection.keep(topic, value)
+
+    def _say_problem(self, microphone: MicrophoneState, state: HomeState) -> None:
+        others = state.microphones.keys() - {microphone.name}
+        bad = [
+            f"{subject}: {health.text}"
+            for subject, health in sorted(state.health.items())
+            if health.level and subject.partition(" ")[0] not in others
+        ]
+        value = {"state": _ON[bool(bad)], "text": shortened("; ".join(bad), _LONGEST)}
+        topic = self._topics.of_microphone(microphone.name, "problem")
+        self._connection.keep(topic, json.dumps(value))
+
+
+def class_values(microphone: MicrophoneState, label: str, news: News) -> Iterator[tuple[str, str]]:
+    """Yield what the broker keeps of a class: the kind of topic, and its value.
+
+    Parameters
+    ----------
+    microphone : MicrophoneState
+    label : str
+        The class.
+    news : News
+        Of whose day and night events are counted.
+    """
+    yield "on", _ON[microphone.heard.is_heard(label)]
+    for kind, count in zip(
+        ("count_today", "count_night"), counts(microphone, label, news.today), strict=True
+    ):
+        yield kind, str(count)
+    last = microphone.last_event(label)
+    if last is not None:  # else what the broker has from an earlier bridge is right
+        yield "last_heard", iso_time(last.end, news.zone)
+
+
+def counts(microphone: MicrophoneState, label: str, today: Today) -> tuple[int, int]:
+    """Count the events of a class that began since midnight, and those of the last night."""
+    night = [e for e in microphone.events(label, today.night) if e.start < today.morning]
+    return len(microphone.events(label, today.midnight)), len(night)
+
+
+def event_fields(event: Event, news: News) -> dict[str, str | float]:
+    """Describe an event for JSON."""
+    return {
+        "event_type": event.label,
+        "id": event.id,
+        "start": iso_time(event.start, news.zone),
+        "end": iso_time(event.end, news.zone),
+        "seconds": round(event.seconds, 2),
+        "confidence": round(event.confidence, 3),
+    }

@@ -1,0 +1,71 @@
+"""The topics of MQTT: chosen once, and never renamed."""
+
+import re
+from typing import NamedTuple
+from urllib.parse import quote, unquote
+
+_CLASS_PART = "/class/"
+_KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
+
+
+class Topics(NamedTuple):
+    """Names the topics of one recorder.
+
+    Attributes
+    ----------
+    base : str
+        `hearthlog`, unless it is configured.
+    node : str
+        Name of the recorder.
+    """
+
+    base: str
+    node: str
+
+    @property
+    def root(self) -> str:
+        """What all topics of the recorder begin with."""
+        return f"{self.base}/{self.node}"
+
+    def of_home(self, kind: str) -> str:
+        """Name a topic of the recorder: `bridge` or `recorder`."""
+        return f"{self.root}/{kind}"
+
+    def of_microphone(self, microphone: str, kind: str) -> str:
+        """Name a topic of a microphone, such as `listening`, `heard` or `event`."""
+        return f"{self.root}/{microphone}/{kind}"
+
+    def of_class(self, microphone: str, label: str, kind: str) -> str:
+        """Name a topic of a class: `on`, `count_today`, `count_night` or `last_heard`.
+
+        Parameters
+        ----------
+        microphone : str
+        label : str
+            The class; what a topic may not have, or what is no ASCII, is written `%2B`, as in
+            addresses.
+        kind : str
+        """
+        name = quote(label, safe=_KEPT)
+        return f"{self.root}/{microphone}{_CLASS_PART}{name}/{kind}"
+
+    def parse_class(self, topic: str, kind: str) -> tuple[str, str] | None:
+        """Return the microphone and the class of a topic; None if it is no such topic."""
+        form = rf"{re.escape(self.root)}/([^/]+){_CLASS_PART}([^/]+)/{kind}"
+        match = re.fullmatch(form, topic)
+        return None if match is None else (match[1], unquote(match[2]))
+
+    def parse_microphone(self, topic: str, kind: str) -> str | None:
+        """Return the microphone of a topic; None if it is no such topic."""
+        match = re.fullmatch(rf"{re.escape(self.root)}/([^/]+)/{kind}", topic)
+        return None if match is None else match[1]
+
+
+def identifier(text: str) -> str:
+    """Make a text part of an identifier: other characters than `a-z0-9` become `_2b_`.
+
+    Parameters
+    ----------
+    text : str
+    """
+    return re.sub(r"[^a-z0-9_]", lambda match: f"_{ord(match[0]):x}_", text)

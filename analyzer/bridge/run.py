@@ -1,0 +1,77 @@
+"""The bridge: follows the log of a recorder, and tells everybody who is to know."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import tzinfo
+from pathlib import Path
+from threading import Event as Flag
+
+from hearthlog.analyzer.bridge.day import today
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.follow_home import follow_home
+from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.output import News, Output
+from hearthlog.schemas.times import NANOSECONDS
+
+_NEWS = 60 * NANOSECONDS  # how old an event may be that is told of after a start
+_FORGET = 3600 * NANOSECONDS
+
+
+@dataclass
+class Bridge:
+    """Follows one recorder.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the logs.
+    node : str
+        Name of the recorder.
+    zone : tzinfo
+        Of the home.
+    outputs : dict of str to Output
+        By what they are called where one of them fails.
+    say : callable
+        Told what is wrong, in a line.
+    """
+
+    folder: Path
+    node: str
+    zone: tzinfo
+    outputs: dict[str, Output]
+    say: Callable[[str], None]
+
+    def run(self, stop: Flag) -> None:
+        """Tell what is heard until `stop` is set."""
+        start = today(time.time_ns(), self.zone)
+        since = min(start.midnight, start.night)
+        early: list[Event] = []
+        try:
+            followed = follow_home(self.folder, self.node, since, stop, self._damaged)
+            for state, begun in followed:
+                if state.caught_up:
+                    self._tell(state, [*early, *begun])
+                    early = []
+                else:
+                    early = [*early, *begun][-1000:]
+        finally:
+            for output in self.outputs.values():
+                output.close()
+
+    def _tell(self, state: HomeState, begun: Sequence[Event]) -> None:
+        now = time.time_ns()
+        moment = today(now, self.zone)
+        ended = [event for each in state.microphones.values() for event in each.ended_events()]
+        for microphone in state.microphones.values():
+            microphone.forget_before(min(moment.midnight, moment.night) - _FORGET)
+        recent = [event for event in begun if now - event.end <= _NEWS]
+        news = News(state, recent, ended, moment, self.zone)
+        for name, output in self.outputs.items():
+            try:
+                output.update(news)
+            except Exception as error:  # noqa: BLE001  one that fails must not stop the others
+                self.say(f"{name}: {type(error).__name__}: {error}")
+
+    def _damaged(self, error: Exception) -> None:
+        self.say(str(error))

@@ -1,0 +1,109 @@
+"""The table `bridge` of the configuration: what a home is told, and where."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hearthlog.recorder.config import BRIDGE, Settings, load_settings, refusal
+from hearthlog.recorder.config_origins import Origins, key_lines
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.storage.small_file import read_toml
+
+_Topic = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^+#\x00]+$")]
+_Port = Annotated[int, Field(ge=1, le=65535)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MqttSettings(_Table):
+    """A broker, and how one speaks to it."""
+
+    host: str = Field(min_length=1, description="Name or address of the broker.")
+    port: _Port | None = Field(default=None, description="1883, with TLS 8883, by default.")
+    user: str = Field(default="", description="Empty: nobody in particular.")
+    password_file: Path | None = Field(default=None, description="Of one line.")
+    tls: bool = Field(default=False, description="Whether the connection is encrypted.")
+    ca_file: Path | None = Field(
+        default=None, description="Of who signs the broker's certificate; none: the machine's own."
+    )
+    certificate_file: Path | None = Field(default=None, description="Of this client.")
+    key_file: Path | None = Field(default=None, description="Of this client.")
+    client_id: str = Field(default="", description="Empty: hearthlog- and the recorder's name.")
+    topic: _Topic = Field(default="hearthlog", description="Begins all topics.")
+    home_assistant: bool = Field(default=True, description="Whether Home Assistant is told.")
+    discovery_topic: _Topic = Field(
+        default="homeassistant", description="Where Home Assistant looks for devices."
+    )
+    commands: bool = Field(
+        default=False, description="Whether corrections and pauses are taken from the broker."
+    )
+
+
+class PrometheusSettings(_Table):
+    """Where a Prometheus finds its figures."""
+
+    text_file: Path | None = Field(
+        default=None, description="For the textfile collector of node_exporter; ends in .prom."
+    )
+    port: _Port | None = Field(default=None, description="On loopback; none: no port.")
+
+
+class PageSettings(_Table):
+    """A page of the home, for a browser."""
+
+    port: _Port = Field(default=8380, description="Where it is.")
+    bind: str = Field(
+        default="127.0.0.1", description="Address of this machine; others than loopback, too."
+    )
+    token_file: Path | None = Field(
+        default=None,
+        description="Of one line, which the address of the page has to have; by default one is "
+        "made in the folder of the state.",
+    )
+
+
+class PingSettings(_Table):
+    """A watchdog on the network that raises the alarm when it hears nothing."""
+
+    url: str = Field(pattern=r"^https?://[^/\s]+", description="As of healthchecks.io.")
+    every_seconds: float = Field(default=60.0, ge=5.0, le=86_400, description="Between pings.")
+
+
+class BridgeSettings(_Table):
+    """Everything that can be configured; the field names are the keys of the table `bridge`."""
+
+    state: Path | None = Field(
+        default=None,
+        description="Folder of what the bridge has to remember; by default that of systemd, or "
+        "`bridge` beside the logs.",
+    )
+    mqtt: MqttSettings | None = None
+    prometheus: PrometheusSettings | None = None
+    page: PageSettings | None = None
+    ping: PingSettings | None = None
+
+
+def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
+    """Load the configuration of a recorder, and of the bridge that follows its log.
+
+    Parameters
+    ----------
+    file : Path or None
+        The TOML file; None for no file.
+
+    Raises
+    ------
+    ConfigurationError
+        As `load_settings`, also for what is in the table `bridge`.
+    """
+    settings = load_settings(file, {}, {})
+    content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
+    table = content.get(BRIDGE, {})
+    lines = {} if file is None else key_lines(file.read_text("utf-8"))
+    try:
+        return settings, BridgeSettings.model_validate(table)
+    except ValidationError as error:
+        raise refusal(error, Origins({}, content, file, lines), (BRIDGE,)) from error
