@@ -6,6 +6,7 @@ _EXTRAS = {
     "rerun_cli": "viewer",
     "foxglove": "foxglove",
     "paho": "bridge",
+    "apprise": "bridge",
 } | dict.fromkeys(_CLUSTER, "cluster")
 
 

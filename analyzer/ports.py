@@ -3,6 +3,8 @@
 import errno
 import secrets
 import socket
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from urllib.parse import urlsplit
 
 from hearthlog.analyzer.errors import DataError
 
@@ -75,3 +77,42 @@ def hidden_address() -> str:
         except OSError:
             return HOST
     return address
+
+
+def is_asked_in_digits(bind: str, host: str) -> bool:
+    """Tell whether a request came for an address of this machine, and not for a name.
+
+    Whoever owns a name can let it point to any address, so that a page of that name may read what
+    is there. Nobody can do so with an address in digits, or with `localhost`.
+
+    Parameters
+    ----------
+    bind : str
+        Address that is listened on, of IPv4 or IPv6.
+    host : str
+        The field `Host` of the request, with or without a port.
+    """
+    listening, named = ip_address(bind), host_name(f"//{host}")
+    if named == "localhost":
+        return listening.is_loopback or listening.is_unspecified
+    address = ip_of(named)
+    if address is None:
+        return False
+    same = address == listening or listening.is_unspecified
+    return same or (listening.is_loopback and address.is_loopback)
+
+
+def host_name(url: str) -> str:
+    """Return the host of a URL in lower case, without its port; empty if it has none."""
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return ""
+
+
+def ip_of(text: str) -> IPv4Address | IPv6Address | None:
+    """Return the address that a text is in digits; None if it is none."""
+    try:
+        return ip_address(text)
+    except ValueError:
+        return None

@@ -308,15 +308,17 @@ def refusal(error: ValidationError, origins: Origins, table: Key = ()) -> Config
     Parameters
     ----------
     error : ValidationError
-        Of which the first error is said.
+        Of which one error is said: an unknown key, for it may be why another one is missing.
     origins : Origins
         Of what was checked.
     table : Key, optional
         Where in the file that was.
     """
-    first = error.errors()[0]
-    where = _place((*table, *first["loc"]), origins)
-    key = ".".join(str(part) for part in (*table, *first["loc"]))
+    errors = error.errors()
+    first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
+    whole = (*table, *first["loc"])
+    where = _place(whole[:-1] if first["type"] == "missing" else whole, origins)
+    key = ".".join(str(part) for part in whole)
     if first["type"] == "extra_forbidden":
         return ConfigurationError(f"{where}: unknown key {key!r}")
     return ConfigurationError(f"{where}: {key}: {first['msg'].removeprefix('Value error, ')}")

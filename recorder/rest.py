@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.messages.gaps import PAUSED, QUIET_HOURS
+from hearthlog.schemas.text import shortened
 
 _FORM = re.compile(r"([01]\d|2[0-3]):([0-5]\d)-([01]\d|2[0-3]):([0-5]\d)")
 _DAY = 24 * 60
 _PAUSE_FILE = ".pause"
-_LONGEST = 64  # bytes of what the file says
+_LONGEST = 600  # bytes of what the file says
+_LONGEST_NAME = 100  # characters of who asked for a pause
 _LAST = 1 << 32  # seconds of UTC: in 2106
 
 
@@ -97,7 +99,9 @@ class Rest:
         if _is_paused(self._folder):
             end = paused_until(self._folder)
             until = "hearthlog resume" if end is None else self._local(end)
-            return f"{PAUSED} until {until}: the microphone is closed"
+            who = _paused_by(self._folder)
+            by = f" by {who}" if who else ""
+            return f"{PAUSED}{by} until {until}: the microphone is closed"
         until = self._local(time.time() + 60 * self._minutes_left())
         return f"{QUIET_HOURS} until {until}: the microphone is closed"
 
@@ -111,7 +115,7 @@ class Rest:
         return f"{datetime.fromtimestamp(seconds, self._zone):%H:%M}"
 
 
-def pause(folder: Path, duration: timedelta | None) -> None:
+def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
     """Ask the recorders of a folder to close their microphones.
 
     Parameters
@@ -120,6 +124,8 @@ def pause(folder: Path, duration: timedelta | None) -> None:
         Of their logs.
     duration : timedelta or None
         How long; None until `resume`.
+    who : str, optional
+        Who asks for it, for the log.
 
     Raises
     ------
@@ -128,7 +134,7 @@ def pause(folder: Path, duration: timedelta | None) -> None:
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
     temporary = folder / f"{_PAUSE_FILE}.new"
-    temporary.write_text(end, encoding="ascii")
+    temporary.write_text(f"{end}\n{who}" if who else end, encoding="utf-8")
     temporary.replace(folder / _PAUSE_FILE)
 
 
@@ -158,15 +164,28 @@ def paused_until(folder: Path) -> float | None:
     folder : Path
         Of the logs.
     """
-    path = folder / _PAUSE_FILE
     try:
-        if not path.is_file():  # what a pipe says would be waited for
-            return None
-        with path.open("rb") as file:
-            end = float(int(file.read(_LONGEST)))
+        end = float(int(_read_pause(folder).partition(b"\n")[0]))
     except (OSError, ValueError):  # in doubt nobody is listened to
         return None
     return end if end < _LAST else None
+
+
+def _paused_by(folder: Path) -> str:
+    """Return who asked for a pause; empty if the file does not say."""
+    try:
+        name = _read_pause(folder).partition(b"\n")[2].decode(errors="replace")
+    except OSError:
+        return ""
+    return shortened(name, _LONGEST_NAME)
+
+
+def _read_pause(folder: Path) -> bytes:
+    path = folder / _PAUSE_FILE
+    if not path.is_file():  # what a pipe says would be waited for
+        return b""
+    with path.open("rb") as file:
+        return file.read(_LONGEST)
 
 
 def _is_paused(folder: Path) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from brokers import broker
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
 from spliced import record_logs
@@ -34,6 +35,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
+    "broker",
     "bucket",
     "camera",
     "in_memory",

@@ -1,6 +1,5 @@
 """Follow the log of one recorder from some time on, and then live, without a seam."""
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event as Flag
@@ -33,7 +32,7 @@ def is_of_bridge(topic: str) -> bool:
     if topic == DIAGNOSTICS:
         return True
     name = parse_topic(topic)
-    return name is not None and name.labelling == LIVE and name.kind in {"label", "segment"}
+    return name is not None and name.labelling == LIVE and name.kind in {"label", "segment", "gap"}
 
 
 def follow_home(
@@ -89,12 +88,7 @@ def _decode(batch: list[RawMessages]) -> list[Columns]:
     for raw in batch:
         if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
             kind = raw.schema.name
-            if kind != message_types.SEGMENT:
+            if kind not in {message_types.SEGMENT, message_types.GAP}:
                 raw = raw.between(int(np.max(raw.log_times)) - _LATEST, None)  # noqa: PLW2901
             columns += decode([raw], FIELDS[kind])
     return columns
-
-
-def history_start(zone_midnight: int, night: int, longest: int) -> int:
-    """Return the earliest of the times from which on events have to be known."""
-    return min(zone_midnight, night, time.time_ns() - longest)

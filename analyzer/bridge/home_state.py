@@ -19,6 +19,7 @@ FIELDS = {
     message_types.LABEL: ("label", "confidence"),
     message_types.SEGMENT: ("header.stamp", "duration", "label", "confidence"),
     message_types.DIAGNOSTICS: ("status",),
+    message_types.GAP: ("header.stamp", "duration"),
 }
 _AWAY_SECONDS = 15.0  # without a word
 _DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after its end no segment is added to an event
@@ -49,6 +50,10 @@ class MicrophoneState:
         The newest label; empty before the first.
     level_dbfs : float
         Mean level of ten seconds; NaN where it is not known.
+    gaps : list of (int, int)
+        When it was not heard, in nanoseconds of UTC, in the order in which a log has them.
+    since : int
+        When the first that is known of it began, in nanoseconds of UTC; 0 before there is any.
     """
 
     def __init__(self, name: str) -> None:
@@ -57,6 +62,8 @@ class MicrophoneState:
         self.heard = HeardNow([])
         self.label, self.confidence = "", 0.0
         self.level_dbfs = math.nan
+        self.gaps: list[tuple[int, int]] = []
+        self.since = 0
         self.seen = -math.inf  # when a label came, by CLOCK_MONOTONIC
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
@@ -70,6 +77,10 @@ class MicrophoneState:
         record = self._records.get(label)
         return [] if record is None else record.since(since)
 
+    def labels(self) -> list[str]:
+        """Return the classes of which events are known."""
+        return list(self._records)
+
     def last_event(self, label: str) -> Event | None:
         """Return the last event of a class; None if none is known."""
         record = self._records.get(label)
@@ -82,12 +93,15 @@ class MicrophoneState:
             self.classes = classes
             self.heard = HeardNow(classes)
         self.heard.push(columns["label"].tolist(), columns.log_times)
+        self.since = self.since or int(columns.log_times[0])
         self.label = str(columns["label"][-1])
         self.confidence = float(columns["confidence"][-1])
 
     def push_segments(self, columns: Columns) -> list[Event]:
         """Add segments, with the fields of `FIELDS`; return the events that begin with them."""
         begun = []
+        first = int(columns["header.stamp"][0])
+        self.since = min(self.since or first, first)
         names = "header.stamp", "duration", "label", "confidence"
         for start, duration, label, confidence in zip(
             *(columns[name].tolist() for name in names), strict=True
@@ -99,6 +113,12 @@ class MicrophoneState:
             if record.push(start, start + max(duration, 0), confidence):
                 begun.append(record.events[-1])
         return begun
+
+    def push_gaps(self, columns: Columns) -> None:
+        """Add gaps, with the fields of `FIELDS`."""
+        starts, durations = columns["header.stamp"].tolist(), columns["duration"].tolist()
+        spans = zip(starts, durations, strict=True)
+        self.gaps += [(start, start + length) for start, length in spans if length > 0]
 
     def ended_events(self) -> list[Event]:
         """Return the events that are over, each once."""
@@ -114,6 +134,8 @@ class MicrophoneState:
         """Forget the events that began before a time, but for the last one of each class."""
         for record in self._records.values():
             record.forget_before(time)
+        if self.gaps and self.gaps[0][1] < time:
+            self.gaps = [gap for gap in self.gaps if gap[1] >= time]
 
     def _is_full(self) -> bool:
         return len(self._records) >= _MOST_CLASSES
@@ -141,6 +163,15 @@ class HomeState:
         """Tell whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
 
+    def find_event(self, identifier: str) -> Event | None:
+        """Return the event of an id; None if it is not known, or no more."""
+        for microphone in self.microphones.values():
+            for label in microphone.labels():
+                for event in microphone.events(label, 0):
+                    if event.id == identifier:
+                        return event
+        return None
+
     def push(self, columns: Sequence[Columns]) -> list[Event]:
         """Add messages with the fields of `FIELDS`; return the events that begin with them.
 
@@ -164,6 +195,8 @@ class HomeState:
             if name.kind == "label":
                 microphone.push_labels(part)
                 microphone.seen = max(microphone.seen, seen)
+            elif name.kind == "gap":
+                microphone.push_gaps(part)
             else:
                 begun += microphone.push_segments(part)
         return begun

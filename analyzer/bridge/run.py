@@ -3,19 +3,19 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import tzinfo
-from pathlib import Path
 from threading import Event as Flag
 
 from hearthlog.analyzer.bridge.day import today
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.follow_home import follow_home
+from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News, Output
 from hearthlog.schemas.times import NANOSECONDS
 
 _NEWS = 60 * NANOSECONDS  # how old an event may be that is told of after a start
-_FORGET = 3600 * NANOSECONDS
+_MOST_EARLY = 1000  # events before all is read, of which only the recent ones are told of
+_FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
 
 
 @dataclass
@@ -24,49 +24,45 @@ class Bridge:
 
     Attributes
     ----------
-    folder : Path
-        Of the logs.
-    node : str
-        Name of the recorder.
-    zone : tzinfo
-        Of the home.
+    home : Home
+    since : int
+        From when on events are to be known, in nanoseconds of UTC.
     outputs : dict of str to Output
         By what they are called where one of them fails.
     say : callable
         Told what is wrong, in a line.
     """
 
-    folder: Path
-    node: str
-    zone: tzinfo
+    home: Home
+    since: int
     outputs: dict[str, Output]
     say: Callable[[str], None]
 
     def run(self, stop: Flag) -> None:
         """Tell what is heard until `stop` is set."""
-        start = today(time.time_ns(), self.zone)
-        since = min(start.midnight, start.night)
         early: list[Event] = []
         try:
-            followed = follow_home(self.folder, self.node, since, stop, self._damaged)
+            followed = follow_home(
+                self.home.folder, self.home.node, self.since, stop, self._damaged
+            )
             for state, begun in followed:
                 if state.caught_up:
                     self._tell(state, [*early, *begun])
                     early = []
                 else:
-                    early = [*early, *begun][-1000:]
+                    early = [*early, *begun][-_MOST_EARLY:]
         finally:
             for output in self.outputs.values():
                 output.close()
 
     def _tell(self, state: HomeState, begun: Sequence[Event]) -> None:
         now = time.time_ns()
-        moment = today(now, self.zone)
+        moment = today(now, self.home.zone)
         ended = [event for each in state.microphones.values() for event in each.ended_events()]
         for microphone in state.microphones.values():
-            microphone.forget_before(min(moment.midnight, moment.night) - _FORGET)
+            microphone.forget_before(min(moment.midnight, moment.night) - _FORGOTTEN)
         recent = [event for event in begun if now - event.end <= _NEWS]
-        news = News(state, recent, ended, moment, self.zone)
+        news = News(state, recent, ended, moment, self.home.zone)
         for name, output in self.outputs.items():
             try:
                 output.update(news)

@@ -1,10 +1,12 @@
 """The table `bridge` of the configuration: what a home is told, and where."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from hearthlog.analyzer.bridge.alerts.rules import AlertRules
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
 from hearthlog.recorder.config import BRIDGE, Settings, load_settings, refusal
 from hearthlog.recorder.config_origins import Origins, key_lines
 from hearthlog.recorder.errors import ConfigurationError
@@ -84,6 +86,8 @@ class BridgeSettings(_Table):
     prometheus: PrometheusSettings | None = None
     page: PageSettings | None = None
     ping: PingSettings | None = None
+    alert: AlertRules = Field(default=[], description="One table for each rule.")
+    delivery: DeliverySettings = DeliverySettings()
 
 
 def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
@@ -107,3 +111,12 @@ def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
         return settings, BridgeSettings.model_validate(table)
     except ValidationError as error:
         raise refusal(error, Origins({}, content, file, lines), (BRIDGE,)) from error
+
+
+def file_schema() -> dict[str, Any]:
+    """Return the JSON schema of a configuration: of the recorder and of the bridge."""
+    schema = Settings.model_json_schema()
+    bridge = BridgeSettings.model_json_schema()
+    schema["$defs"] |= bridge.pop("$defs", {})
+    schema["properties"][BRIDGE] = bridge
+    return schema

@@ -3,10 +3,9 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv6Address, ip_address
 from secrets import compare_digest
-from urllib.parse import urlsplit
 
+from hearthlog.analyzer.ports import host_name, ip_of, is_asked_in_digits
 from hearthlog.schemas.errors import HearthlogError
 
 # Foxglove in a browser, and the desktop applications, whose pages are files.
@@ -14,7 +13,6 @@ _ORIGINS = frozenset({"https://app.foxglove.dev", "file://"})
 _FIELD = re.compile(r"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([\x20-\x7e]*?)[ \t]*")
 _HANDED_ON = ("Sec-WebSocket-Key", "Sec-WebSocket-Version", "Sec-WebSocket-Protocol")
 _LONGEST = 200  # characters of an origin that is told
-_Address = IPv4Address | IPv6Address
 
 
 class RefusedError(HearthlogError):
@@ -64,7 +62,7 @@ class Admission:
         """
         target, fields = _parse(head)
         origin = fields.get("origin")
-        if not self._is_here(fields.get("host", "")):
+        if not is_asked_in_digits(self.bind, fields.get("host", "")):
             raise RefusedError(
                 "refused: it was asked for by a name; connect to an address in digits"
             )
@@ -81,17 +79,6 @@ class Admission:
         lines = ["GET / HTTP/1.1", "Host: hearthlog", "Upgrade: websocket", "Connection: Upgrade"]
         return "\r\n".join([*lines, *handed_on, "", ""]).encode()
 
-    def _is_here(self, host: str) -> bool:
-        """Tell whether a host is where we listen, or no name and another way to this machine."""
-        bind, named = ip_address(self.bind), _hostname(f"//{host}")
-        if named == "localhost":
-            return bind.is_loopback or bind.is_unspecified
-        address = _address(named)
-        if address is None:
-            return False
-        same = address == bind or bind.is_unspecified
-        return same or (bind.is_loopback and address.is_loopback)
-
 
 def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
     """Return the target and the fields, by their names in lower case."""
@@ -107,20 +94,6 @@ def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
 
 def _is_local(origin: str) -> bool:
     """Tell whether a page is one that this machine serves."""
-    address = _address(name := _hostname(origin))
+    address = ip_of(name := host_name(origin))
     is_here = name == "localhost" or (address is not None and address.is_loopback)
     return is_here and origin.startswith(("http://", "https://"))
-
-
-def _hostname(url: str) -> str:
-    try:
-        return urlsplit(url).hostname or ""
-    except ValueError:
-        return ""
-
-
-def _address(text: str) -> _Address | None:
-    try:
-        return ip_address(text)
-    except ValueError:
-        return None

@@ -3,17 +3,11 @@
 import signal
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from hearthlog.tools.cli.text import TellOnce, wrong_use
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from hearthlog.analyzer.bridge.output import Output
-    from hearthlog.analyzer.bridge.settings import BridgeSettings
+from hearthlog.tools.cli.text import tell, wrong_use
 
 
 def bridge(
@@ -33,28 +27,23 @@ def bridge(
 
     The recorder takes no notice: only its logs are read. What cannot be told is tried again.
     """
+    from hearthlog.analyzer.bridge.home import Home
+    from hearthlog.analyzer.bridge.outputs import open_outputs
     from hearthlog.analyzer.bridge.run import Bridge
+    from hearthlog.analyzer.bridge.saying import Saying
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
+    from hearthlog.analyzer.bridge.state_folder import state_folder
     from hearthlog.recorder.timezone import time_zone
 
     settings, own = load_bridge_settings(config)
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
-    say = TellOnce()
-    outputs = _outputs(own, settings.node, say)
+    home = Home(logs or settings.output, settings.node, time_zone(settings.timezone))
+    say = Saying(tell)
+    outputs, since = open_outputs(own, home, state_folder(own.state, home.folder), say)
     if not outputs:
-        wrong_use("nobody is to be told anything: see docs/bridge.md for the table [bridge.mqtt]")
-    folder = logs or settings.output
-    Bridge(folder, settings.node, time_zone(settings.timezone), outputs, say).run(stop)
-
-
-def _outputs(
-    settings: "BridgeSettings", node: str, say: "Callable[[str], None]"
-) -> dict[str, "Output"]:
-    outputs: dict[str, Output] = {}
-    if settings.mqtt is not None:
-        from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
-
-        outputs["mqtt"] = MqttPublisher(settings.mqtt, node, say)
-    return outputs
+        wrong_use(
+            "nobody is to be told anything: docs/bridge.md says how, by a table [bridge.mqtt]"
+        )
+    Bridge(home, since, outputs, say).run(stop)

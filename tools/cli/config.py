@@ -46,20 +46,21 @@ def check(
 
     Exit status 2: it is wrong; 1: its model, or its folder of logs, cannot be used.
     """
-    from hearthlog.recorder.config import load_settings
+    from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.recorder.recording import check_recording
     from hearthlog.tools.cli.record import with_model
 
-    check_recording(with_model(load_settings(file, {}, {})))
+    settings, _ = load_bridge_settings(file)
+    check_recording(with_model(settings))
     print(f"{file}: can be used")
 
 
 @config.command()
 def schema() -> None:
     """Print the JSON schema of the configuration, by which editors check and complete it."""
-    from hearthlog.recorder.config import Settings
+    from hearthlog.analyzer.bridge.settings import file_schema
 
-    print(json.dumps(Settings.model_json_schema(), indent=2))
+    print(json.dumps(file_schema(), indent=2))
 
 
 def _value_lines(

@@ -78,10 +78,10 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
 
 def _examine_live(folder: Path, ping_url: str | None, *, as_json: bool) -> None:
     from hearthlog.analyzer.live import examine_live
-    from hearthlog.tools.cli.ping import check_ping_address, ping
+    from hearthlog.analyzer.ping import is_ping_address, ping
 
-    if ping_url is not None:
-        check_ping_address(ping_url)
+    if ping_url is not None and not is_ping_address(ping_url):
+        wrong_use("--ping wants an address such as https://hc-ping.com/your-uuid")
     states = examine_live(folder)
     if as_json:
         print(json.dumps([state._asdict() for state in states], indent=2))

@@ -17,6 +17,7 @@ import typer
 
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
+from hearthlog.tools.cli.alerts import alerts
 from hearthlog.tools.cli.annotate import annotate
 from hearthlog.tools.cli.bridge import bridge
 from hearthlog.tools.cli.cat import cat
@@ -73,6 +74,7 @@ _LEARNING = (manifest, train, enrol)
 _NAMED = 10  # of many files with the same fault
 for verb in (*_ON_LOGS, *_LEARNING, diff, review, watch, bridge, report, replay, relabel, demo):
     app.command(cls=ReviewCommand if verb is review else None)(verb)
+app.add_typer(alerts, name="alerts")
 app.add_typer(annotate, name="annotate")
 app.add_typer(config, name="config")
 app.add_typer(evaluate, name="evaluate")

@@ -25,6 +25,7 @@ _TIMELY_SECONDS = 60.0  # after which an event is no news
 _FIRST_PAUSE, _LONGEST_PAUSE = 1, 60  # seconds, before it is tried again
 _CLOSE_SECONDS = 2.0
 _QOS = 1
+_SHORT_SECONDS = 15.0  # so short a connection is no good one
 _TAKEN_OVER = 0x8E
 _LONGEST_PASSWORD = 4096
 
@@ -74,6 +75,8 @@ class Connection:
         self._client_id = client_id
         self._place = f"{settings.host}:{_port(settings)}"
         self._hint = ""
+        self._connected: float | None = None  # since when, by CLOCK_MONOTONIC
+        self._short = 0  # connections in a row that were
         self._values: dict[str, str] = {}  # the newest of each topic that the broker keeps
         self._unsent: dict[str, None] = {}  # topics, in order
         self._events: deque[tuple[float, str, str]] = deque(maxlen=_QUEUED)
@@ -177,7 +180,7 @@ class Connection:
         if reason.is_failure:
             self._say(f"{self._place}: refused: {reason}; see user, password_file and client_id")
             return
-        client.reconnect_delay_set(_FIRST_PAUSE, _LONGEST_PAUSE)
+        self._connected = time.monotonic()
         for topic in self._subscriptions:
             client.subscribe(topic, _QOS)
         client.publish(self._alive, "online", _QOS, retain=True)
@@ -195,14 +198,23 @@ class Connection:
     def _on_disconnect(
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
     ) -> None:
-        if reason.value == _TAKEN_OVER:
-            client.reconnect_delay_set(_LONGEST_PAUSE, _LONGEST_PAUSE)
+        since, self._connected = self._connected, None
+        if since is None:
+            if reason.is_failure:
+                self._say(f"{self._place}: no connection: {reason}{self._hint}; trying again")
+            return
+        is_short = reason.is_failure and time.monotonic() - since < _SHORT_SECONDS
+        self._short = self._short + 1 if is_short else 0
+        # The client itself begins with the first pause again, whenever it was let in.
+        pause = min(_FIRST_PAUSE << self._short, _LONGEST_PAUSE)
+        client.reconnect_delay_set(pause, max(pause, _LONGEST_PAUSE))
+        if reason.value == _TAKEN_OVER or self._short > 1:
             self._say(
-                f"{self._place}: another client named {self._client_id} has connected: is a second "
-                "bridge of this recorder running? give one of them another client_id"
+                f"{self._place}: the broker ends each connection at once: is another client named "
+                f"{self._client_id} running, a second bridge? give one of them another client_id"
             )
         elif reason.is_failure:
-            self._say(f"{self._place}: the connection ended: {reason}{self._hint}; trying again")
+            self._say(f"{self._place}: the connection ended: {reason}; trying again")
 
     def _on_publish(
         self, _client: mqtt.Client, _data: Any, _number: int, reason: ReasonCode, _more: Any

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from threading import Lock
 
@@ -10,7 +11,9 @@ from paho.mqtt.client import MQTTMessage
 from hearthlog.analyzer.bridge.day import Today, iso_time
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.bridge.heard_now import ANY_SOUND
+from hearthlog.analyzer.bridge.home import Home
 from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.mqtt.commands import Answer, Commands
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.discovery import device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
@@ -23,6 +26,7 @@ _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
 _BORN = b"online"  # of Home Assistant
+_MOST_ASKED = 20  # commands that wait
 
 
 class MqttPublisher:
@@ -31,8 +35,7 @@ class MqttPublisher:
     Parameters
     ----------
     settings : MqttSettings
-    node : str
-        Name of the recorder.
+    home : Home
     say : callable
         Told what is wrong, in a line.
 
@@ -42,9 +45,10 @@ class MqttPublisher:
         If a file of the settings cannot be used.
     """
 
-    def __init__(self, settings: MqttSettings, node: str, say: Callable[[str], None]) -> None:
+    def __init__(self, settings: MqttSettings, home: Home, say: Callable[[str], None]) -> None:
         self._settings = settings
-        self._topics = topics = Topics(settings.topic, node)
+        self._home = home
+        self._topics = topics = Topics(settings.topic, home.node)
         self._classes: dict[str, list[str]] = {}  # those that were told of, by microphone
         self._lock = Lock()
         self._at_broker: set[tuple[str, str]] = set()  # microphones and classes with values there
@@ -56,7 +60,13 @@ class MqttPublisher:
         ]
         if settings.home_assistant:
             subscriptions.append(self._birth_topic)
-        client_id = settings.client_id or f"hearthlog-{node}"
+        self._commands = None
+        self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
+        self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
+        if settings.commands:
+            subscriptions.append(self._command_topic)
+            self._commands = Commands(home.folder, home.node, self._answers.append)
+        client_id = settings.client_id or f"hearthlog-{home.node}"
         self._connection = Connection(
             settings,
             client_id,
@@ -79,15 +89,48 @@ class MqttPublisher:
             for event in events:
                 topic = self._topics.of_microphone(event.microphone, kind)
                 self._connection.send(topic, json.dumps(event_fields(event, news)))
+        self._obey(news.state)
         with self._lock:
             is_born, self._is_born = self._is_born, False
         if is_born:
             self._connection.repeat()
         self._connection.flush()
 
+    def alert(self, name: str, text: str, time: int) -> None:
+        """Say that an alert rings.
+
+        Parameters
+        ----------
+        name : str
+            Of its rule.
+        text : str
+            What is the case.
+        time : int
+            Since when, in nanoseconds of UTC.
+        """
+        since = iso_time(time, self._home.zone)
+        fields = {"event_type": "alert", "name": name, "text": text, "time": since}
+        self._connection.send(self._topics.of_home("alert"), json.dumps(fields))
+
     def close(self) -> None:
         """Say `offline`, and end."""
+        if self._commands is not None:
+            self._commands.close()
         self._connection.close()
+
+    def _obey(self, state: HomeState) -> None:
+        """Have the commands carried out that came, and answer those that are."""
+        while self._commands is not None and self._asked:
+            self._commands.add(self._asked.popleft(), state.find_event)
+        while self._answers:
+            answer = self._answers.popleft()
+            self._connection.send(
+                self._topics.of_home("command/answer"), json.dumps(answer._asdict())
+            )
+
+    @property
+    def _command_topic(self) -> str:
+        return self._topics.of_home("command")
 
     @property
     def _birth_topic(self) -> str:
@@ -97,7 +140,10 @@ class MqttPublisher:
         """Note what the broker has of earlier bridges, and that Home Assistant has started."""
         topic, payload = message.topic, message.payload
         with self._lock:
-            if topic == self._birth_topic:
+            if topic == self._command_topic:
+                if not message.retain:  # else it was meant for whoever was there then
+                    self._asked.append(bytes(payload))
+            elif topic == self._birth_topic:
                 self._is_born |= payload == _BORN and not message.retain
             elif payload and (found := self._topics.parse_class(topic, "on")):
                 self._at_broker.add(found)

@@ -4,16 +4,18 @@ import urllib.request
 from threading import Thread
 from urllib.parse import urlsplit
 
-from hearthlog.tools.cli.text import wrong_use
-
 _SECONDS = 15.0
 
 
-def check_ping_address(url: str) -> None:
-    """End with the exit status of wrong use unless an address can be asked."""
+def is_ping_address(url: str) -> bool:
+    """Tell whether an address can be asked.
+
+    Parameters
+    ----------
+    url : str
+    """
     parts = urlsplit(url)
-    if parts.scheme not in {"http", "https"} or not parts.hostname:
-        wrong_use("--ping wants an address such as https://hc-ping.com/your-uuid")
+    return parts.scheme in {"http", "https"} and bool(parts.hostname)
 
 
 def ping(url: str, *, is_well: bool) -> str:
@@ -22,7 +24,7 @@ def ping(url: str, *, is_well: bool) -> str:
     Parameters
     ----------
     url : str
-        As `check_ping_address` takes it.
+        As `is_ping_address` takes it.
     is_well : bool
 
     Returns

@@ -1,0 +1,110 @@
+"""Tell targets of rings, each in a thread of its own, again and again with growing pauses."""
+
+import time
+from collections.abc import Callable, Sequence
+from datetime import tzinfo
+from threading import Event as Flag
+from threading import Thread
+
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.ring import Ring
+from hearthlog.analyzer.bridge.alerts.targets import Target
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.schemas.times import NANOSECONDS
+
+_LOOK_SECONDS = 0.5
+_CLOSE_SECONDS = 2.0
+_LATE = 5 * 60 * NANOSECONDS
+
+
+class Delivery:
+    """Tells each target of the rings that wait for it; none of them waits for another.
+
+    Parameters
+    ----------
+    outbox : Outbox
+    targets : sequence of Target
+    node : str
+        Name of the recorder, for the titles.
+    zone : tzinfo
+        Of the home.
+    say : callable
+        Told why somebody cannot be told, in a line.
+    first_pause, longest_pause : float, optional
+        Seconds after the first failure, and at most; each pause is twice the one before.
+    """
+
+    def __init__(  # noqa: PLR0913
+        self,
+        outbox: Outbox,
+        targets: Sequence[Target],
+        node: str,
+        zone: tzinfo,
+        say: Callable[[str], None],
+        *,
+        first_pause: float = 5.0,
+        longest_pause: float = 900.0,
+    ) -> None:
+        self._outbox = outbox
+        self._node = node
+        self._zone = zone
+        self._say = say
+        self._pauses = first_pause, longest_pause
+        self._stop = Flag()
+        self._threads = [
+            Thread(target=self._run, args=(target,), daemon=True, name=f"alerts {target.place}")
+            for target in targets
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End within seconds, whatever a target does; the rest waits for the next start."""
+        self._stop.set()
+        until = time.monotonic() + _CLOSE_SECONDS
+        for thread in self._threads:
+            thread.join(max(until - time.monotonic(), 0.0))
+
+    def _run(self, target: Target) -> None:
+        first, longest = self._pauses
+        pause = first
+        while not self._stop.wait(_LOOK_SECONDS):
+            if self._tell(target):
+                pause = first
+                continue
+            self._stop.wait(pause)
+            pause = min(2 * pause, longest)
+
+    def _tell(self, target: Target) -> bool:
+        """Tell a target of all that waits for it; False if it could not be told."""
+        for ring in self._outbox.waiting_for(target.name, time.time_ns()):
+            if self._stop.is_set():
+                break
+            try:
+                reason = target.deliver(f"{self._node}: {ring.rule}", message(ring, self._zone))
+            except Exception as error:  # noqa: BLE001  hundreds of services, each with its own
+                reason = type(error).__name__
+            if reason:
+                self._say(
+                    f"{target.place}: an alert could not be told ({reason}); it is kept, and tried "
+                    "again, a quarter of an hour apart at most"
+                )
+                return False
+            self._outbox.note_told(target.name, ring)
+        return True
+
+
+def message(ring: Ring, zone: tzinfo, now: int | None = None) -> str:
+    """Write what is told of a ring: when it rang, what was the case, and whether that was long ago.
+
+    Parameters
+    ----------
+    ring : Ring
+    zone : tzinfo
+        Of the home.
+    now : int, optional
+        In nanoseconds of UTC; by default it is now.
+    """
+    late = (time.time_ns() if now is None else now) - ring.due > _LATE
+    moment = f"{local_time(ring.time, zone):%Y-%m-%d %H:%M}"
+    return f"{moment}: {ring.text}{' (told late)' if late else ''}"

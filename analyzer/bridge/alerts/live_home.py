@@ -1,0 +1,125 @@
+"""What was heard up to now, from the log while it is written."""
+
+from collections.abc import Sequence
+
+from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
+from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.bridge.alerts.open_run import Label, OpenRun
+from hearthlog.analyzer.bridge.alerts.rules import LONGEST_PAUSE
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
+
+FIELDS = {
+    message_types.SEGMENT: SEGMENT_FIELDS,
+    message_types.GAP: ("header.stamp", "duration"),
+    message_types.DIAGNOSTICS: (),
+}
+_CUT = 1_000_000_000  # ns of a run that no segment has, where a gap follows
+
+
+def is_of_alerts(topic: str) -> bool:
+    """Tell whether alerts need a topic.
+
+    Parameters
+    ----------
+    topic : str
+        Its name.
+    """
+    if topic == DIAGNOSTICS:
+        return True
+    name = parse_topic(topic)
+    return name is not None and name.labelling == LIVE and name.kind in {"segment", "gap"}
+
+
+class LiveHome:
+    """What the microphones of one recorder have heard up to now.
+
+    Parameters
+    ----------
+    start : int
+        From when on it is known, in nanoseconds of UTC.
+    patience : int
+        How late what a recorder writes may be read, in nanoseconds.
+    """
+
+    def __init__(self, start: int, patience: int) -> None:
+        self._start = start
+        self._patience = patience
+        self._gathered = Gathered()
+        self._runs: dict[str, OpenRun] = {}
+
+    def push(self, columns: Sequence[Columns]) -> None:
+        """Add messages, with the fields of `FIELDS`.
+
+        Parameters
+        ----------
+        columns : sequence of Columns
+            Of one log, in the order in which it was written.
+        """
+        for part in (each for each in columns if len(each)):
+            self._gathered.add_written(part.log_times)
+            name = parse_topic(part.topic)
+            if part.type == message_types.SEGMENT and name is not None:
+                self._gathered.add_segments(name.microphone, part)
+                self._run(name.microphone).begin(
+                    int((part["header.stamp"] + part["duration"]).max())
+                )
+            elif part.type == message_types.GAP and name is not None:
+                rows = zip(part["header.stamp"].tolist(), part["duration"].tolist(), strict=True)
+                for start, duration in rows:
+                    self._cut(name.microphone, start)
+                    self._run(name.microphone).begin(start + max(duration, 0))
+
+    def add_label(self, microphone: str, label: Label, classes: Sequence[str]) -> None:
+        """Add a label of a microphone.
+
+        Parameters
+        ----------
+        microphone : str
+        label : Label
+        classes : sequence of str
+            Those of its model.
+        """
+        run = self._run(microphone)
+        if label.time > run.last:
+            self._gathered.add_classes(microphone, classes)
+            self._gathered.add_written_span(label.time, label.time)
+            run.add(label)
+        if not run.start:
+            run.begin(max(self._start, self._gathered.recorder_began or 0))
+
+    def known_until(self, now: int) -> int:
+        """Return up to when everything is known that can have been heard.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
+        until = now
+        for open_run in self._runs.values():
+            run = open_run.run()
+            known = open_run.start if run is None else run.end
+            is_away = open_run.last < now - self._patience
+            until = min(until, max(known, now - self._patience) if is_away else known)
+        return until if self._runs else now - self._patience
+
+    def heard(self) -> HomeHeard:
+        """Return what was heard, with what goes on."""
+        runs = ((name, each.run()) for name, each in self._runs.items())
+        return self._gathered.heard([(name, *run) for name, run in runs if run is not None])
+
+    def forget_before(self, time: int) -> None:
+        """Forget what was over before a time, in nanoseconds of UTC."""
+        self._gathered.forget_before(time, LONGEST_PAUSE)
+
+    def _run(self, microphone: str) -> OpenRun:
+        return self._runs.setdefault(microphone, OpenRun())
+
+    def _cut(self, microphone: str, start: int) -> None:
+        """Keep what was heard before a gap although its segment was never written."""
+        run = self._run(microphone).run()
+        if run is not None and start - run.start > _CUT:
+            end = min(run.end, start)
+            self._gathered.add_segment(microphone, run.start, end, run.label, run.confidence)

@@ -1,0 +1,87 @@
+"""What the rules remember from one start of the bridge to the next, in a file."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hearthlog.analyzer.bridge.alerts.ring import RuleState
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.small_file import read_whole
+
+_LIMIT = 1 << 20  # bytes
+_DAMAGED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, HearthlogError)
+
+
+@dataclass
+class Progress:
+    """How far a rule is evaluated.
+
+    Attributes
+    ----------
+    until : int
+        Log time, in nanoseconds of UTC; 0 for one that is new.
+    state : RuleState
+    """
+
+    until: int = 0
+    state: RuleState = field(default_factory=RuleState)
+
+
+class Memory:
+    """Remembers how far each rule is evaluated; one that was changed begins anew.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    say : callable
+        Told what is wrong, in a line.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self._path = path
+        self._say = say
+
+    def load(self, rules: Sequence[AlertRule]) -> dict[str, Progress]:
+        """Return how far rules are evaluated, by name.
+
+        Parameters
+        ----------
+        rules : sequence of AlertRule
+        """
+        known = {}
+        try:
+            if self._path.exists():
+                content = json.loads(read_whole(self._path, "memory", _LIMIT, LogError))
+                known = {name: _progress(each) for name, each in content.items()}
+        except _DAMAGED:
+            self._say(f"{self._path}: cannot be read; all rules begin anew")
+        return {rule.name: known.get(rule.fingerprint, Progress()) for rule in rules}
+
+    def save(self, rules: Sequence[AlertRule], progress: dict[str, Progress]) -> None:
+        """Keep how far rules are evaluated; it is on the disk on return.
+
+        Parameters
+        ----------
+        rules : sequence of AlertRule
+        progress : dict of str to Progress
+            By name of the rule.
+        """
+        content = {
+            rule.fingerprint: {"until": own.until, **own.state._asdict()}
+            for rule in rules
+            for own in [progress[rule.name]]
+        }
+        try:
+            with replaced_file(self._path) as temporary:
+                temporary.write_text(json.dumps(content), "utf-8")
+        except LogError as error:
+            self._say(f"{error}; alerts may come twice after the next start")
+
+
+def _progress(content: dict[str, int]) -> Progress:
+    state = RuleState(int(content["last"]), bool(content["has_rung"]))
+    return Progress(int(content["until"]), state)

@@ -1,0 +1,189 @@
+"""The output of the bridge that evaluates rules, and tells of what rings."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from threading import Event as Flag
+from threading import Thread
+
+from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
+from hearthlog.analyzer.bridge.alerts.gathering import Gathered
+from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.bridge.alerts.live_home import FIELDS, LiveHome, is_of_alerts
+from hearthlog.analyzer.bridge.alerts.memory import Memory
+from hearthlog.analyzer.bridge.alerts.open_run import Label
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+from hearthlog.analyzer.bridge.alerts.ring import Ring
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
+from hearthlog.analyzer.bridge.alerts.targets import read_targets
+from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns, decode
+from hearthlog.schemas.logs.files import log_name
+from hearthlog.schemas.logs.follow import follow_messages
+from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.times import NANOSECONDS
+
+OnRing = Callable[[str, str, int], None]  # told the name of a rule, a text, and when it rang
+BROKER = "mqtt"  # in the place of the name of a target
+_PATIENCE = 30 * NANOSECONDS
+_LOOK_SECONDS = 1.0
+_FORGET_SECONDS = 300.0
+_CLOSE_SECONDS = 2.0
+_LABELS = 10_000
+_WAIT_SECONDS = 60.0  # for news, where there is no recorder
+
+
+class AlertsOutput:
+    """Evaluates rules in a thread of its own, and has everybody told of what rings.
+
+    Parameters
+    ----------
+    rules : sequence of AlertRule
+    delivery : DeliverySettings
+    home : Home
+    state_folder : Path
+        Of what the bridge remembers.
+    say : callable
+        Told what is wrong, in a line.
+    on_ring : callable, optional
+        Told the name of the rule, the text and the time (nanoseconds of UTC) of each ring, in the
+        thread of `update`.
+
+    Raises
+    ------
+    BridgeError
+        If nobody would be told, the file of addresses cannot be used, or the folder of the state
+        cannot be written.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917
+        self,
+        rules: Sequence[AlertRule],
+        delivery: DeliverySettings,
+        home: Home,
+        state_folder: Path,
+        say: Callable[[str], None],
+        on_ring: OnRing | None = None,
+    ) -> None:
+        file = delivery.urls_file
+        targets = [] if file is None else read_targets(file, say)
+        if not targets and on_ring is None:
+            raise BridgeError(
+                "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a "
+                "broker in [bridge.mqtt]"
+            )
+        self._followed = home
+        self._say = say
+        self._on_ring = on_ring
+        names = [*(target.name for target in targets), *([BROKER] if on_ring else [])]
+        folder = state_folder / "alerts"
+        try:
+            self._outbox = Outbox(folder / "outbox", names, say)
+        except OSError as error:
+            raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
+        memory = Memory(folder / "rules.json", say)
+        now = time.time_ns()
+        self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
+        self._heard = LiveHome(self._watch.start, _PATIENCE)
+        self._began = time.monotonic()
+        self._has_news = Flag()  # what is heard now is known
+        self._labels: deque[tuple[str, Label, Sequence[str]]] = deque(maxlen=_LABELS)
+        self._stop = Flag()
+        self._delivery = Delivery(self._outbox, targets, home.node, home.zone, say)
+        self._thread = Thread(target=self._run, daemon=True, name="alerts")
+        self._thread.start()
+
+    def update(self, news: News) -> None:
+        """Note what is heard now, and tell the broker of what rang."""
+        for microphone in news.state.microphones.values():
+            if microphone.label:
+                label = Label(microphone.heard.time, microphone.label, microphone.confidence)
+                self._labels.append((microphone.name, label, microphone.classes))
+        self._has_news.set()
+        if self._on_ring is not None:
+            for ring in self._outbox.waiting_for(BROKER, time.time_ns()):
+                self._tell_broker(ring, self._on_ring)
+
+    def close(self) -> None:
+        """End within seconds; what was not told waits for the next start."""
+        self._stop.set()
+        self._thread.join(_CLOSE_SECONDS)
+        self._delivery.close()
+
+    def _tell_broker(self, ring: Ring, on_ring: OnRing) -> None:
+        on_ring(ring.rule, message(ring, self._followed.zone), ring.time)
+        self._outbox.note_told(BROKER, ring)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._follow()
+            except Exception as error:  # noqa: BLE001  alerts must go on
+                self._say(f"alerts: {type(error).__name__}: {error}; they go on from there")
+                self._stop.wait(_LOOK_SECONDS)
+        self._watch.save(time.time_ns())
+
+    def _follow(self) -> None:
+        """Read what is written, and evaluate the rules whenever all of it has been read."""
+        logs, looked, forgot = self._followed.folder, 0.0, time.monotonic()
+        start = self._watch.needed_from(time.time_ns())
+        self._heard = LiveHome(start, _PATIENCE)
+        while not logs.is_dir():
+            self._look()
+            if self._stop.wait(_LOOK_SECONDS):
+                return
+        batches = follow_messages(logs, is_of_alerts, start, self._stop, self._damaged, ticks=True)
+        caught_up = False
+        for path, batch in batches:
+            if path == logs:
+                caught_up = True
+            elif log_name(path).node == self._followed.node:
+                self._push(path, batch)
+            if caught_up and time.monotonic() - looked >= _LOOK_SECONDS:
+                self._look()
+                looked = time.monotonic()
+            if time.monotonic() - forgot >= _FORGET_SECONDS:
+                self._heard.forget_before(self._watch.needed_from(time.time_ns()))
+                forgot = time.monotonic()
+
+    def _push(self, path: Path, batch: Sequence[RawMessages]) -> None:
+        try:
+            self._heard.push(_decoded(batch))
+        except LogError as error:
+            self._damaged(LogError(f"{path}: {error}"))
+
+    def _look(self) -> None:
+        if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
+            return
+        while self._labels:
+            self._heard.add_label(*self._labels.popleft())
+        now = time.time_ns()
+        self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
+
+    def _weeks(self, start: int, end: int) -> HomeHeard:
+        """Read weeks from the logs, once a day; what cannot be read was not heard."""
+        home = self._followed
+        try:
+            logs = find_home_logs([home.folder])
+        except LogError:  # there is none yet
+            return Gathered().heard()
+        return read_heard(logs, home.node, start, end, lambda _: None)
+
+    def _damaged(self, error: LogError) -> None:
+        self._say(f"alerts: {error}")
+
+
+def _decoded(batch: Sequence[RawMessages]) -> list[Columns]:
+    columns: list[Columns] = []
+    for raw in batch:
+        if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
+            columns += decode([raw], FIELDS[raw.schema.name])
+    return columns

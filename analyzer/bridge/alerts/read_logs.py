@@ -1,0 +1,125 @@
+"""What was heard in a span of time, from the logs of one recorder."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from hearthlog.analyzer.bridge.alerts.gathering import SEGMENT_FIELDS, Gathered
+from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.logs.channel_names import array_names
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.selection import Described, select
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.mcap.statistics import time_span
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, microphone_of, parse_topic
+from hearthlog.schemas.progress import Progress, ignore_progress
+from hearthlog.schemas.times import NANOSECONDS
+
+_LATE = 12 * 3600 * NANOSECONDS  # a segment is in the log when it has ended, a long silence late
+
+
+def read_heard(  # noqa: PLR0913, PLR0917
+    logs: HomeLogs,
+    node: str,
+    start: int,
+    end: int,
+    lose: Callable[[str], None],
+    progress: Progress = ignore_progress,
+) -> HomeHeard:
+    """Read what was heard in a span of time.
+
+    Parameters
+    ----------
+    logs : HomeLogs
+    node : str
+        Name of the recorder.
+    start, end : int
+        In nanoseconds of UTC; of what ends later, the beginning is there, too.
+    lose : callable
+        Told what cannot be read, a log in a line.
+    progress : callable, optional
+        Told the share of the logs that is read, 0 to 1.
+    """
+    gathered = Gathered()
+    entries = [entry.path for entry in logs.between(start, end + _LATE) if entry.node == node]
+    for number, path in enumerate(entries, 1):
+        try:
+            _add_log(gathered, path, start, end + _LATE, lose)
+        except LogError as error:
+            lose(str(error))
+        progress(number / len(entries))
+    return gathered.heard()
+
+
+def _add_log(
+    gathered: Gathered, path: Path, start: int, end: int, lose: Callable[[str], None]
+) -> None:
+    with LogFile(path) as file:
+        for first, last in zip(
+            file.chunks["start"].tolist(), file.chunks["end"].tolist(), strict=True
+        ):
+            gathered.add_written_span(first, last)
+    selection = select([path])
+    if selection.unfinished:
+        lose(f"unfinished, read up to the last whole chunk: {path}")
+    topics = [
+        topic
+        for topic in selection.topics_of(message_types.SEGMENT, set(SEGMENT_FIELDS))
+        if (name := parse_topic(topic)) is not None and name.labelling == LIVE
+    ]
+    for topic in topics:
+        _add_classes(gathered, microphone_of(topic), selection.channels)
+    found = read_columns([path], topics, start, end, SEGMENT_FIELDS)
+    for topic, columns in found.items():
+        gathered.add_segments(microphone_of(topic), columns)
+
+
+def _add_classes(
+    gathered: Gathered, microphone: str, channels: Mapping[str, Sequence[Described]]
+) -> None:
+    for channel, _ in channels.get(labelling_topic(microphone, LIVE, "label"), ()):
+        gathered.add_classes(microphone, array_names(channel.metadata, "probabilities"))
+
+
+def nodes_of(logs: HomeLogs) -> list[str]:
+    """List the names of the recorders of some logs.
+
+    Parameters
+    ----------
+    logs : HomeLogs
+    """
+    entries: Sequence[str] = [entry.node for entry in logs.entries if not entry.layer]
+    return sorted(set(entries))
+
+
+def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
+    """Return when the logs of a recorder begin and end, in nanoseconds of UTC.
+
+    Parameters
+    ----------
+    logs : HomeLogs
+    node : str
+        Name of the recorder.
+
+    Raises
+    ------
+    LogError
+        If none of them has a message that can be read.
+    """
+    own = [entry.path for entry in logs.entries if entry.node == node and not entry.layer]
+    first, last = _first_span(own), _first_span(reversed(own))
+    if first is None or last is None:
+        raise LogError(f"the logs of {node} have no message that can be read")
+    return first[0], last[1]
+
+
+def _first_span(paths: Iterable[Path]) -> tuple[int, int] | None:
+    for path in paths:
+        with suppress(LogError):
+            span = time_span(path)
+            if span is not None:
+                return span
+    return None

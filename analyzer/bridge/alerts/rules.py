@@ -1,0 +1,214 @@
+"""The rules of alerts: each a table `[[bridge.alert]]` of the configuration."""
+
+import hashlib
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from hearthlog.analyzer.bridge.alerts.duration import DAY, MINUTE, SECOND, read_duration
+from hearthlog.models.classes import SILENCE, class_name, in_words
+from hearthlog.recorder.rest import QuietHours, check_quiet_hours, quiet_hours
+from hearthlog.schemas.errors import HearthlogError
+
+ANY_SOUND = ""  # in place of a class: whatever is not silence
+_LONGEST_WINDOW = 7 * DAY
+LONGEST_PAUSE = 10 * MINUTE  # within an event
+_MARGIN = 5 * MINUTE
+_PAUSE = 10 * SECOND  # between the segments of one event, as in the report
+_NIGHT_ENDS = 7 * 60
+
+
+def _within(least: int, most: int, words: str) -> BeforeValidator:
+    def read(text: object) -> int:
+        nanoseconds = read_duration(text)
+        if not least <= nanoseconds <= most:
+            raise ValueError(f"{text} is too short or too long; {words}")
+        return nanoseconds
+
+    return BeforeValidator(read)
+
+
+def _read_minute(text: object) -> int:
+    try:
+        return quiet_hours(f"{text}-00:00").start
+    except HearthlogError:
+        raise ValueError(f"{str(text)[:64]!r} is no time of day; write it as 07:30") from None
+
+
+def _check_hours(text: str) -> str:
+    try:
+        return check_quiet_hours(text)
+    except HearthlogError as error:
+        raise ValueError(str(error)) from error
+
+
+Window = Annotated[int, _within(MINUTE, _LONGEST_WINDOW, "a minute to seven days")]
+Pause = Annotated[int, _within(0, LONGEST_PAUSE, "ten minutes at most")]
+TimeOfDay = Annotated[int, BeforeValidator(_read_minute)]
+_Hours = Annotated[str, AfterValidator(_check_hours)]
+
+
+class _Rule(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(
+        min_length=1, max_length=60, pattern=r"^[^\x00-\x1f\x7f]+$", description="Shown; unique."
+    )
+    cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")  # type: ignore[assignment]
+    quiet_hours: list[_Hours] = Field(
+        default=[], description='When a ring waits until they end, as ["22:00-06:30"].'
+    )
+    urgent: bool = Field(default=False, description="Whether it rings in quiet hours, too.")
+
+    def hours(self) -> list[QuietHours]:
+        """Return the quiet hours in which a ring waits."""
+        return [] if self.urgent else [quiet_hours(text) for text in self.quiet_hours]
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells whether a rule is still the one that was evaluated before."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+
+
+class _SoundRule(_Rule):
+    label: str = Field(
+        default=ANY_SOUND, alias="class", max_length=64, description="Left out: any sound."
+    )
+    microphone: str = Field(default="", description="Left out: all of them together.")
+    confidence: float = Field(
+        default=0.0, ge=0.0, le=1.0, description="Segments that are less sure do not count."
+    )
+    least_seconds: float = Field(
+        default=0.0, ge=0.0, le=3600.0, description="Shorter events do not count."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_class(cls, values: Any) -> Any:
+        if isinstance(values, dict) and isinstance(values.get("class"), str):
+            name = class_name(values["class"])
+            if name == SILENCE:
+                raise ValueError(
+                    f"{SILENCE} is no sound; for no sound at all, none_by without a class"
+                )
+            return values | {"class": name}
+        return values
+
+    @property
+    def words(self) -> str:
+        """What people call the class."""
+        return "Any sound" if self.label == ANY_SOUND else in_words(self.label)
+
+
+class MoreThan(_SoundRule):
+    """More than so many events, or so many minutes, of a class in a window."""
+
+    rule: Literal["more_than"]
+    count: int | None = Field(default=None, ge=0, le=100_000, description="Events in the window.")
+    minutes: float | None = Field(default=None, ge=0.0, le=10_080.0, description="In the window.")
+    window: Window
+
+    @model_validator(mode="after")
+    def _check_amount(self) -> "MoreThan":
+        if (self.count is None) == (self.minutes is None):
+            raise ValueError("say either count or minutes")
+        return self
+
+
+class NoneBy(_SoundRule):
+    """None of a class from one time of day to another, of which enough was heard."""
+
+    rule: Literal["none_by"]
+    since: TimeOfDay
+    by: TimeOfDay
+    least_share: float = Field(
+        default=0.75, gt=0.0, le=1.0, description="That has to be heard; of less it is not known."
+    )
+
+    @model_validator(mode="after")
+    def _check_times(self) -> "NoneBy":
+        if self.since == self.by:
+            raise ValueError("since and by are the same time of day")
+        return self
+
+
+class LongerThan(_SoundRule):
+    """A class for longer than a time, with no more than short pauses."""
+
+    rule: Literal["longer_than"]
+    longer_than: Window
+    pause: Pause = Field(default="10s", validate_default=True, description="That ends a sound.")  # type: ignore[assignment]
+
+
+class RecorderSilent(_Rule):
+    """Nothing from the recorder for a time, not even what it says of its health."""
+
+    rule: Literal["recorder_silent"]
+    silent_for: Window = Field(default="10m", validate_default=True)  # type: ignore[assignment]
+
+
+class UnlikeUsual(_SoundRule):
+    """A day, or its night, outside of what the four weeks before it had."""
+
+    rule: Literal["unlike_usual"]
+    part: Literal["day", "night"] = Field(
+        default="day", description="Of the day before, or 22:00 to 07:00."
+    )
+    of: Literal["count", "minutes"] = Field(default="count", description="What is compared.")
+    which: Literal["more", "less", "both"] = Field(default="both", description="That rings.")
+    margin: float = Field(
+        default=0.25, ge=0.0, le=10.0, description="Share beyond the highest and the lowest."
+    )
+    at: TimeOfDay = Field(default="08:00", validate_default=True)  # type: ignore[assignment]
+    least_share: float = Field(
+        default=0.75, gt=0.0, le=1.0, description="That has to be heard for it to be compared."
+    )
+
+    @model_validator(mode="after")
+    def _check_time(self) -> "UnlikeUsual":
+        if self.part == "night" and self.at < _NIGHT_ENDS:
+            raise ValueError("at: a night ends at 07:00")
+        return self
+
+
+SoundRule = MoreThan | NoneBy | LongerThan | UnlikeUsual
+AlertRule = Annotated[
+    MoreThan | NoneBy | LongerThan | RecorderSilent | UnlikeUsual, Field(discriminator="rule")
+]
+
+
+def _check_names(rules: list[AlertRule]) -> list[AlertRule]:
+    names = [rule.name for rule in rules]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two rules have the name {twice!r}; say which is which")
+    return rules
+
+
+AlertRules = Annotated[list[AlertRule], AfterValidator(_check_names), Field(max_length=100)]
+
+
+def pause_of(rule: SoundRule) -> int:
+    """Return the longest pause within an event, in nanoseconds."""
+    return rule.pause if isinstance(rule, LongerThan) else _PAUSE
+
+
+def history(rule: AlertRule) -> int:
+    """Return how long before a time the sound has to be known that a rule judges it by.
+
+    Parameters
+    ----------
+    rule : AlertRule
+
+    Returns
+    -------
+    int
+        Nanoseconds. Events that begin earlier and go on have to be known in whole.
+    """
+    if isinstance(rule, MoreThan):
+        return rule.window + _MARGIN
+    if isinstance(rule, RecorderSilent):
+        return rule.silent_for + _MARGIN
+    if isinstance(rule, UnlikeUsual):
+        return 31 * DAY
+    return 50 * 3600 * SECOND if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN

@@ -1,0 +1,110 @@
+"""Those who are told of alerts by Apprise: a phone, a chat, an address."""
+
+import hashlib
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.schemas.storage.small_file import read_whole
+from hearthlog.schemas.text import shortened
+
+_LIMIT = 1 << 16  # bytes of the file
+_LONGEST = 120  # characters of a reason
+_OTHERS = 0o004
+
+
+class Target(Protocol):
+    """Somebody who is told."""
+
+    @property
+    def name(self) -> str:
+        """What names the target from one start to the next, and gives nothing away."""
+
+    @property
+    def place(self) -> str:
+        """What people call the target."""
+
+    def deliver(self, title: str, text: str) -> str:
+        """Tell; return why it could not be told, or an empty text.
+
+        Parameters
+        ----------
+        title, text : str
+        """
+
+
+class AppriseTarget:
+    """An address of Apprise.
+
+    Parameters
+    ----------
+    plugin : apprise.NotifyBase
+        The address, as Apprise has read it.
+    address : str
+        A secret.
+    """
+
+    def __init__(self, plugin: Any, address: str) -> None:
+        self._plugin = plugin
+        self.name = hashlib.sha256(address.encode()).hexdigest()[:16]
+        self.place = shortened(plugin.url(privacy=True).partition("?")[0], _LONGEST)
+
+    def deliver(self, title: str, text: str) -> str:
+        """Tell, within the seconds that the address allows; return why it could not be told.
+
+        Parameters
+        ----------
+        title, text : str
+        """
+        import apprise  # noqa: PLC0415  takes half a second, and few need it
+
+        with apprise.LogCapture(level=logging.WARNING, fmt="%(message)s") as said:
+            done = self._plugin.notify(
+                title=title, body=text, notify_type=apprise.NotifyType.WARNING
+            )
+            if done:
+                return ""
+            lines = said.getvalue().split("\n")
+        return shortened(lines[0].rstrip("."), _LONGEST) or "no reason is given"
+
+
+def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
+    """Read a file of addresses, one a line; `#` begins a line that is none.
+
+    Parameters
+    ----------
+    file : Path
+    say : callable
+        Told in a line that others may read the file.
+
+    Raises
+    ------
+    BridgeError
+        If the file cannot be read, a line is no address that Apprise knows, or none is there.
+    """
+    import apprise  # noqa: PLC0415
+
+    data = read_whole(file, "file of addresses", _LIMIT, BridgeError)
+    if file.stat().st_mode & _OTHERS:
+        say(f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}")
+    # Nothing is loaded from the disk, and nothing written there.
+    asset = apprise.AppriseAsset(
+        plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
+    )
+    asset.app_id = asset.app_desc = "hearthlog"
+    targets = []
+    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+        address = line.strip()
+        if not address or address.startswith("#"):
+            continue
+        plugin = apprise.Apprise.instantiate(address, asset=asset, suppress_exceptions=True)
+        if plugin is None:
+            raise BridgeError(
+                f"{file}, line {number}: no address that Apprise knows; docs/alerts.md has examples"
+            )
+        targets.append(AppriseTarget(plugin, address))
+    if not targets:
+        raise BridgeError(f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic")
+    return targets

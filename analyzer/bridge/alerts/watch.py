@@ -1,0 +1,138 @@
+"""Evaluate rules on what is heard, from where the last start of the bridge left off."""
+
+from collections.abc import Callable, Sequence
+from datetime import tzinfo
+from functools import cache
+
+from hearthlog.analyzer.bridge.alerts.daily import judged_days
+from hearthlog.analyzer.bridge.alerts.duration import DAY, HOUR, MINUTE, SECOND
+from hearthlog.analyzer.bridge.alerts.evaluate import rings
+from hearthlog.analyzer.bridge.alerts.home_heard import HomeHeard
+from hearthlog.analyzer.bridge.alerts.memory import Memory, Progress
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.ring import Ring, RuleState
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule, UnlikeUsual, history
+
+_OLDEST = DAY  # what rang longer ago is not told any more
+_EVERY = SECOND  # of the log
+_SAVE_EVERY = 5 * MINUTE
+
+
+class RuleWatch:
+    """Evaluates rules, keeps what rings, and remembers how far it is.
+
+    Parameters
+    ----------
+    rules : sequence of AlertRule
+    zone : tzinfo
+        Of the home.
+    outbox : Outbox
+    memory : Memory
+    say : callable
+        Told what is wrong, in a line.
+    now : int
+        In nanoseconds of UTC.
+
+    Attributes
+    ----------
+    start : int
+        From when on what was heard has to be known, in nanoseconds of UTC.
+    """
+
+    def __init__(  # noqa: PLR0913, PLR0917
+        self,
+        rules: Sequence[AlertRule],
+        zone: tzinfo,
+        outbox: Outbox,
+        memory: Memory,
+        say: Callable[[str], None],
+        now: int,
+    ) -> None:
+        self._rules = rules
+        self._zone = zone
+        self._outbox = outbox
+        self._memory = memory
+        self._say = say
+        self._progress = memory.load(rules)
+        for rule in rules:
+            self._progress[rule.name] = self._as_of(rule, now)
+        self._saved = now
+        self.start = self.needed_from(now)
+
+    def _as_of(self, rule: AlertRule, now: int) -> Progress:
+        own = self._progress[rule.name]
+        if own.until > now + HOUR:
+            self._say(f"{rule.name}: was evaluated up to a time to come; did the clock run ahead?")
+            return Progress(now, RuleState())
+        if not own.until:
+            return Progress(now, own.state)
+        if own.until < now - _OLDEST:
+            return Progress(now - _OLDEST, own.state._replace(has_rung=False))
+        return own
+
+    def needed_from(self, now: int) -> int:
+        """Return from when on what was heard has to be known, in nanoseconds of UTC.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
+        live = [rule for rule in self._rules if not isinstance(rule, UnlikeUsual)]
+        return min((self._progress[r.name].until - history(r) for r in live), default=now)
+
+    def evaluate(
+        self,
+        heard: Callable[[], HomeHeard],
+        weeks: Callable[[int, int], HomeHeard],
+        until: int,
+        now: int,
+    ) -> list[Ring]:
+        """Evaluate the rules up to a time; what rings is on the disk on return.
+
+        Parameters
+        ----------
+        heard : callable
+            Returns what was heard, from `start` on.
+        weeks : callable
+            Returns the same of a span of weeks, from the logs.
+        until : int
+            In nanoseconds of UTC: up to then all is known.
+        now : int
+            In nanoseconds of UTC.
+
+        Returns
+        -------
+        list of Ring
+        """
+        found: list[Ring] = []
+        heard_once = cache(heard)
+        for rule in self._rules:
+            own = self._progress[rule.name]
+            if until - own.until < _EVERY:
+                continue
+            if isinstance(rule, UnlikeUsual):
+                if not judged_days(rule, own.until, until, self._zone):
+                    own.until = until
+                    continue
+                what = weeks(until - history(rule), until)
+            else:
+                what = heard_once()
+            rang, state = rings(rule, what, own.until, until, self._zone, own.state)
+            self._progress[rule.name] = Progress(until, state)
+            found += rang
+        self._outbox.put(found)
+        if found or now - self._saved >= _SAVE_EVERY:
+            self.save(now)
+        return found
+
+    def save(self, now: int) -> None:
+        """Remember how far the rules are evaluated.
+
+        Parameters
+        ----------
+        now : int
+            In nanoseconds of UTC.
+        """
+        self._memory.save(self._rules, self._progress)
+        self._saved = now

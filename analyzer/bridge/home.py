@@ -1,0 +1,22 @@
+"""Whose sounds a bridge tells of."""
+
+from datetime import tzinfo
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Home(NamedTuple):
+    """The recorder of a home, and the home's own time.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the logs.
+    node : str
+        Name of the recorder.
+    zone : tzinfo
+    """
+
+    folder: Path
+    node: str
+    zone: tzinfo

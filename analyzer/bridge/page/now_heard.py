@@ -1,0 +1,113 @@
+"""What is heard now, in words, and since when."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HOLD_SECONDS
+from hearthlog.analyzer.bridge.home_state import MicrophoneState
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.words import class_words, room, told, when
+from hearthlog.models.classes import SILENCE, in_words
+from hearthlog.schemas.messages.labels import spelt
+from hearthlog.schemas.times import NANOSECONDS
+
+_QUIETEST = -80.0  # dBFS, the left end of the bar
+_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # behind the end of a segment
+_NOT_LISTENING = "Not listening"
+
+
+class _Heard(NamedTuple):
+    words: str
+    since: int  # in nanoseconds of UTC; 0: not known
+
+
+class NowHeard:
+    """Says what each microphone hears, and remembers since when."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, _Heard] = {}
+
+    def describe(self, news: News) -> Any:
+        """Describe what is heard for JSON."""
+        microphones = list(news.state.microphones.values())
+        return {
+            "is_recording": news.state.is_recording(),
+            "rooms": [
+                self._room(each, news, is_alone=len(microphones) == 1) for each in microphones
+            ],
+        }
+
+    def _room(self, microphone: MicrophoneState, news: News, *, is_alone: bool) -> Any:
+        words = _sentence(microphone)
+        last = self._last.get(microphone.name)
+        if last is None or last.words != words:
+            since = _known_since(microphone) or (news.today.now if last is not None else 0)
+            last = self._last[microphone.name] = _Heard(words, since)
+        since = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
+        health = news.state.health.get(microphone.name)
+        is_listening = microphone.is_listening()
+        return {
+            "room": "" if is_alone else room(microphone.name),
+            "words": words,
+            "since": since,
+            "why": told(health.text) if health is not None and not is_listening else "",
+            "level": _level(microphone) if is_listening else None,
+        }
+
+
+def _sentence(microphone: MicrophoneState) -> str:
+    if not microphone.is_listening():
+        return _NOT_LISTENING
+    names = [class_words(label) for label in _heard_classes(microphone)]
+    if names:
+        first, *others = names
+        return " and ".join(
+            filter(
+                None,
+                [
+                    ", ".join([first, *map(str.lower, others[:-1])]),
+                    others[-1].lower() if others else "",
+                ],
+            )
+        )
+    return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
+
+
+def _heard_classes(microphone: MicrophoneState) -> list[str]:
+    return [
+        label
+        for label in microphone.classes
+        if spelt(label) != SILENCE and microphone.heard.is_heard(label)
+    ]
+
+
+def _known_since(microphone: MicrophoneState) -> int:
+    """Return since when it has been so, as far as the log says; 0 if it does not."""
+    if not microphone.is_listening():
+        return microphone.heard.time
+    heard = _heard_classes(microphone)
+    if heard:
+        going = [
+            e.start
+            for e in _last_events(microphone)
+            if e.label in heard and microphone.heard.time - e.end <= _GOES_ON
+        ]
+        return min(going, default=0)
+    return max((event.end for event in _last_events(microphone)), default=0)
+
+
+def _last_events(microphone: MicrophoneState) -> Iterator[Event]:
+    for label in microphone.labels():
+        event = microphone.last_event(label)
+        if event is not None:
+            yield event
+
+
+def _level(microphone: MicrophoneState) -> Any:
+    """Return the level as a share of the bar and in words; None where it is not known."""
+    level = microphone.level_dbfs
+    if not math.isfinite(level):
+        return None
+    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace("-", "\N{MINUS SIGN}")

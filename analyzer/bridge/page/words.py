@@ -1,0 +1,88 @@
+"""Times, lengths and names as people say them."""
+
+from datetime import timedelta, tzinfo
+
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.models.classes import in_words
+from hearthlog.schemas.text import printable, shortened
+
+_LONGEST = 200  # characters of a text from a log
+_LONGEST_NAME = 60
+_SURE, _FAIRLY_SURE = 0.9, 0.7
+
+
+def clock(time: int, zone: tzinfo) -> str:
+    """Write what the clock on the wall shows: `14:05`."""
+    return f"{local_time(time, zone):%H:%M}"
+
+
+def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
+    """Say when something was: `14:05`, `yesterday 23:10`, `3 May 14:05`.
+
+    Parameters
+    ----------
+    time, now : int
+        In nanoseconds of UTC.
+    zone : tzinfo
+        Of the home.
+    seconds : bool
+        Whether the seconds are said, too.
+    """
+    moment, today = local_time(time, zone), local_time(now, zone).date()
+    shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
+    if moment.date() == today:
+        return shown
+    if moment.date() == today - timedelta(days=1):
+        return f"yesterday {shown}"
+    return f"{moment.day} {moment:%B} {shown}"
+
+
+def long_date(time: int, zone: tzinfo) -> str:
+    """Write a date: `Tuesday, 3 May`."""
+    moment = local_time(time, zone)
+    return f"{moment:%A}, {moment.day} {moment:%B}"
+
+
+def length(seconds: float) -> str:
+    """Say how long something was: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
+    if seconds < 1:
+        return "less than a second"
+    if seconds < 90:
+        return _counted(round(seconds), "second")
+    minutes = round(seconds / 60)
+    if minutes < 90:
+        return _counted(minutes, "minute")
+    hours, rest = divmod(minutes, 60)
+    return _counted(hours, "hour") + (f" {_counted(rest, 'minute')}" if rest else "")
+
+
+def sureness(confidence: float) -> str:
+    """Say how sure the model was: `sure (95 %)`."""
+    words = "not sure"
+    if confidence >= _FAIRLY_SURE:
+        words = "sure" if confidence >= _SURE else "fairly sure"
+    return f"{words} ({100 * confidence:.0f} %)"
+
+
+def times(count: int) -> str:
+    """Say how often something was: `never`, `once`, `4 times`."""
+    return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def class_words(label: str) -> str:
+    """Name a class of any log as people would, on one line and not too long."""
+    return shortened(in_words(label), _LONGEST_NAME)
+
+
+def room(microphone: str) -> str:
+    """Name the place of a microphone as people would."""
+    return shortened(microphone.replace("_", " ").capitalize(), _LONGEST_NAME)
+
+
+def told(text: str) -> str:
+    """Return a text of a log on one line, and not too long."""
+    return shortened(" ".join(printable(text).split()), _LONGEST)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,39 @@
+"""The folder of what the bridge has to remember."""
+
+import os
+from pathlib import Path
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+
+_OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between them
+
+
+def state_folder(configured: Path | None, logs: Path) -> Path:
+    """Return the folder of the state, which is made where it is missing.
+
+    Parameters
+    ----------
+    configured : Path or None
+        `state` of the table `bridge`.
+    logs : Path
+        Folder of the logs.
+
+    Returns
+    -------
+    Path
+        The configured one; else that of systemd; else `bridge` beside the logs.
+
+    Raises
+    ------
+    BridgeError
+        If it cannot be made.
+    """
+    given = os.environ.get(_OF_SYSTEMD, "").partition(":")[0]
+    folder = configured or (Path(given) if given else logs.absolute().parent / "bridge")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise BridgeError(
+            f"{folder}: cannot be made ({error.strerror}); name another one: bridge.state"
+        ) from error
+    return folder

@@ -1,0 +1,117 @@
+"""How often and how long each class was heard since a bridge was first started, from the log."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.storage.new_files import replaced_file
+from hearthlog.schemas.storage.small_file import read_whole
+
+_LIMIT = 1 << 20  # bytes
+
+
+class Total(NamedTuple):
+    """What was heard of a class by a microphone."""
+
+    microphone: str
+    label: str
+    events: int
+    seconds: float
+
+
+class _Kept(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    time: int = Field(ge=0)
+    totals: list[Total]
+
+
+class Totals:
+    """Events and seconds by microphone and class, which no restart takes back.
+
+    What began before a time is kept in a file; the rest is counted from the state of the home.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    time : int
+        When the first event that counts may begin if there is no file; in nanoseconds of UTC.
+
+    Attributes
+    ----------
+    time : int
+        What began before is in the file.
+
+    Raises
+    ------
+    BridgeError
+        If the file is damaged.
+    """
+
+    def __init__(self, path: Path, time: int) -> None:
+        self._path = path
+        self.time, self._kept = time, list[Total]()
+        if path.exists():
+            data = read_whole(path, "file of totals", _LIMIT, BridgeError)
+            try:
+                kept = _Kept.model_validate_json(data)
+            except ValidationError as error:
+                raise BridgeError(
+                    f"{path}: is damaged; delete it, and counts begin anew"
+                ) from error
+            self.time, self._kept = kept.time, kept.totals
+
+    def count(self, state: HomeState, end: int | None = None) -> list[Total]:
+        """Return what was heard, by microphone and class.
+
+        Parameters
+        ----------
+        state : HomeState
+            That has all events since `self.time`.
+        end : int, optional
+            Before which events begin that count, in nanoseconds of UTC; by default all do.
+        """
+        sums = {total[:2]: total for total in self._kept}
+        for microphone in state.microphones.values():
+            for label in microphone.labels():
+                events = [
+                    event
+                    for event in microphone.events(label, self.time)
+                    if end is None or event.start < end
+                ]
+                before = sums.get((microphone.name, label), Total(microphone.name, label, 0, 0.0))
+                seconds = before.seconds + sum(event.seconds for event in events)
+                sums[before[:2]] = before._replace(
+                    events=before.events + len(events), seconds=seconds
+                )
+        return [sums[key] for key in sorted(sums)]
+
+    def keep(self, state: HomeState, time: int) -> None:
+        """Put what began before a time into the file, unless it is there already.
+
+        Parameters
+        ----------
+        state : HomeState
+            That has all events since `self.time`.
+        time : int
+            In nanoseconds of UTC.
+
+        Raises
+        ------
+        BridgeError
+            If the file cannot be written.
+        """
+        if time <= self.time:
+            return
+        kept = _Kept(time=time, totals=self.count(state, time))
+        try:
+            with replaced_file(self._path) as temporary:
+                temporary.write_text(kept.model_dump_json(), encoding="utf-8")
+        except (OSError, HearthlogError) as error:
+            raise BridgeError(f"{self._path}: cannot be written ({error})") from error
+        self.time, self._kept = kept.time, kept.totals

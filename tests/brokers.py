@@ -1,0 +1,156 @@
+"""A real broker of MQTT, Mosquitto, on a port of its own; and what it holds and says."""
+
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import paho.mqtt.client as mqtt
+import pytest
+from microphones import DIES_WITH_PARENT
+
+_SECONDS = 15.0
+_SETTINGS = "allow_anonymous true\npersistence false\n"
+_AS_WE = "user root\n"  # else it gives up the right to read its files, where root starts it
+
+
+class Broker:
+    """Mosquitto, which may be ended and started again on its port.
+
+    Attributes
+    ----------
+    port : int
+    said : Path
+        What it writes to its log.
+    """
+
+    def __init__(self, folder: Path, settings: str = _SETTINGS):
+        self.port = _free_port()
+        self.said = folder / "mosquitto.log"
+        self._configuration = folder / "mosquitto.conf"
+        self._configuration.write_text(f"{_AS_WE}listener {self.port} 127.0.0.1\n{settings}")
+        self.start()
+
+    def start(self):
+        with self.said.open("ab") as log:
+            self._process = subprocess.Popen(
+                [*DIES_WITH_PARENT, _mosquitto(), "-c", str(self._configuration)],
+                stdout=log,
+                stderr=log,
+            )
+        until = time.monotonic() + _SECONDS
+        while time.monotonic() < until:
+            try:
+                socket.create_connection(("127.0.0.1", self.port), timeout=1).close()
+            except OSError:
+                time.sleep(0.02)
+            else:
+                return
+        pytest.fail(f"Mosquitto did not start: {self.said.read_text()}")
+
+    def kill(self):
+        self._process.kill()
+        self._process.wait(timeout=5)
+
+
+class Listener:
+    """A client of a broker that notes all that it is told.
+
+    Attributes
+    ----------
+    values : dict of str to str
+        The newest payload of each topic.
+    messages : list of (float, str, str, bool)
+        When it came (seconds of UTC), topic, payload, whether the broker had kept it.
+    """
+
+    def __init__(self, port: int, topics: str = "#"):
+        self.values = {}
+        self.messages = []
+        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._client.on_connect = lambda client, *_: client.subscribe(topics, 1)
+        self._client.on_message = self._note
+        self._client.reconnect_delay_set(1, 1)
+        self._client.connect_async("127.0.0.1", port)
+        self._client.loop_start()
+
+    def _note(self, _client, _data, message):
+        payload = message.payload.decode()
+        self.values[message.topic] = payload
+        self.messages.append((time.time(), message.topic, payload, message.retain))
+
+    def payloads(self, topic: str) -> list[str]:
+        return [payload for _, name, payload, _ in list(self.messages) if name == topic]
+
+    def publish(self, topic: str, payload: str, *, retain: bool = False):
+        self._client.publish(topic, payload, 1, retain).wait_for_publish(_SECONDS)
+
+    def wait_for(self, topic: str, value: str | None = None, seconds: float = 30.0) -> str:
+        """Wait until a topic has a value, any or this one, and return it."""
+        return (
+            self.wait_until(
+                lambda: topic in self.values and value in {None, self.values[topic]},
+                seconds,
+            )
+            and self.values[topic]
+        )
+
+    def wait_until(self, holds, seconds: float = 30.0) -> bool:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            if holds():
+                return True
+            time.sleep(0.05)
+        pytest.fail(f"it did not come; the broker has {self.values}")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+@pytest.fixture
+def broker(tmp_path):
+    """A broker that lets everybody in; without persistence, so a kill empties it."""
+    broker = Broker(tmp_path)
+    yield broker
+    broker.kill()
+
+
+def start_bridge(config: Path, said: Path) -> subprocess.Popen:
+    """Start `hearthlog bridge`; what it says goes to a file."""
+    from conftest import HEARTHLOG  # noqa: PLC0415  which imports this module
+
+    with said.open("ab") as log:
+        return subprocess.Popen(
+            [*DIES_WITH_PARENT, *HEARTHLOG, "bridge", "--config", str(config)],
+            stdout=log,
+            stderr=log,
+        )
+
+
+def settled_values(port: int, topics: str = "#", seconds: float = 1.0) -> dict[str, str]:
+    """Return what a broker keeps, as a client finds it that comes now."""
+    with Listener(port, topics) as listener:
+        threading.Event().wait(seconds)
+        return dict(listener.values)
+
+
+def _mosquitto() -> str:
+    found = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+    if found is None:
+        reason = "a broker needs the Debian package mosquitto"
+        if os.environ.get("TESTS_REQUIRE_BROKER") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return found
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]

@@ -1,0 +1,117 @@
+"""Kill broker, recorder and bridge at random moments, and compare what the broker has in the end.
+
+    python tests/killed_bridge.py SOUND MODEL MINUTES KILLS [SEED]
+
+SOUND is an audio file, at whose end it begins anew. Each of the three is killed KILLS times. Says
+whether states and counts are those computed from the logs.
+"""
+
+import random
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+from zoneinfo import ZoneInfo
+
+from bridged import expected_values
+from brokers import Broker, settled_values, start_bridge
+from conftest import HEARTHLOG
+from microphones import DIES_WITH_PARENT
+
+ZONE = "Europe/Vienna"
+_ROOT = "hearthlog/home"
+_KINDS = "on", "count_today", "count_night", "last_heard"
+_ARRIVES_SECONDS = 8.0  # a client that lost its broker tries again within so many
+
+
+class Ending(NamedTuple):
+    """What the broker has of the classes in the end, and what the logs say."""
+
+    found: dict[str, str]
+    expected: dict[str, str]
+    said: str
+
+    @property
+    def wrong(self) -> list[str]:
+        """Topics whose value is another, or that should say nothing."""
+        nothing = {"OFF", "0"}
+        return [
+            topic
+            for topic in self.found.keys() | self.expected.keys()
+            if topic.rpartition("/")[2] in _KINDS
+            and self.found.get(topic) != self.expected.get(topic)
+            and not (topic not in self.expected and self.found[topic] in nothing)
+        ]
+
+
+def kill_at_random(
+    folder: Path, sounds: list[Path], model: str, seconds: float, kills: int, chance: random.Random
+) -> Ending:
+    """Let all three run, kill each so many times, and wait until what is left is told."""
+    broker, said = Broker(folder), folder / "said"
+    config = folder / "home.toml"
+    config.write_text(
+        f'output = "{folder}/logs"\ntimezone = "{ZONE}"\n'
+        f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+    )
+    start = {
+        "recorder": lambda: start_recorder(config, sounds, model, said),
+        "bridge": lambda: start_bridge(config, said),
+    }
+    running = {what: begin() for what, begin in start.items()}
+    names = [what for what in ("broker", *running) for _ in range(kills)]
+    due = sorted((chance.uniform(4, seconds - 4), what) for what in names)
+    began = time.monotonic()
+    for at, what in due:
+        time.sleep(max(began + at - time.monotonic(), 0))
+        if what == "broker":
+            broker.kill()
+            time.sleep(chance.uniform(0, 2))
+            broker.start()
+        else:
+            running[what].kill()
+            running[what].wait()
+            time.sleep(chance.uniform(0, 2))
+            running[what] = start[what]()
+    time.sleep(max(began + seconds - time.monotonic(), 0))
+    running["recorder"].terminate()
+    running["recorder"].wait()
+    time.sleep(_ARRIVES_SECONDS)
+    found = settled_values(broker.port, f"{_ROOT}/#")
+    expected = expected_values(folder / "logs", ZoneInfo(ZONE), _ROOT)
+    running["bridge"].terminate()
+    running["bridge"].wait()
+    broker.kill()
+    return Ending(found, expected, said.read_text())
+
+
+def start_recorder(config: Path, sounds: list[Path], model: str, said: Path) -> subprocess.Popen:
+    """Record files at the pace of real time, as if they were heard from now on."""
+    now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}Z"
+    options = ["--realtime", "--start", now, "--model", model, "--config", str(config)]
+    with said.open("ab") as log:
+        return subprocess.Popen(
+            [*DIES_WITH_PARENT, *HEARTHLOG, "record", *map(str, sounds), *options],
+            stdout=log,
+            stderr=log,
+        )
+
+
+def main(sound: str, model: str, minutes: str, kills: str, seed: str = "0") -> None:
+    """Run it, and say what came of it."""
+    with TemporaryDirectory(prefix="hearthlog") as folder:
+        chance, seconds = random.Random(int(seed)), 60 * float(minutes)
+        sounds = 10 * [Path(sound)]
+        ending = kill_at_random(Path(folder), sounds, model, seconds, int(kills), chance)
+    sys.stdout.write(f"{ending.said}{len(ending.expected)} values, wrong: {ending.wrong}\n")
+    for topic in ending.wrong:
+        sys.stdout.write(
+            f"{topic}: {ending.found.get(topic)}, not {ending.expected.get(topic)}\n"
+        )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

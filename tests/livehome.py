@@ -1,0 +1,105 @@
+"""A home whose log is written as a test goes on, without sound."""
+
+import time
+from datetime import UTC, datetime, timedelta, timezone
+
+import numpy as np
+from homelife import GENERAL
+
+from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.schemas.logs.files import log_path
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import encode, header, message
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, topics_of
+from hearthlog.schemas.times import NANOSECONDS
+
+FRAME = NANOSECONDS // 20
+MINUTE = 60 * NANOSECONDS
+
+
+def midday_zone():
+    """A time zone in which it is about noon, so that what was an hour ago was today."""
+    return timezone(timedelta(hours=12 - datetime.now(UTC).hour))
+
+
+class LiveHome:
+    """A log that is being written, from six hours ago on.
+
+    Attributes
+    ----------
+    start : int
+        Of the log, in nanoseconds of UTC.
+    """
+
+    def __init__(self, folder, microphones=("mic",), classes=GENERAL):
+        self.folder, self.classes = folder, list(classes)
+        self.start = time.time_ns() - 360 * MINUTE
+        topics = {t.name: t for m in microphones for t in topics_of(m, FEATURE_NAMES, self.classes)}
+        path = log_path(folder, "home", self.start)
+        self._writer = LogWriter(path, list(topics.values()), {"version": "0", "node": "home"})
+
+    def heard(self, label, minutes_ago, seconds=4.0, confidence=0.93, microphone="mic"):
+        """Write a segment that began so many minutes ago; return when that was."""
+        start = time.time_ns() - round(minutes_ago * 60 * 1000) * 1_000_000
+        length = round(seconds * 1000) * 1_000_000
+        fields = {
+            "header.stamp": np.array([start]),
+            "header.frame_id": microphone,
+            "duration": np.array([length]),
+            "label": [label],
+            "confidence": np.array([confidence], np.float32),
+        }
+        self._write(f"/{microphone}/segment", start + length, fields)
+        return start
+
+    def hears(self, label, microphone="mic"):
+        """Write two seconds of labels that are of now."""
+        count, now = 40, time.time_ns()
+        stamps = now - FRAME * np.arange(count)[::-1]
+        fields = {
+            "header.stamp": stamps,
+            "header.frame_id": microphone,
+            "frame": np.arange(count),
+            "label": [label] * count,
+            "confidence": np.full(count, 0.9, np.float32),
+            "novelty": np.zeros(count, np.float32),
+            "probabilities": np.zeros((count, len(self.classes)), np.float32),
+        }
+        self._write(f"/{microphone}/label", stamps, fields)
+
+    def not_heard(self, minutes_ago, minutes, microphone="mic"):
+        """Write a gap."""
+        start = time.time_ns() - minutes_ago * MINUTE
+        fields = {
+            "header.stamp": np.array([start]),
+            "header.frame_id": microphone,
+            "duration": np.array([minutes * MINUTE]),
+            "reason": ["the microphone was away"],
+            "frames_lost": np.array([minutes * 1200]),
+        }
+        self._write(f"/{microphone}/gap", start + minutes * MINUTE, fields)
+
+    def says(self, subject, level, text, **values):
+        """Write what the recorder says of something."""
+        now = time.time_ns()
+        pair = "diagnostic_msgs/msg/KeyValue"
+        status = message(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=f"hearthlog: {subject}",
+            message=text,
+            hardware_id=subject.partition(" ")[0],
+            values=[message(pair, key=key, value=value) for key, value in values.items()],
+        )
+        said = message(message_types.DIAGNOSTICS, header=header(now, ""), status=[status])
+        self._writer.write(DIAGNOSTICS, now, encode(said))
+        self._writer.flush()
+
+    def close(self):
+        self._writer.finish()
+
+    def _write(self, topic, times, fields):
+        self._writer.write_columns([TopicBatch(topic, np.atleast_1d(times), fields)])
+        self._writer.flush()

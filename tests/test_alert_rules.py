@@ -1,0 +1,432 @@
+"""Rules replayed over a month ring exactly when the truth says, and so do they day by day."""
+
+import itertools
+from datetime import UTC, date, datetime, timedelta
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import HOUR, at, midnight, write_day
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
+
+from hearthlog.analyzer.bridge.alerts.clock import end_of_quiet, wall_times
+from hearthlog.analyzer.bridge.alerts.duration import duration_words, read_duration
+from hearthlog.analyzer.bridge.alerts.evaluate import rings
+from hearthlog.analyzer.bridge.alerts.gathering import Gathered
+from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+from hearthlog.analyzer.bridge.alerts.ring import RuleState
+from hearthlog.analyzer.bridge.alerts.rules import LONGEST_PAUSE, AlertRule, AlertRules, history
+from hearthlog.analyzer.bridge.settings import load_bridge_settings
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.rest import quiet_hours
+
+VIENNA = ZoneInfo("Europe/Vienna")
+SECOND = 1_000_000_000
+MINUTE, DAY = 60 * SECOND, 86_400 * SECOND
+NOON = midnight(date(2026, 3, 2)) + 12 * HOUR * SECOND
+
+
+def rule(kind, **keys):
+    return TypeAdapter(AlertRule).validate_python({"name": "it", "rule": kind, **keys})
+
+
+def home(*segments, covered=(), classes=None, written=()):
+    """What was heard: segments (second, seconds, class[, confidence, microphone]) after noon."""
+    gathered = Gathered()
+    for microphone, names in (classes or {}).items():
+        gathered.add_classes(microphone, names)
+    for start, seconds, label, *more in sorted(segments):
+        confidence, microphone = [*more, 1.0, "mic"][:2] if len(more) != 1 else (more[0], "mic")
+        begin = NOON + round(start * SECOND)
+        end = begin + round(seconds * SECOND)
+        gathered.add_segment(microphone, begin, end, label, confidence)
+    for start, end in covered:
+        gathered.add_segment("mic", start, end, "silence", 1.0)
+    for start, seconds in written:
+        begin = NOON + round(start * SECOND)
+        gathered.add_written_span(begin, begin + round(seconds * SECOND))
+    return gathered.heard()
+
+
+def rung(one, heard, hours=24):
+    """Seconds after noon at which a rule rings."""
+    found, _ = rings(one, heard, NOON, NOON + hours * HOUR * SECOND, UTC)
+    return [(ring.time - NOON) / SECOND for ring in found]
+
+
+def test_a_rule_of_more_than_rings_with_the_event_that_is_one_too_many():
+    heard = home(*((minute * 60, 2, "coughing") for minute in (0, 10, 20, 30, 40)))
+    one = rule("more_than", count=2, window="30m", **{"class": "coughing"})
+    assert rung(one, heard) == [20 * 60]
+    assert rung(rule("more_than", count=3, window="30m", **{"class": "coughing"}), heard) == []
+
+
+def test_segments_with_short_pauses_between_them_are_one_event_of_all_microphones():
+    heard = home((0, 2, "coughing", 1.0, "a"), (9, 2, "coughing", 1.0, "b"), (21, 1, "coughing"))
+    assert rung(rule("more_than", count=0, window="1h", **{"class": "coughing"}), heard) == [0]
+    assert rung(rule("more_than", count=1, window="1h", **{"class": "coughing"}), heard) == []
+
+
+def test_an_event_counts_when_it_has_lasted_long_enough_and_is_sure_enough():
+    heard = home((0, 2, "crying"), (100, 3, "crying"), (107, 3, "crying"), (500, 9, "crying", 0.5))
+    base = {"count": 0, "window": "1h", "class": "crying", "least_seconds": 5}
+    assert rung(rule("more_than", **base), heard) == [109]
+    assert rung(rule("more_than", **base | {"least_seconds": 7}), heard) == [507]
+    assert rung(rule("more_than", **base | {"least_seconds": 7, "confidence": 0.6}), heard) == []
+
+
+def test_a_rule_of_one_microphone_does_not_mind_the_others():
+    heard = home((0, 2, "crying", 1.0, "hall"), (60, 2, "crying", 1.0, "bath"))
+    keys = {"count": 0, "window": "1h", "class": "crying"}
+    assert rung(rule("more_than", microphone="bath", **keys), heard) == [60]
+
+
+def test_a_rule_of_minutes_rings_in_the_second_in_which_there_are_more():
+    heard = home((0, 600, "speech"), (1200, 600, "speech"), (4000, 1000, "speech"))
+    one = rule("more_than", minutes=15, window="1h", cooldown="1m", **{"class": "speech"})
+    # 15 min at 1500; below it again from 3900 on, for the first span leaves the window.
+    assert rung(one, heard) == [1500, 4000 + 1000 - 300 + 0][:1] + [
+        second for second in rung(one, heard)[1:]
+    ]
+    expected = _first_seconds(heard.of("speech"), 3600, 900)
+    assert rung(one, heard) == expected
+
+
+def _first_seconds(sounds, window, most):
+    """Seconds at which the sum over the window passes a limit, counted second by second."""
+    on = np.zeros(20_000, int)
+    for start, end in zip(sounds.starts, sounds.ends, strict=True):
+        on[(start - NOON) // SECOND : (end - NOON) // SECOND] = 1
+    sums = np.cumsum(on)
+    amounts = sums - np.concatenate([np.zeros(window, int), sums[:-window]])
+    over = amounts > most
+    return np.flatnonzero(np.diff(over.astype(int), prepend=0) == 1).tolist()
+
+
+def test_a_rule_of_any_sound_takes_all_classes_but_silence():
+    heard = home((0, 100, "silence"), (100, 40, "music"), (140, 40, "speech"))
+    assert rung(rule("longer_than", longer_than="1m"), heard) == [160]
+
+
+def test_a_sound_that_lasts_too_long_rings_while_it_does_and_once():
+    heard = home((0, 70, "tap_water"), (75, 100, "tap_water"), (1000, 3, "tap_water"))
+    one = rule("longer_than", longer_than="1m", cooldown="1m", **{"class": "tap_water"})
+    assert rung(one, heard) == [60]
+    # The limit lies in a pause: it goes on when it is heard again.
+    one = rule("longer_than", longer_than="72s", **{"class": "tap_water"})
+    assert rung(one, heard) == [75]
+    # Twelve seconds are two sounds, unless the rule says otherwise.
+    heard = home((0, 40, "tap_water"), (52, 40, "tap_water"))
+    assert rung(rule("longer_than", longer_than="1m"), heard) == []
+    assert rung(rule("longer_than", longer_than="1m", pause="15s"), heard) == [60]
+
+
+def test_what_begins_in_the_cooldown_rings_at_its_end_if_it_still_is_so():
+    long = home((0, 200, "shower"), (1000, 9000, "shower"))
+    short = home((0, 200, "shower"), (1000, 900, "shower"))
+    one = rule("longer_than", longer_than="2m", cooldown="1h", **{"class": "shower"})
+    assert rung(one, long) == [120, 120 + 3600]
+    assert rung(one, short) == [120]
+
+
+def test_no_word_from_the_recorder_rings_once_until_it_writes_again():
+    heard = home(written=[(-3600, 3600), (300, 600), (5000, 90_000)])
+    assert rung(rule("recorder_silent", silent_for="10m"), heard) == [900 + 600]
+    assert rung(rule("recorder_silent", silent_for="10m"), home(), hours=2) == [0]
+    assert rung(rule("recorder_silent", silent_for="4m"), heard) == [240, 240 + 3600]
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.8, True), (0.7, False)])
+def test_none_by_a_time_is_not_known_where_too_little_was_heard(share, known):
+    begin = NOON + 18 * HOUR * SECOND  # 06:00
+    heard = home(covered=[(begin, begin + round(4 * share * HOUR) * SECOND)])
+    one = rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"})
+    found, _ = rings(one, heard, NOON, NOON + DAY, UTC)
+    assert [ring.is_known for ring in found] == [known]
+    assert found[0].time == NOON + 22 * HOUR * SECOND
+    assert found[0].text == (
+        "Toilet flush: none from 06:00 to 10:00"
+        if known
+        else "Toilet flush from 06:00 to 10:00: not known, for only 70 % of that time was heard"
+    )
+
+
+def test_a_microphone_whose_model_does_not_know_a_class_does_not_listen_for_it():
+    segments = [(18 * HOUR, 4 * HOUR, "silence", 1.0, name) for name in ("hall", "bath")]
+    one = rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"})
+    know = {"hall": ["silence", "speech"], "bath": ["silence", "flushing_water"]}
+    both, hall = home(*segments, classes=know), home(segments[0], classes=know)
+    assert [ring.is_known for ring in rings(one, both, NOON, NOON + DAY, UTC)[0]] == [True]
+    assert [ring.is_known for ring in rings(one, hall, NOON, NOON + DAY, UTC)[0]] == [False]
+
+
+@pytest.mark.parametrize(
+    ("day", "minute", "first", "last"),
+    [
+        ("2026-03-29", "02:30", "2026-03-29T01:00", "2026-03-29T01:00"),
+        ("2026-03-29", "03:00", "2026-03-29T01:00", "2026-03-29T01:00"),
+        ("2026-03-29", "01:59", "2026-03-29T00:59", "2026-03-29T00:59"),
+        ("2026-10-25", "02:30", "2026-10-25T00:30", "2026-10-25T01:30"),
+        ("2026-10-25", "03:00", "2026-10-25T02:00", "2026-10-25T02:00"),
+        ("2026-07-01", "02:30", "2026-07-01T00:30", "2026-07-01T00:30"),
+    ],
+)
+def test_a_time_that_the_clock_shows_twice_or_never_is_found(day, minute, first, last):
+    hours, minutes = map(int, minute.split(":"))
+    times = wall_times(date.fromisoformat(day), 60 * hours + minutes, VIENNA)
+    utc = [datetime.fromtimestamp(time // SECOND, UTC) for time in times]
+    assert [f"{moment:%Y-%m-%dT%H:%M}" for moment in utc] == [first, last]
+
+
+@pytest.mark.parametrize("day", ["2026-03-29", "2026-10-25", "2026-07-01"])
+def test_quiet_hours_end_by_the_clock_of_the_home(day):
+    start = midnight(date.fromisoformat(day)) - 3 * HOUR * SECOND
+    for minute in range(0, 24 * 60, 7):
+        time = start + minute * MINUTE
+        until = end_of_quiet([quiet_hours("22:00-02:30"), quiet_hours("02:30-06:30")], time, VIENNA)
+        shown = datetime.fromtimestamp(time // SECOND, VIENNA)
+        is_quiet = shown.hour >= 22 or (shown.hour, shown.minute) < (6, 30)
+        ends = datetime.fromtimestamp(until // SECOND, VIENNA)
+        assert (ends.hour, ends.minute) == (6, 30) if is_quiet else until == time
+        assert 0 <= until - time < 10 * HOUR * SECOND
+
+
+def test_a_ring_in_quiet_hours_waits_for_their_end_unless_it_is_urgent():
+    heard = home((12 * HOUR, 5, "crying"))
+    keys = {"count": 0, "window": "1h", "class": "crying", "quiet_hours": ["22:00-06:30"]}
+    (ring,), _ = rings(rule("more_than", **keys), heard, NOON, NOON + DAY, UTC)
+    assert ring.due - ring.time == 6.5 * HOUR * SECOND
+    (ring,), _ = rings(rule("more_than", urgent=True, **keys), heard, NOON, NOON + DAY, UTC)
+    assert ring.due == ring.time
+
+
+def days_of(count, first=date(2026, 2, 1)):
+    return [first + timedelta(days=number) for number in range(count)]
+
+
+def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
+    """Four to six coughs a night; 40 in the night to day 20, which day 21 is compared with."""
+    gathered = Gathered()
+    days = days_of(30)
+    for number, day in enumerate(days):
+        evening = midnight(day) - 2 * HOUR * SECOND
+        gathered.add_segment("mic", midnight(day) - DAY // 2, midnight(day) + DAY, "silence", 1.0)
+        for cough in range({20: 40}.get(number, 4 + number % 3)):
+            start = evening + (cough + 1) * 5 * MINUTE
+            gathered.add_segment("mic", start, start + SECOND, "coughing", 1.0)
+    one = rule("unlike_usual", part="night", **{"class": "cough"})
+    first, last = midnight(days[0]), midnight(days[-1]) + DAY
+    found, _ = rings(one, gathered.heard(), first, last, UTC)
+    assert [(ring.time, ring.text) for ring in found] == [
+        (
+            midnight(days[20]) + 8 * HOUR * SECOND,
+            "Coughing in the night to 2026-02-21: 40 times, usually 5 (4 to 6)",
+        )
+    ]
+
+
+def test_a_day_rings_only_with_a_week_to_compare_it_with_of_which_enough_was_heard():
+    def with_days(before, share=1.0):
+        gathered = Gathered()
+        for number, day in enumerate(days_of(before + 1)):
+            begin = midnight(day)
+            own = share if number == 0 else 1.0
+            gathered.add_segment("mic", begin, begin + round(own * DAY), "silence", 1.0)
+            length = (60 if number == before else 10) * MINUTE
+            gathered.add_segment("mic", begin + DAY // 3, begin + DAY // 3 + length, "music", 1.0)
+        one = rule("unlike_usual", of="minutes", **{"class": "music"})
+        start = midnight(days_of(1)[0])
+        return [ring.text for ring in rings(one, gathered.heard(), start, start + 99 * DAY, UTC)[0]]
+
+    expected = ["Music on 2026-02-08: 1 h 00 min, usually 10 min"]
+    assert with_days(7) == expected
+    assert with_days(6) == []
+    assert with_days(7, share=0.7) == []
+
+
+# A month with a truth, over both changes of the clock.
+
+LOCAL = {"flush": "07:10", "cough": "03:00", "shower": "20:00"}
+
+
+def write_month(root, first, count=30):
+    """Write a month in Vienna; return when each rule must ring, by the clock on the wall.
+
+    Every day has a flush at 07:10, but each fifth; on each seventh day the microphone hears
+    nothing from 05:00 to 11:00. Six coughs from 03:00 on in each third night; a shower of half an
+    hour on each fourth evening, of ten minutes on the others.
+    """
+    truth = {"no flush": [], "not known": [], "coughs": [], "shower": []}
+    events, gaps = {}, {}
+    for number in range(count):
+        day = first + timedelta(days=number)
+
+        def utc(text, day=day):
+            hours, minutes = map(int, text.split(":"))
+            shown = datetime(day.year, day.month, day.day, hours, minutes, tzinfo=VIENNA)
+            return shown.astimezone(UTC)
+
+        def put(kind, moment, *what, into=events):
+            second = (moment - datetime.combine(moment, datetime.min.time(), UTC)).total_seconds()
+            into.setdefault(moment.date(), []).append((second, *what))
+            del kind
+
+        is_deaf = number % 7 == 6
+        if is_deaf:
+            put("gap", utc("05:00"), 6 * HOUR, "unplugged", into=gaps)
+            truth["not known"].append(f"{day} 10:00")
+        elif number % 5 == 4:
+            truth["no flush"].append(f"{day} 10:00")
+        else:
+            put("flush", utc("07:10"), 12.0, "flushing_water", 0.9)
+        if number % 3 == 2:
+            for cough in range(6):
+                put("cough", utc("03:00") + timedelta(minutes=5 * cough), 2.0, "coughing", 0.9)
+            truth["coughs"].append(f"{day} 03:25")
+        minutes = 30 if number % 4 == 3 else 10
+        put("shower", utc("20:00"), minutes * 60.0, "shower", 0.9)
+        if minutes == 30:
+            truth["shower"].append(f"{day} 20:20")
+    classes = ["silence", "flushing_water", "coughing", "shower"]
+    for day in days_of(count + 2, first - timedelta(days=1)):
+        about = {"classes": classes, "timezone": "Europe/Vienna", "file_hours": 6}
+        write_day(root, day, events.get(day, ()), gaps=gaps.get(day, ()), **about)
+    return truth
+
+
+RULES = {
+    "no flush": rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"}),
+    "coughs": rule("more_than", count=5, window="1h", **{"class": "coughing"}),
+    "shower": rule("longer_than", longer_than="20m", **{"class": "shower"}),
+}
+
+
+@pytest.mark.parametrize("first", [date(2026, 3, 10), date(2026, 10, 5)])
+def test_rules_over_thirty_days_ring_exactly_when_the_truth_says(first, tmp_path):
+    truth = write_month(tmp_path, first)
+    begin = wall_times(first, 0, VIENNA)[0]
+    end = wall_times(first + timedelta(days=30), 0, VIENNA)[0]
+    lost = []
+    heard = read_heard(find_home_logs([tmp_path]), "home", begin - 3 * DAY, end, lost.append)
+    found = {name: rings(one, heard, begin, end, VIENNA)[0] for name, one in RULES.items()}
+
+    def shown(own, *, known=True):
+        times = [each.time for each in own if each.is_known == known]
+        return [f"{datetime.fromtimestamp(time // SECOND, VIENNA):%Y-%m-%d %H:%M}" for time in times]
+
+    assert lost == []
+    assert {name: shown(own) for name, own in found.items()} == {
+        name: truth[name] for name in RULES
+    }
+    assert shown(found["no flush"], known=False) == truth["not known"]
+    assert min(map(len, truth.values())) >= 4
+
+
+@pytest.mark.parametrize("first", [date(2026, 3, 29), date(2026, 10, 25)])
+def test_a_time_of_day_in_the_hour_of_the_change_rings_once_on_that_day(first):
+    day = wall_times(first, 0, VIENNA)[0]
+    one = rule("none_by", since="23:00", by="02:30", **{"class": "crying"})
+    heard = home(covered=[(day - DAY, day + 2 * DAY)])
+    found, _ = rings(one, heard, day, day + DAY, VIENNA)
+    assert [ring.time for ring in found] == [wall_times(first, 150, VIENNA)[1]]
+
+
+# Any division of the time gives the same rings.
+
+
+@st.composite
+def lives(draw):
+    """Six hours with sounds, pauses of all lengths, and a recorder that falls silent."""
+    seconds = st.integers(1, 900)
+    heard, now = [], 0
+    while now < 6 * HOUR and len(heard) < 80:
+        now += draw(seconds)
+        length = draw(st.integers(1, 400))
+        heard.append((now, length, draw(st.sampled_from(["coughing", "music"]))))
+        now += length if draw(st.booleans()) else length // 2
+    writes, at_second = [], -600
+    while at_second < 7 * HOUR:
+        length = draw(st.integers(10, 4000))
+        writes.append((at_second, length))
+        at_second += length + draw(st.integers(30, 1500))
+    cuts = draw(st.lists(st.integers(1, 7 * HOUR - 1), max_size=20, unique=True))
+    return heard, writes, sorted(cuts)
+
+
+DIVIDED = [
+    rule("more_than", count=2, window="20m", cooldown="15m", **{"class": "coughing"}),
+    rule("more_than", count=1, window="10m", least_seconds=60, cooldown="1m"),
+    rule("more_than", minutes=5, window="15m", cooldown="2m"),
+    rule("more_than", minutes=4, window="15m", cooldown="20m", least_seconds=30),
+    rule("longer_than", longer_than="5m", cooldown="30m", pause="3m"),
+    rule("longer_than", longer_than="100s", cooldown="1m", **{"class": "music"}),
+    rule("recorder_silent", silent_for="10m", cooldown="1h"),
+    rule("none_by", since="12:30", by="14:00", **{"class": "music"}, least_share=0.3),
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(lives())
+def test_any_division_of_the_time_gives_the_same_rings(life):
+    heard, writes, cuts = life
+    whole = home(*heard, written=writes)
+    edges = [NOON + second * SECOND for second in (0, *cuts, 7 * HOUR)]
+    for one in DIVIDED:
+        at_once = rings(one, whole, edges[0], edges[-1], UTC)
+        found, state = [], RuleState()
+        for start, end in itertools.pairwise(edges):
+            known = whole.between(start - history(one), end, LONGEST_PAUSE)
+            more, state = rings(one, known, start, end, UTC, state)
+            found += more
+        assert (found, state) == at_once
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90s", 90), ("20m", 1200), ("1h30m", 5400), ("7d", 604_800)]
+)
+def test_a_duration_is_read_and_said(text, seconds):
+    assert read_duration(text) == seconds * SECOND
+    assert read_duration(duration_words(seconds * SECOND).replace(" ", "").replace("min", "m"))
+
+
+@pytest.mark.parametrize("text", ["", "20", "m", "2 h", "1.5h", 20, None, "h1"])
+def test_what_is_no_duration_is_refused(text):
+    with pytest.raises(ValueError, match="is no duration; write it as 90s, 20m, 1h30m or 7d"):
+        read_duration(text)
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"rule": "more_than", "window": "2h"}, "say either count or minutes"),
+        ({"rule": "more_than", "window": "2h", "count": 1, "minutes": 1}, "either count or minutes"),
+        ({"rule": "more_than", "window": "9d", "count": 1}, "a minute to seven days"),
+        ({"rule": "none_by", "since": "6:00", "by": "10:00"}, "is no time of day; write it as"),
+        ({"rule": "none_by", "since": "10:00", "by": "10:00"}, "are the same time of day"),
+        ({"rule": "longer_than", "longer_than": "1m", "class": "silence"}, "silence is no sound"),
+        ({"rule": "unlike_usual", "part": "night", "at": "06:00"}, "a night ends at 07:00"),
+        ({"rule": "recorder_silent", "class": "music"}, "Extra inputs are not permitted"),
+        ({"rule": "loud"}, "'more_than', 'none_by', 'longer_than', 'recorder_silent'"),
+        ({"rule": "recorder_silent", "quiet_hours": ["22-6"]}, "write them as 22:00-06:30"),
+    ],
+)
+def test_a_rule_that_makes_no_sense_is_refused(keys, says):
+    with pytest.raises(ValidationError, match=says):
+        TypeAdapter(AlertRules).validate_python([{"name": "it", **keys}])
+
+
+def test_a_configuration_with_two_rules_of_one_name_is_refused_where_they_are(tmp_path):
+    file = tmp_path / "home.toml"
+    table = '[[bridge.alert]]\nname = "it"\nrule = "recorder_silent"\n'
+    file.write_text(table)
+    assert [each.name for each in load_bridge_settings(file)[1].alert] == ["it"]
+    file.write_text(2 * table)
+    with pytest.raises(ConfigurationError, match="two rules have the name 'it'"):
+        load_bridge_settings(file)
+
+
+def test_a_life_as_the_tests_write_it_has_the_hours_that_they_say():
+    assert at("07:30") == 7.5 * HOUR

@@ -1,0 +1,541 @@
+"""The page of the home: who may read it, what it shows, and how one says what a sound was."""
+
+import json
+import os
+import socket
+import threading
+import time
+from contextlib import contextmanager, suppress
+from datetime import UTC, date, datetime
+from http.client import HTTPConnection, HTTPException
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import GENERAL
+from livehome import LiveHome, midday_zone
+from viewers import address_of, browsing, free_port, patiently
+
+from hearthlog.analyzer.bridge.day import today
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.event_record import Event
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.outputs import open_outputs
+from hearthlog.analyzer.bridge.page import server
+from hearthlog.analyzer.bridge.page.board import Board
+from hearthlog.analyzer.bridge.page.day_picture import day_picture
+from hearthlog.analyzer.bridge.page.home_page import HomePage
+from hearthlog.analyzer.bridge.page.said import REVIEWER, Said, class_of
+from hearthlog.analyzer.bridge.page.words import length, when
+from hearthlog.analyzer.bridge.run import Bridge
+from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.times import NANOSECONDS
+
+HOSTILE = '<img src=x onerror="document.title=1">'
+JSON = {"Content-Type": "application/json"}
+
+
+class Served:
+    """A home whose log is being written, and its page."""
+
+    def __init__(self, folder, **options):
+        self.log = LiveHome(folder / "logs", **options)
+        self.home = Home(folder / "logs", "home", midday_zone())
+        self.state, self.said, self.port = folder / "state", [], free_port()
+        self._start()
+
+    def _start(self):
+        settings = PageSettings(port=self.port)
+        page = HomePage(settings, self.home, self.state, self.said.append)
+        self.url = self.said[-1].partition(": ")[2]
+        self.token = self.url.partition("=")[2]
+        now = today(time.time_ns(), self.home.zone)
+        self._stop = threading.Event()
+        bridge = Bridge(self.home, min(now.midnight, now.night), {"page": page}, self.said.append)
+        self._thread = threading.Thread(target=bridge.run, args=(self._stop,))
+        self._thread.start()
+
+    def end(self):
+        self._stop.set()
+        self._thread.join()
+
+    def restart(self):
+        self.end()
+        self._start()
+
+    def close(self):
+        self.end()
+        self.log.close()
+
+    def connect(self):
+        return socket.create_connection(("127.0.0.1", self.port), timeout=30)
+
+    def cookie(self):
+        _, fields, _ = self.ask("GET", f"/?token={self.token}", cookie=None)
+        return fields["Set-Cookie"].partition(";")[0]
+
+    def ask(self, method, path, body=None, cookie="own", **fields):
+        """Send a request; return status, fields and body of the answer."""
+        named = {name.replace("_", "-"): value for name, value in fields.items()}
+        if cookie is not None:
+            named["Cookie"] = self.cookie() if cookie == "own" else cookie
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=30)
+        try:
+            connection.request(method, path, body, named)
+            answer = connection.getresponse()
+            return answer.status, answer.headers, answer.read().decode()
+        finally:
+            connection.close()
+
+    def mark(self, event, label, **fields):
+        body = json.dumps({"event": event, "label": label})
+        own = {"Origin": f"http://127.0.0.1:{self.port}", **JSON, **fields}
+        status, _, answer = self.ask("POST", "/mark", body, **own)
+        return status, answer
+
+    def marks(self):
+        return [mark for log in find_logs(self.log.folder) for mark in read_marks(log)]
+
+    @contextmanager
+    def stream(self):
+        """Open the stream of news; yield what waits for a part of the page."""
+        with self.connect() as connection:
+            head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n"
+            connection.sendall(f"{head}Cookie: {self.cookie()}\r\n\r\n".encode())
+            lines = connection.makefile("r", encoding="utf-8")
+
+            def next_part(name, is_enough=lambda _: True):
+                for line in lines:
+                    if line.strip() == f"event: {name}":
+                        part = json.loads(next(lines).removeprefix("data: "))
+                        if is_enough(part):
+                            return part
+                raise AssertionError(name)
+
+            yield next_part
+
+
+@contextmanager
+def serving(folder, **options):
+    served = Served(folder, **options)
+    try:
+        yield served
+    finally:
+        served.close()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("served")) as home:
+        home.log.heard("silence", 300, 60)
+        home.log.heard("coughing", 90, 3, 0.95)
+        home.log.hears("silence")
+        with home.stream() as part:
+            part("events", lambda events: events["events"])
+        yield home
+
+
+def event_id(start, label="coughing", microphone="mic"):
+    return f"{microphone}-{label}-{start}"
+
+
+# Who may read
+
+
+@pytest.mark.parametrize("path", ["/", "/page.js", "/page.css", "/events", "/mark", "/etc/passwd"])
+def test_without_the_token_one_learns_how_to_get_the_address_and_nothing_else(served, path):
+    token = served.token
+    cookies = [None, "", f"hearthlog-{served.port}=", f"hearthlog-{served.port}={token}"]
+    targets = [path, f"{path}?token=", f"{path}?token={token[:-1]}", f"{path}?token={token}x"]
+    answers = {served.ask("GET", path, cookie=cookie)[::2] for cookie in cookies}
+    answers |= {served.ask("GET", target, cookie=None)[::2] for target in targets}
+    answers.add(served.ask("POST", path, "{}", None, Origin=served.url.partition("/?")[0])[::2])
+    ((status, text),) = answers
+    assert status == 403
+    assert "its whole address" in text
+    assert "<" not in text
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "localhost.evil.example", "192.168.1.5", "", "127.0.0.1.evil.example"]
+)
+def test_a_name_that_somebody_lets_point_here_gets_nothing(served, host):
+    for target in ("/", f"/?token={served.token}", "/events"):
+        assert served.ask("GET", target, Host=f"{host}:{served.port}")[0] == 403
+    assert served.ask("GET", "/", Host="127.0.0.1:9999")[0] == 200  # the other end of a tunnel
+    assert served.ask("GET", "/", Host=f"localhost:{served.port}")[0] == 200
+
+
+def test_two_hosts_get_nothing(served):
+    with served.connect() as connection:
+        head = f"GET /?token={served.token} HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n"
+        connection.sendall(f"{head}\r\n".encode())
+        assert connection.recv(100).startswith(b"HTTP/1.1 403")
+
+
+@pytest.mark.parametrize(
+    "origin", [None, "null", "https://evil.example", "http://127.0.0.1:1", "http://localhost"]
+)
+def test_another_page_marks_nothing_though_the_browser_sends_the_cookie(served, origin):
+    before = served.marks()
+    own = {} if origin is None else {"Origin": origin}
+    body = json.dumps({"event": "x", "label": "music"})
+    assert served.ask("POST", "/mark", body, **JSON, **own)[0] == 403
+    if origin is not None:
+        assert served.ask("GET", "/events", Origin=origin)[0] == 403
+    assert served.marks() == before
+
+
+def test_the_address_gives_a_cookie_that_no_script_reads_and_that_has_no_token(served):
+    status, fields, text = served.ask("GET", f"/?token={served.token}", cookie=None)
+    assert status == 200
+    assert 'url=/"' in text
+    rules = {rule.strip() for rule in fields["Set-Cookie"].split(";")[1:]}
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= rules
+    assert served.token not in f"{fields}{text}"
+    assert served.ask("GET", "/")[0] == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/page.js", "/page.css", "/none"])
+def test_no_answer_is_kept_framed_guessed_at_or_handed_on(served, path):
+    for cookie in ("own", None):
+        _, fields, _ = served.ask("GET", path, cookie=cookie)
+        policy = fields["Content-Security-Policy"].split("; ")
+        assert {"default-src 'none'", "script-src 'self'", "frame-ancestors 'none'"} <= {*policy}
+        assert "unsafe" not in fields["Content-Security-Policy"]
+        assert fields["Cache-Control"] == "no-store"
+        assert fields["Referrer-Policy"] == "no-referrer"
+        assert fields["X-Content-Type-Options"] == "nosniff"
+        assert fields["Server"] == "hearthlog"
+
+
+@pytest.mark.parametrize(
+    "path", ["/../server.py", "/server.py", "/%2e%2e/page.css", "//page.css", "/page.html", "/x"]
+)
+def test_only_the_files_of_the_page_are_served(served, path):
+    assert served.ask("GET", path)[::2] == (404, "Not Found\n")
+
+
+@pytest.mark.parametrize(
+    ("body", "fields", "status"),
+    [
+        ("x" * 5000, JSON, 413),
+        ("{}", {**JSON, "Content-Length": "9" * 30}, 413),
+        ("{}", {**JSON, "Content-Length": "-1"}, 411),
+        ("{}", {"Content-Type": "text/plain"}, 415),
+        ("{", JSON, 400),
+        ("[1]", JSON, 400),
+        ("[" * 4000, JSON, 400),
+        ('{"event": 1, "label": "music"}', JSON, 400),
+        ('{"event": "none", "label": "music"}', JSON, 422),
+    ],
+)
+def test_what_is_no_mark_is_refused(served, body, fields, status):
+    origin = f"http://127.0.0.1:{served.port}"
+    assert served.ask("POST", "/mark", body, Origin=origin, **fields)[0] == status
+
+
+def test_a_head_without_end_is_not_read(served):
+    with served.connect() as connection:
+        head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {served.cookie()}\r\n"
+        with suppress(ConnectionError):
+            connection.sendall(head.encode() + b"X: y\r\n" * 20000)
+        answer = b""
+        with suppress(ConnectionError):
+            answer = connection.recv(1000)
+    assert not answer.startswith(b"HTTP/1.1 200")
+
+
+def test_too_many_connections_are_turned_away_until_others_end(served):
+    held = [served.connect() for _ in range(server._MOST_CONNECTIONS)]
+    with served.connect() as late, suppress(ConnectionError):
+        assert late.recv(100).startswith(b"HTTP/1.1 503") or late.recv(1) == b""
+    for each in held:
+        each.close()
+
+    def answers():
+        with suppress(HTTPException, KeyError):
+            return served.ask("GET", "/")[0]
+
+    assert patiently(answers, lambda status: status == 200)
+
+
+def test_too_many_open_pages_leave_room_for_the_page_itself(served):
+    streams = [served.connect() for _ in range(server._MOST_STREAMS)]
+    request = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {served.cookie()}\r\n\r\n"
+    for each in streams:
+        each.sendall(request.encode())
+        assert each.recv(100).startswith(b"HTTP/1.1 200")
+    assert served.ask("GET", "/events")[0] == 503
+    assert served.ask("GET", "/")[0] == 200
+    for each in streams:
+        each.close()
+
+
+def test_who_sends_a_request_for_ever_is_cut_off(served, monkeypatch):
+    monkeypatch.setattr(server, "_SECONDS", 0.2)
+    with served.connect() as connection, suppress(ConnectionError):
+        connection.sendall(b"GET / HTTP/1.1\r\n")
+        while True:  # until the other side ends: by reset, or by an end
+            connection.sendall(b"X: y\r\n")
+            connection.settimeout(0.05)
+            with suppress(TimeoutError):
+                assert connection.recv(1) == b""
+                break
+
+
+def test_a_reader_who_is_slow_gets_the_newest_and_nobody_waits_for_him():
+    board = Board()
+    for number in range(1000):
+        board.put("now", b"%d" % number)
+    (part,) = board.wait({}, 60).values()
+    assert part.content == b"999"
+    assert board.wait({"now": part.number}, 0) == {}
+    board.put("now", b"999")
+    assert board.wait({"now": part.number}, 0) == {}
+
+
+def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
+    with served.connect() as asleep:
+        head = f"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {served.cookie()}\r\n\r\n"
+        asleep.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        asleep.sendall(head.encode())
+        with served.stream() as part:
+            start = served.log.heard("laughing", 5)
+            part("events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]})
+
+
+# Ports and tokens
+
+
+def test_nothing_listens_unless_the_page_is_configured(tmp_path):
+    home = Home(tmp_path, "home", UTC)
+    outputs, _ = open_outputs(BridgeSettings(), home, tmp_path, print)
+    assert outputs == {}
+
+
+def test_the_page_listens_on_loopback_by_default(tmp_path):
+    home, said, port = Home(tmp_path, "home", UTC), [], free_port()
+    settings = BridgeSettings(page=PageSettings(port=port))
+    outputs, _ = open_outputs(settings, home, tmp_path, said.append)
+    assert address_of(port) == "127.0.0.1"
+    outputs["page"].close()
+    assert address_of(port) is None
+    assert len(said) == 1
+
+
+def test_an_address_of_the_network_comes_with_a_warning(tmp_path):
+    said = []
+    settings = PageSettings(port=free_port(), bind="0.0.0.0")
+    HomePage(settings, Home(tmp_path, "home", UTC), tmp_path, said.append).close()
+    assert "in the clear" in said[1]
+
+
+@pytest.mark.parametrize("bind", ["localhost", "box.example", ""])
+def test_an_address_that_is_a_name_is_refused(tmp_path, bind):
+    with pytest.raises(BridgeError, match="in digits"):
+        HomePage(PageSettings(bind=bind), Home(tmp_path, "home", UTC), tmp_path, print)
+
+
+def test_a_port_that_is_taken_is_named(served, tmp_path):
+    with pytest.raises(BridgeError, match=rf"port {served.port} .*choose another"):
+        HomePage(PageSettings(port=served.port), served.home, tmp_path, print)
+
+
+def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
+    said = []
+    for _ in range(2):
+        home = Home(tmp_path, "home", UTC)
+        HomePage(PageSettings(port=free_port()), home, tmp_path / "state", said.append).close()
+    (path,) = (tmp_path / "state").iterdir()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert {line.partition("token=")[2] for line in said} == {path.read_text().strip()}
+
+
+@pytest.mark.parametrize("text", ["", "short", "a b c d e f g h i j", "x" * 16 + "\nsecond", "é" * 20])
+def test_a_file_that_has_no_token_is_refused(tmp_path, text):
+    file = tmp_path / "token"
+    file.write_text(text)
+    with pytest.raises(BridgeError, match="no token of the page"):
+        HomePage(PageSettings(token_file=file), Home(tmp_path, "home", UTC), tmp_path, print)
+
+
+def test_a_token_of_ones_own_opens_the_page(tmp_path):
+    file, said, port = tmp_path / "token", [], free_port()
+    file.write_text("Correct.Horse_Battery~1\n")
+    settings = PageSettings(port=port, token_file=file)
+    page = HomePage(settings, Home(tmp_path, "home", UTC), tmp_path, said.append)
+    connection = HTTPConnection("127.0.0.1", port, timeout=30)
+    connection.request("GET", "/?token=Correct.Horse_Battery~1")
+    assert connection.getresponse().status == 200
+    connection.close()
+    page.close()
+
+
+# What it shows
+
+
+def segments(name, *spans):
+    starts = np.array([start for start, _, _ in spans])
+    ends = np.array([end for _, end, _ in spans])
+    fields = {
+        "header.stamp": starts,
+        "duration": ends - starts,
+        "label": np.array([label for _, _, label in spans], object),
+        "confidence": np.ones(len(spans), np.float32),
+    }
+    return Columns(f"/{name}/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
+
+
+def at(zone, *moment):
+    return int(datetime(*moment, tzinfo=zone).timestamp()) * NANOSECONDS
+
+
+@pytest.mark.parametrize(("day", "hours"), [((2026, 3, 29), 23), ((2026, 10, 25), 25)])
+def test_a_day_on_which_the_clock_is_changed_has_the_hours_of_the_clock(day, hours):
+    zone = ZoneInfo("Europe/Vienna")
+    noon = at(zone, *day, 12)
+    state = HomeState()
+    state.push([segments("mic", (noon, noon + 120 * NANOSECONDS, "speech"))])
+    picture = day_picture(state.microphones.values(), today(noon + 60, zone), zone)
+    clock = [hour for _, hour in picture["hours"]]
+    assert len(clock) == hours
+    assert sorted({*clock}) == sorted({*range(24)} - ({2} if hours == 23 else set()))
+    noons = [place for place, hour in picture["hours"] if hour == 12]
+    (lane,) = picture["rooms"][0]["lanes"]
+    assert len(lane["bars"]) == hours * 30
+    assert lane["bars"].index("9") / len(lane["bars"]) == pytest.approx(noons[0], abs=1e-4)
+    assert picture["nights"][0][1] == [place for place, hour in picture["hours"] if hour == 7][0]
+    assert picture["nights"][1][0] == [place for place, hour in picture["hours"] if hour == 22][0]
+
+
+def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_night():
+    begin = at(UTC, 2026, 5, 5)
+    minute = 60 * NANOSECONDS
+    state = HomeState()
+    state.push([segments("mic", (begin - 60 * minute, begin + 60 * minute, "music"))])
+    now = today(begin + 600 * minute, UTC)
+    (lane,) = day_picture(state.microphones.values(), now, UTC)["rooms"][0]["lanes"]
+    assert lane["bars"] == "9" * 30 + "0" * 690
+    assert (lane["today"], lane["night"], lane["told"]) == (0, 1, "Music: never today")
+
+
+def test_what_was_not_heard_is_marked_as_such():
+    begin = at(UTC, 2026, 5, 5)
+    hour = 3600 * NANOSECONDS
+    state = HomeState()
+    state.push([segments("mic", (begin + 6 * hour, begin + 7 * hour, "silence"))])
+    times = np.array([begin + 14 * hour])
+    fields = {"header.stamp": np.array([begin + 12 * hour]), "duration": np.array([2 * hour])}
+    state.push([Columns("/mic/gap", message_types.GAP, {}, times, times, times, fields)])
+    (microphone,) = state.microphones.values()
+    microphone.heard.time, microphone.seen = begin + 18 * hour, time.monotonic() - 60
+    now = today(begin + 20 * hour, UTC)
+    gaps = day_picture([microphone], now, UTC)["rooms"][0]["gaps"]
+    assert gaps == [(0, 0.25), (0.5, 0.5833), (0.75, 0.8333)]
+
+
+def test_times_and_lengths_are_said_in_words():
+    now = at(UTC, 2026, 5, 5, 12)
+    hour = 3600 * NANOSECONDS
+    assert [when(now - hours * hour, now, UTC) for hours in (1, 13, 60)] == [
+        "11:00",
+        "yesterday 23:00",
+        "3 May 00:00",
+    ]
+    said = [length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
+    expected = "less than a second,1 second,89 seconds,2 minutes,1 hour 30 minutes,2 hours 1 minute"
+    assert said == expected.split(",")
+
+
+def test_a_day_of_thousands_of_sounds_is_small():
+    begin, step = at(UTC, 2026, 5, 5), 15 * NANOSECONDS
+    state = HomeState()
+    starts = [begin + number * step for number in range(5000)]
+    labels = [name for name in GENERAL if name != "silence"]
+    state.push(
+        [
+            segments("mic", *((s, s + NANOSECONDS, labels[i % 8]) for i, s in enumerate(starts))),
+        ]
+    )
+    picture = day_picture(state.microphones.values(), today(begin + 5000 * step, UTC), UTC)
+    assert sum(lane["today"] for lane in picture["rooms"][0]["lanes"]) == 5000
+    assert len(json.dumps(picture)) < 20_000
+
+
+# What people say
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("music", "music"),
+        ("Water tap", "tap_water"),
+        (" Kettle ", "kettle"),
+        ("My old, dear fridge", "my_old_dear_fridge"),
+        ("Talking", "speech"),
+    ],
+)
+def test_a_class_is_meant_by_its_words(text, name):
+    assert class_of(text) == name
+
+
+@pytest.mark.parametrize("text", ["", "   ", "7 dwarfs", "Türglocke", HOSTILE, "x" * 65, "a\nb"])
+def test_what_cannot_be_a_class_is_explained(served, text):
+    start = served.log.heard("music", 20)
+    with served.stream() as part:
+        part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
+    status, answer = served.mark(event_id(start, "music"), text)
+    assert status == 422
+    assert "letters a to z" in json.loads(answer)["error"]
+
+
+def test_what_somebody_says_is_a_mark_of_the_log_also_after_a_restart(tmp_path):
+    with serving(tmp_path) as home:
+        start = home.log.heard("coughing", 10, 3)
+        home.log.hears("silence")
+        with home.stream() as part:
+            part("events", lambda it: it["events"])
+            status, answer = home.mark(event_id(start), "Kettle boiling")
+            assert (status, json.loads(answer)) == (200, {"said": "You said: Kettle boiling"})
+            told = part("events", lambda it: it["events"][0]["said"])
+        assert told["events"][0]["said"] == "You said: Kettle boiling"
+        (mark,) = home.marks()
+        assert mark[:5] == ("mic", start, start + 3 * NANOSECONDS, "kettle_boiling", REVIEWER)
+        home.restart()
+        with home.stream() as part:
+            told = part("events", lambda it: it["events"] and it["events"][0]["said"])
+        assert told["events"][0]["said"] == "You said: Kettle boiling"
+
+
+def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
+    def refuse(log, _):
+        raise LogError(f"{log}: cannot be written") from PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("hearthlog.analyzer.bridge.corrections.write_marks", refuse)
+    start = served.log.heard("music", 30)
+    with served.stream() as part:
+        part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
+    status, answer = served.mark(event_id(start, "music"), "speech")
+    assert status == 422
+    assert "may only read the logs" in json.loads(answer)["error"]
+
+
+def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
+    home = LiveHome(tmp_path)
+    start = home.heard("music", 40)
+    home.close()
+    (log,) = find_logs(tmp_path)
+    event = Event("mic", "music", start, start + 4 * NANOSECONDS, 1.0, 4.0)
+    write_marks(log, [Mark("mic", start, event.end, "phone_ring", "Ann")])
+    said = Said(tmp_path, "home")
+    said.read_back()
+    assert said.of(event) == "Marked: Telephone ringing"
+    later = event._replace(start=event.end, end=event.end + NANOSECONDS)
+    assert said.of(later) == ""

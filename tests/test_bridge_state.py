@@ -1,0 +1,173 @@
+"""What a bridge says follows from the log alone, however it came to be read."""
+
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hearthlog.analyzer.accuracy.events import events_of
+from hearthlog.analyzer.bridge.day import iso_time, today
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.event_record import EventRecord
+from hearthlog.analyzer.bridge.heard_now import ANY_SOUND, HeardNow
+from hearthlog.analyzer.bridge.home_state import HomeState, MicrophoneState
+from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
+from hearthlog.analyzer.bridge.saying import Saying
+from hearthlog.analyzer.bridge.settings import load_bridge_settings
+from hearthlog.analyzer.bridge.totals import Total, Totals
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.times import NANOSECONDS
+
+pytestmark = pytest.mark.fast
+
+FRAME = NANOSECONDS // 20
+CLASSES = ["silence", "speech", "coughing"]
+VIENNA = ZoneInfo("Europe/Vienna")
+
+
+def heard(labels, cuts=()):
+    """Tell what is heard after labels that came in pieces."""
+    now, times = HeardNow(CLASSES), FRAME * np.arange(1, len(labels) + 1)
+    for first, last in zip([0, *cuts], [*cuts, len(labels)], strict=True):
+        now.push(labels[first:last], times[first:last])
+    return [now.is_heard(name) for name in (*CLASSES, ANY_SOUND)]
+
+
+@given(st.lists(st.sampled_from(CLASSES), max_size=300), st.lists(st.integers(0, 300), max_size=9))
+def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
+    assert heard(labels, sorted(min(cut, len(labels)) for cut in cuts)) == heard(labels)
+
+
+@pytest.mark.parametrize(("frames", "is_heard"), [(7, False), (8, True)])
+def test_eight_labels_of_a_second_are_a_sound(frames, is_heard):
+    labels = 50 * ["silence"] + frames * ["coughing", "silence"]
+    assert heard(labels)[2:] == [is_heard, is_heard]
+
+
+@pytest.mark.parametrize(("frames", "is_heard"), [(200, True), (201 + 12, False)])
+def test_a_sound_is_held_for_ten_seconds(frames, is_heard):
+    assert heard(20 * ["coughing"] + frames * ["silence"])[2:] == [is_heard, is_heard]
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 20)), max_size=40))
+def test_events_are_those_of_the_report(spans):
+    starts, ends, time = [], [], 0
+    for pause, length in spans:
+        starts.append(time + pause * NANOSECONDS)
+        ends.append(time := starts[-1] + length * NANOSECONDS)
+    record = EventRecord("mic", "coughing")
+    for start, end in zip(starts, ends, strict=True):
+        record.push(start, end, 0.5)
+    labels = Labelling(
+        np.array(starts, np.int64), np.array(ends, np.int64), np.array(["coughing"] * len(starts))
+    )
+    expected = events_of(labels, "coughing")
+    assert [event.start for event in record.events] == expected.starts.tolist()
+    assert [event.end for event in record.events] == expected.ends.tolist()
+
+
+@pytest.mark.parametrize(
+    ("now", "midnight", "night", "morning"),
+    [
+        ("2026-03-29T10:00+02:00", "03-29T00:00+01:00", "03-28T22:00+01:00", "03-29T07:00+02:00"),
+        ("2026-10-25T22:00+01:00", "10-25T00:00+02:00", "10-25T22:00+01:00", "10-26T07:00+01:00"),
+        ("2026-10-25T21:59+01:00", "10-25T00:00+02:00", "10-24T22:00+02:00", "10-25T07:00+01:00"),
+    ],
+)
+def test_day_and_night_follow_the_clock_on_the_wall(now, midnight, night, morning):
+    found = today(int(datetime.fromisoformat(now).timestamp()) * NANOSECONDS, VIENNA)
+    texts = [f"2026-{text}" for text in (midnight, night, morning)]
+    times = [int(datetime.fromisoformat(text).timestamp()) * NANOSECONDS for text in texts]
+    assert list(found[1:]) == times
+
+
+def test_a_time_is_written_with_the_offset_of_the_home():
+    assert iso_time(1_792_890_000_123_456_789, VIENNA) == "2026-10-25T02:00:00.123+01:00"
+    assert iso_time(1_792_886_400_000_000_000, UTC) == "2026-10-25T00:00:00.000+00:00"
+
+
+@given(st.text(min_size=1, max_size=20))
+def test_a_class_of_any_name_has_a_topic_of_its_own(label):
+    topics = Topics("hearthlog", "home")
+    topic = topics.of_class("mic", label, "on")
+    assert not {"+", "#", "\x00"} & set(topic)
+    assert topic.count("/") == 5
+    if label.isprintable():
+        assert topics.parse_class(topic, "on") == ("mic", label)
+
+
+@given(st.text(max_size=20))
+def test_an_identifier_has_letters_that_home_assistant_takes(text):
+    assert set(identifier(text)) <= set("abcdefghijklmnopqrstuvwxyz0123456789_")
+
+
+def state_with(*events):
+    """The state of a home with events of coughing, each of a second."""
+    state, microphone = HomeState(), MicrophoneState("mic")
+    state.microphones["mic"] = microphone
+    record = microphone._records.setdefault("coughing", EventRecord("mic", "coughing"))
+    for start in events:
+        record.push(start * NANOSECONDS, (start + 1) * NANOSECONDS, 1.0)
+    return state
+
+
+def test_totals_survive_restarts_and_are_counted_once(tmp_path):
+    path = tmp_path / "totals.json"
+    totals = Totals(path, 100 * NANOSECONDS)
+    assert totals.count(state_with(50, 150, 250)) == [Total("mic", "coughing", 2, 2.0)]
+    totals.keep(state_with(50, 150, 250), 200 * NANOSECONDS)
+    again = Totals(path, 0)
+    assert again.time == 200 * NANOSECONDS
+    assert again.count(state_with(250, 350)) == [Total("mic", "coughing", 3, 3.0)]
+    assert again.count(HomeState()) == [Total("mic", "coughing", 1, 1.0)]
+
+
+def test_damaged_totals_are_named(tmp_path):
+    path = tmp_path / "totals.json"
+    path.write_text('{"time": -1}')
+    with pytest.raises(BridgeError, match=r"totals.json: is damaged; delete it"):
+        Totals(path, 0)
+
+
+def test_a_trouble_is_said_again_after_an_hour(monkeypatch):
+    said, now = [], [1e6]
+    monkeypatch.setattr("hearthlog.analyzer.bridge.saying.time.monotonic", lambda: now[0])
+    say = Saying(said.append)
+    for _ in range(3):
+        say("no broker")
+        say("a full disk")
+    now[0] += 3601
+    say("no broker")
+    assert said == ["no broker", "a full disk", "no broker"]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ('[bridge.mqtt]\nhots = "x"', "line 2: unknown key 'bridge.mqtt.hots'"),
+        ('[bridge.mqtt]\nport = 1883', "line 1: bridge.mqtt.host: Field required"),
+        ('[bridge.mqtt]\nhost = "x"\nport = 70000', "line 3: bridge.mqtt.port: Input should"),
+        ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: String should match"),
+        ("bridge = 3", "line 1: bridge: Input should be"),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_named_with_its_line(tmp_path, text, problem):
+    path = tmp_path / "home.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as error:
+        load_bridge_settings(path)
+    assert str(error.value).startswith(f"{path}, {problem}")
+
+
+def test_the_recorder_takes_no_notice_of_the_table_of_the_bridge(tmp_path):
+    path = tmp_path / "home.toml"
+    path.write_text('node = "flat"\n[bridge.mqtt]\nhost = "broker"\n')
+    settings, bridge = load_bridge_settings(path)
+    assert settings.node == "flat"
+    assert bridge.mqtt is not None
+    assert bridge.mqtt.host == "broker"
+    assert bridge.ping is None

@@ -1,0 +1,179 @@
+"""A connection to a real broker says what is wrong with it, and loses nothing that counts."""
+
+import time
+from contextlib import contextmanager
+
+import pytest
+from brokers import Broker, Listener, settled_values
+from certificates import Authority
+
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.mqtt import connection
+from hearthlog.analyzer.bridge.mqtt.connection import Connection
+from hearthlog.analyzer.bridge.settings import MqttSettings
+
+pytestmark = pytest.mark.fast
+
+ALIVE = "hearthlog/home/bridge"
+
+
+@contextmanager
+def connected(broker, client_id="hearthlog-home", **settings):
+    """A connection, and the lines that it says."""
+    said = []
+    settings = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
+    connection = Connection(
+        settings, client_id, ALIVE, said.append, subscriptions=(), received=print
+    )
+    try:
+        yield connection, said
+    finally:
+        connection.close()
+
+
+def flush_until(connection, holds, seconds=20.0):
+    """Flush as the bridge does, until something holds."""
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until
+        connection.flush()
+        time.sleep(0.05)
+
+
+def test_a_broker_that_forgot_everything_is_told_everything_again(broker):
+    with connected(broker) as (connection, _):
+        connection.keep("hearthlog/home/mic/class/coughing/on", "ON")
+        with Listener(broker.port) as listener:
+            flush_until(connection, lambda: ALIVE in listener.values)
+            flush_until(connection, lambda: len(listener.values) == 2)
+        broker.kill()
+        connection.keep("hearthlog/home/mic/class/coughing/on", "OFF")
+        connection.flush()
+        broker.start()
+        with Listener(broker.port) as listener:
+            flush_until(connection, lambda: len(listener.values) == 2)
+        assert settled_values(broker.port, seconds=0.3) == {
+            ALIVE: "online",
+            "hearthlog/home/mic/class/coughing/on": "OFF",
+        }
+
+
+def test_a_value_is_said_once_and_an_event_each_time(broker):
+    with connected(broker) as (connection, _), Listener(broker.port) as listener:
+        for _ in range(3):
+            connection.keep("a", "1")
+            connection.send("b", "2")
+            flush_until(connection, lambda: bool(listener.payloads("b")))
+        flush_until(connection, lambda: len(listener.payloads("b")) == 3)
+        assert listener.payloads("a") == ["1"]
+        assert [kept for _, topic, _, kept in listener.messages if topic == "b"] == 3 * [False]
+
+
+def test_an_event_that_is_too_old_when_the_broker_comes_is_no_news(broker, monkeypatch):
+    monkeypatch.setattr(connection, "_TIMELY_SECONDS", 0.5)
+    broker.kill()
+    with connected(broker) as (link, _):
+        link.send("old", "1")
+        time.sleep(0.6)
+        link.send("new", "2")
+        monkeypatch.setattr(connection, "_TIMELY_SECONDS", 10.0)
+        link._events[0] = (link._events[0][0] - 10.0, *link._events[0][1:])
+        broker.start()
+        with Listener(broker.port) as listener:
+            flush_until(link, lambda: "new" in listener.values)
+            assert "old" not in listener.values
+
+
+def test_a_broker_that_is_not_there_is_said_in_one_line_and_found_when_it_comes(broker):
+    broker.kill()
+    with connected(broker) as (connection, said):
+        flush_until(connection, lambda: bool(said))
+        assert said[0] == f"127.0.0.1:{broker.port}: no broker (Connection refused); trying again"
+        broker.start()
+        with Listener(broker.port) as listener:
+            flush_until(connection, lambda: listener.values.get(ALIVE) == "online")
+
+
+def test_a_second_bridge_of_the_same_name_is_said_to_be_one(broker):
+    with (
+        connected(broker) as (first, said),
+        Listener(broker.port) as listener,
+    ):
+        flush_until(first, lambda: listener.values.get(ALIVE) == "online")
+        with connected(broker):
+            flush_until(first, lambda: any("another client named" in line for line in said))
+    assert "hearthlog-home running, a second bridge? give one of them another" in said[-1]
+
+
+@pytest.fixture
+def authority(tmp_path):
+    return Authority(tmp_path, "authority")
+
+
+@pytest.fixture
+def tls_broker(tmp_path, authority):
+    """A broker that wants certificates of its authority, and lets `bridge` write below `home`."""
+    certificate, key = authority.sign("broker")
+    rules = tmp_path / "acl"
+    rules.write_text("user bridge\ntopic readwrite hearthlog/home/#\n")
+    broker = Broker(
+        tmp_path,
+        f"cafile {authority.file}\ncertfile {certificate}\nkeyfile {key}\n"
+        f"require_certificate true\nuse_identity_as_username true\nacl_file {rules}\n",
+    )
+    yield broker
+    broker.kill()
+
+
+def test_a_client_certificate_opens_an_encrypted_connection(tls_broker, authority):
+    certificate, key = authority.sign("bridge")
+    files = {"ca_file": authority.file, "certificate_file": certificate, "key_file": key}
+    with connected(tls_broker, tls=True, **files) as (connection, said):
+        connection.keep("hearthlog/home/mic/heard", "x")
+        flush_until(connection, lambda: not connection._unsent)
+        time.sleep(0.2)
+        assert said == []
+        connection.send("elsewhere", "x")  # what the broker forbids
+        flush_until(connection, lambda: bool(said))
+    assert "a message was refused: Not authorized; the broker must let this client write" in said[0]
+
+
+def test_a_missing_client_certificate_is_guessed_where_the_broker_only_hangs_up(
+    tls_broker, authority
+):
+    with connected(tls_broker, tls=True, ca_file=authority.file) as (connection, said):
+        flush_until(connection, lambda: bool(said))
+    assert "does it want a client certificate? see certificate_file and key_file" in said[0]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho's socket
+def test_a_broker_whose_certificate_nobody_vouches_for_is_refused(tls_broker, tmp_path):
+    with connected(tls_broker, tls=True, ca_file=Authority(tmp_path, "other").file) as (
+        connection,
+        said,
+    ):
+        flush_until(connection, lambda: bool(said))
+    assert "its certificate is refused: " in said[0]
+    assert "see ca_file" in said[0]
+
+
+@pytest.mark.parametrize("missing", ["ca_file", "certificate_file", "password_file"])
+def test_a_file_that_is_missing_is_named(tmp_path, missing):
+    settings = MqttSettings(host="127.0.0.1", tls=True, user="x", **{missing: tmp_path / "none"})
+    with pytest.raises(BridgeError, match="none"):
+        Connection(settings, "x", ALIVE, print, subscriptions=(), received=print)
+
+
+def test_a_password_is_taken_from_a_file(tmp_path, broker):
+    users = tmp_path / "users"
+    users.write_text("home:$7$101$")  # no password matches
+    password = tmp_path / "password"
+    password.write_text("wrong\n")
+    password.chmod(0o600)
+    broker.kill()
+    guarded = Broker(tmp_path, f"password_file {users}\nallow_anonymous false\n")
+    with connected(guarded, user="home", password_file=password) as (connection, said):
+        flush_until(connection, lambda: bool(said))
+    guarded.kill()
+    assert "refused: " in said[0]
+    assert "see user, password_file and client_id" in said[0]
