@@ -71,7 +71,9 @@ class Listener:
         self.values = {}
         self.messages = []
         self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._is_ready = threading.Event()
         self._client.on_connect = lambda client, *_: client.subscribe(topics, 1)
+        self._client.on_subscribe = lambda *_: self._is_ready.set()
         self._client.on_message = self._note
         self._client.reconnect_delay_set(1, 1)
         self._client.connect_async("127.0.0.1", port)
@@ -86,6 +88,7 @@ class Listener:
         return [payload for _, name, payload, _ in list(self.messages) if name == topic]
 
     def publish(self, topic: str, payload: str, *, retain: bool = False):
+        assert self._is_ready.wait(_SECONDS)
         self._client.publish(topic, payload, 1, retain).wait_for_publish(_SECONDS)
 
     def wait_for(self, topic: str, value: str | None = None, seconds: float = 30.0) -> str:
@@ -104,7 +107,8 @@ class Listener:
             if holds():
                 return True
             time.sleep(0.05)
-        pytest.fail(f"it did not come; the broker has {self.values}")
+        newest = [(topic, payload[:80]) for _, topic, payload, _ in self.messages[-30:]]
+        pytest.fail(f"it did not come; what came last: {newest}")
 
     def __enter__(self):
         return self

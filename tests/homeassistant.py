@@ -130,7 +130,9 @@ class HomeAssistant:
         """Start it, and wait until it answers."""
         with (self.folder / "said").open("a") as said:
             self._process = subprocess.Popen(
-                [*DIES_WITH_PARENT, self._hass, "-c", self.folder, "--skip-pip"], stdout=said, stderr=said
+                [*DIES_WITH_PARENT, self._hass, "-c", self.folder, "--skip-pip"],
+                stdout=said,
+                stderr=said,
             )
         wait_for(self._answers, 120)
         if not self._refresh:

@@ -108,9 +108,7 @@ def main(sound: str, model: str, minutes: str, kills: str, seed: str = "0") -> N
         ending = kill_at_random(Path(folder), sounds, model, seconds, int(kills), chance)
     sys.stdout.write(f"{ending.said}{len(ending.expected)} values, wrong: {ending.wrong}\n")
     for topic in ending.wrong:
-        sys.stdout.write(
-            f"{topic}: {ending.found.get(topic)}, not {ending.expected.get(topic)}\n"
-        )
+        sys.stdout.write(f"{topic}: {ending.found.get(topic)}, not {ending.expected.get(topic)}\n")
 
 
 if __name__ == "__main__":

@@ -134,7 +134,7 @@ def serving(folder, **options):
 def served(tmp_path_factory):
     with serving(tmp_path_factory.mktemp("served")) as home:
         home.log.heard("silence", 300, 60)
-        home.log.heard("coughing", 90, 3, 0.95)
+        home.coughed = home.log.heard("coughing", 90, 3, 0.95)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda events: events["events"])
@@ -216,7 +216,7 @@ def test_no_answer_is_kept_framed_guessed_at_or_handed_on(served, path):
 
 
 @pytest.mark.parametrize(
-    "path", ["/../server.py", "/server.py", "/%2e%2e/page.css", "//page.css", "/page.html", "/x"]
+    "path", ["/../server.py", "/server.py", "/%2e%2e/page.css", "/page.html", "/x"]
 )
 def test_only_the_files_of_the_page_are_served(served, path):
     assert served.ask("GET", path)[::2] == (404, "Not Found\n")
@@ -308,7 +308,9 @@ def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
         asleep.sendall(head.encode())
         with served.stream() as part:
             start = served.log.heard("laughing", 5)
-            part("events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]})
+            part(
+                "events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]}
+            )
 
 
 # Ports and tokens
@@ -358,7 +360,9 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path):
     assert {line.partition("token=")[2] for line in said} == {path.read_text().strip()}
 
 
-@pytest.mark.parametrize("text", ["", "short", "a b c d e f g h i j", "x" * 16 + "\nsecond", "é" * 20])
+@pytest.mark.parametrize(
+    "text", ["", "short", "a b c d e f g h i j", "x" * 16 + "\nsecond", "é" * 20]
+)
 def test_a_file_that_has_no_token_is_refused(tmp_path, text):
     file = tmp_path / "token"
     file.write_text(text)
@@ -488,10 +492,7 @@ def test_a_class_is_meant_by_its_words(text, name):
 
 @pytest.mark.parametrize("text", ["", "   ", "7 dwarfs", "Türglocke", HOSTILE, "x" * 65, "a\nb"])
 def test_what_cannot_be_a_class_is_explained(served, text):
-    start = served.log.heard("music", 20)
-    with served.stream() as part:
-        part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
-    status, answer = served.mark(event_id(start, "music"), text)
+    status, answer = served.mark(event_id(served.coughed), text)
     assert status == 422
     assert "letters a to z" in json.loads(answer)["error"]
 

@@ -149,7 +149,7 @@ def test_a_trouble_is_said_again_after_an_hour(monkeypatch):
     ("text", "problem"),
     [
         ('[bridge.mqtt]\nhots = "x"', "line 2: unknown key 'bridge.mqtt.hots'"),
-        ('[bridge.mqtt]\nport = 1883', "line 1: bridge.mqtt.host: Field required"),
+        ("[bridge.mqtt]\nport = 1883", "line 1: bridge.mqtt.host: Field required"),
         ('[bridge.mqtt]\nhost = "x"\nport = 70000', "line 3: bridge.mqtt.port: Input should"),
         ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: String should match"),
         ("bridge = 3", "line 1: bridge: Input should be"),

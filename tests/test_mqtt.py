@@ -1,95 +1,318 @@
-"""What is heard reaches a real broker, and survives the loss of broker, recorder and bridge."""
+"""What is heard reaches a real broker, and what people say comes back from it."""
 
 import json
 import random
 import signal
-import subprocess
+import time
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
-from bridged import expected_values
 from brokers import Broker, Listener, settled_values, start_bridge
+from homelife import GENERAL
 from killed_bridge import ZONE, kill_at_random, start_recorder
+from livehome import LiveHome, midday_zone
+
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.mqtt.discovery import device_id
+from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
+from hearthlog.analyzer.bridge.run import Bridge
+from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.recorder.rest import paused_until
+from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.times import NANOSECONDS
 
 ROOT = "hearthlog/home"
+COUGHING = f"{ROOT}/mic/class/coughing"
+DISCOVERY = f"homeassistant/device/{device_id('home', 'mic')}/config"
 _CLIPS = Path(__file__).parent / "data" / "household"
 
 
-@pytest.fixture
-def sounds():
-    """Real recordings, of some minutes."""
-    return sorted(_CLIPS.glob("coughing/*.flac")) + sorted(_CLIPS.glob("*/*.flac"))
+class Bridged:
+    """A bridge in a thread, between the log of a home and a broker."""
 
+    def __init__(self, folder: Path, broker: Broker, outputs=(), **settings):
+        self.said = []
+        self._stop = Event()
+        home = Home(folder, "home", midday_zone())
+        mqtt = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
+        everybody = dict(outputs) | {"mqtt": MqttPublisher(mqtt, home, self.said.append)}
+        since = time.time_ns() - 24 * 3600 * NANOSECONDS
+        bridge = Bridge(home, since, everybody, self.said.append)
+        self._thread = Thread(target=bridge.run, args=[self._stop], daemon=True)
+        self._thread.start()
 
-class Home:
-    """A recorder that hears real recordings, a broker, and a bridge between them."""
+    def __enter__(self):
+        return self
 
-    def __init__(self, folder: Path, broker: Broker, sounds: list[Path], settings: str = ""):
-        self.folder = folder
-        self.said = folder / "said"
-        self.config = folder / "home.toml"
-        self.config.write_text(
-            f'output = "{folder}/logs"\ntimezone = "{ZONE}"\n'
-            f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n{settings}'
-        )
-        self.model = "general"
-        self.sounds = sounds
-        self.recorder = self.start_recorder()
-        self.bridge = self.start_bridge()
-
-    def start_recorder(self) -> subprocess.Popen:
-        return start_recorder(self.config, self.sounds, self.model, self.said)
-
-    def start_bridge(self) -> subprocess.Popen:
-        return start_bridge(self.config, self.said)
-
-    def close(self):
-        for process in (self.recorder, self.bridge):
-            process.kill()
-            process.wait()
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
 
 
 @pytest.fixture
-def home(tmp_path, broker, sounds):
-    home = Home(tmp_path, broker, sounds)
+def home(tmp_path):
+    home = LiveHome(tmp_path / "logs")
     yield home
     home.close()
 
 
-def test_a_broker_has_states_and_counts_after_random_kills_as_the_logs_have_them(
-    tmp_path, sounds
-):
-    ending = kill_at_random(tmp_path, sounds, "general", 22, 2, random.Random(3))
-    assert sum(topic.endswith("/last_heard") for topic in ending.expected) > 1
+@pytest.fixture
+def sounds():
+    """Real recordings, coughs among the first."""
+    clips = sorted(_CLIPS.glob("*/*.flac"))
+    random.Random(2).shuffle(clips)
+    return clips
+
+
+@pytest.mark.fast
+def test_events_since_midnight_are_counted_and_only_new_ones_are_told_of(home, broker):
+    for minutes_ago in (300, 299.9, 100):  # the second goes on with the first
+        home.heard("coughing", minutes_ago)
+    last = home.heard("coughing", 30, seconds=2.5)
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{COUGHING}/count_today", "3")
+        end = listener.wait_for(f"{COUGHING}/last_heard")
+        start = home.heard("coughing", 0.1)
+        listener.wait_for(f"{COUGHING}/count_today", "4")
+        event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
+        assert len(listener.payloads(f"{ROOT}/mic/event")) == 1
+        assert end.startswith(_clock(last + 2_500_000_000))
+    assert event.pop("start").startswith(_clock(start))
+    assert event.pop("end").startswith(_clock(start + 4 * NANOSECONDS))
+    assert event == {
+        "event_type": "coughing",
+        "id": f"mic-coughing-{start}",
+        "seconds": 4.0,
+        "confidence": 0.93,
+    }
+
+
+def _clock(nanoseconds):
+    from datetime import datetime  # noqa: PLC0415
+
+    moment = datetime.fromtimestamp(nanoseconds / NANOSECONDS, midday_zone())
+    return f"{moment:%Y-%m-%dT%H:%M:%S}"
+
+
+@pytest.mark.fast
+def test_a_class_is_on_while_it_is_heard_and_its_event_ends(home, broker):
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        home.hears("silence")
+        listener.wait_for(f"{COUGHING}/on", "OFF")
+        listener.wait_for(f"{ROOT}/mic/sound", "OFF")
+        home.hears("coughing")
+        listener.wait_for(f"{COUGHING}/on", "ON")
+        listener.wait_for(f"{ROOT}/mic/sound", "ON")
+        assert listener.values[f"{ROOT}/mic/class/speech/on"] == "OFF"
+        home.heard("coughing", 0.5, seconds=2)
+        home.hears("silence")
+        ended = json.loads(listener.wait_for(f"{ROOT}/mic/event_ended"))
+    assert ended["event_type"] == "coughing"
+
+
+@pytest.mark.fast
+def test_what_is_wrong_is_a_problem_of_the_microphone_that_it_is_about(tmp_path, broker):
+    home = LiveHome(tmp_path / "logs", ("kitchen", "bath"))
+    for microphone in ("kitchen", "bath"):
+        home.hears("silence", microphone)
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{ROOT}/bath/problem", '{"state": "OFF", "text": ""}')
+        home.says("bath", 1, "the microphone clips", level_dbfs="-12.5")
+        home.says("home disk", 2, "full")
+        both = '{"state": "ON", "text": "bath: the microphone clips; home disk: full"}'
+        listener.wait_for(f"{ROOT}/bath/problem", both)
+        listener.wait_for(f"{ROOT}/kitchen/problem", '{"state": "ON", "text": "home disk: full"}')
+        assert listener.values[f"{ROOT}/bath/level"] == "-12.5"
+        assert f"{ROOT}/kitchen/level" not in listener.values
+    home.close()
+
+
+@pytest.mark.fast
+def test_what_an_earlier_bridge_left_at_the_broker_is_cleared(home, broker):
+    left = {
+        f"{ROOT}/mic/class/barking/on": "ON",
+        f"{ROOT}/mic/class/barking/count_today": "7",
+        f"{ROOT}/attic/listening": "online",
+    }
+    home.hears("silence")
+    with Listener(broker.port) as listener:
+        for topic, value in left.items():
+            listener.publish(topic, value, retain=True)
+        with Bridged(home.folder, broker):
+            listener.wait_for(f"{ROOT}/attic/listening", "offline")
+            listener.wait_for(f"{ROOT}/mic/class/barking/on", "")
+            listener.wait_for(f"{ROOT}/mic/class/barking/count_today", "")
+            gone = ('"on_barking": {"p": "binary_sensor"}', '"trigger_barking"')
+            listener.wait_until(
+                lambda: all(part in listener.values.get(DISCOVERY, "") for part in gone)
+            )
+    assert not any("barking/" in topic for topic in settled_values(broker.port, seconds=0.3))
+
+
+@pytest.mark.fast
+def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{COUGHING}/on")
+        before = len(listener.payloads(DISCOVERY))
+        listener.publish("homeassistant/status", "online")
+        listener.wait_until(lambda: len(listener.payloads(DISCOVERY)) == before + 1)
+        listener.wait_until(lambda: listener.payloads(f"{COUGHING}/on")[-2:] == ["OFF", "OFF"])
+    with Listener(broker.port) as listener, Bridged(home.folder, broker, home_assistant=False):
+        home.heard("coughing", 0.1)
+        listener.wait_for(f"{ROOT}/mic/event")
+        assert len(listener.payloads(DISCOVERY)) == 1  # what the broker has from before
+
+
+@pytest.mark.fast
+def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
+    with (
+        Listener(broker.port) as listener,
+        Bridged(tmp_path / "logs", broker) as bridged,
+    ):
+        listener.wait_for(f"{ROOT}/bridge", "online")
+        home = LiveHome(tmp_path / "logs")
+        home.hears("silence")
+        listener.wait_for(f"{ROOT}/mic/listening", "online")
+    assert bridged.said == [f"{tmp_path}/logs: no such folder yet; waiting for a recorder"]
+    home.close()
+
+
+class _Failing:
+    def update(self, _news):
+        raise ZeroDivisionError("on purpose")
+
+    def close(self):
+        pass
+
+
+@pytest.mark.fast
+def test_an_output_that_fails_stops_no_other(home, broker):
+    home.hears("silence")
+    with (
+        Listener(broker.port) as listener,
+        Bridged(home.folder, broker, {"page": _Failing()}) as bridged,
+    ):
+        listener.wait_for(f"{ROOT}/mic/listening", "online")
+    assert set(bridged.said) == {"page: ZeroDivisionError: on purpose"}
+
+
+@pytest.mark.fast
+def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_who_says_so(home, broker):
+    start = home.heard("coughing", 20, seconds=3)
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
+        listener.wait_for(f"{COUGHING}/count_today", "1")
+        command = {"correct": f"mic-coughing-{start}", "label": "Kettle", "by": "Anna"}
+        listener.publish(f"{ROOT}/command", json.dumps(command))
+        answer = json.loads(listener.wait_for(f"{ROOT}/command/answer"))
+    assert answer == {"done": True, "text": f"mic-coughing-{start} was kettle, says Anna"}
+    (mark,) = read_marks(next(log for log in find_logs(home.folder) if "review" not in log.name))
+    assert mark[:5] == ("mic", start, start + 3 * NANOSECONDS, "kettle", "Anna")
+    assert mark.corrects == "live"
+
+
+@pytest.mark.fast
+def test_a_pause_that_comes_in_has_an_end_and_says_who_asked_for_it(home, broker):
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
+        listener.wait_for(f"{ROOT}/bridge", "online")
+        listener.publish(f"{ROOT}/command", '{"pause_minutes": 30, "by": "Anna"}')
+        assert "paused for 30 minutes by Anna" in listener.wait_for(f"{ROOT}/command/answer")
+        left = paused_until(home.folder) - time.time()
+        assert 1700 < left <= 1800
+        listener.publish(f"{ROOT}/command", '{"resume": true}')
+        listener.wait_for(f"{ROOT}/command/answer", '{"done": true, "text": "it listens again"}')
+    assert not (home.folder / ".pause").exists()
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        ("{", "command: Invalid JSON"),
+        ("[]", "command: Input should be an object"),
+        ("{}", "one of correct, pause_minutes and resume has to be there"),
+        ('{"resume": true, "pause_minutes": 3}', "one of correct, pause_minutes and resume"),
+        ('{"pause_minutes": 1e9}', "pause_minutes: Input should be less than or equal to"),
+        ('{"pause_minutes": 3, "for": 3}', "for: Extra inputs are not permitted"),
+        ('{"correct": "x"}', "correct and label belong together"),
+        ('{"correct": "x", "label": "../y"}', "'../y' cannot be the name of a class"),
+        ('{"correct": "x", "label": "kettle"}', "'x' is no event since last evening"),
+        ('{"resume": true, "by": "a\\u0000"}', "by: String should match pattern"),
+        (f'{{"by": "{"x" * 5000}"}}', "a command has 4096 bytes at most"),
+    ],
+)
+def test_a_command_that_makes_no_sense_is_answered_so(home, broker, command, problem):
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
+        listener.wait_for(f"{ROOT}/bridge", "online")
+        listener.publish(f"{ROOT}/command", command)
+        answer = json.loads(listener.wait_for(f"{ROOT}/command/answer"))
+    assert not answer["done"]
+    assert answer["text"].startswith(f"refused: {problem}")
+
+
+@pytest.mark.fast
+def test_commands_are_not_taken_unless_the_configuration_says_so(home, broker):
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{ROOT}/bridge", "online")
+        listener.publish(f"{ROOT}/command", '{"pause_minutes": 30}')
+        home.heard("coughing", 0.1)
+        listener.wait_for(f"{ROOT}/mic/event")
+        assert f"{ROOT}/command/answer" not in listener.values
+    assert not (home.folder / ".pause").exists()
+
+
+def test_a_broker_has_states_and_counts_after_random_kills_as_the_logs_have_them(tmp_path, sounds):
+    ending = kill_at_random(tmp_path, sounds, "general", 24, 2, random.Random(3))
+    assert any(topic.endswith("/last_heard") for topic in ending.expected)
     assert ending.wrong == [], ending.said
 
 
-def test_a_recorder_that_stops_and_a_bridge_that_is_killed_are_said_to_be_away(home, broker):
+def test_a_recorder_and_a_bridge_that_end_are_said_to_be_away(tmp_path, broker, sounds):
+    config, said = tmp_path / "home.toml", tmp_path / "said"
+    config.write_text(
+        f'output = "{tmp_path}/logs"\ntimezone = "{ZONE}"\n'
+        f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+    )
+    recorder = start_recorder(config, sounds, "general", said)
+    bridge = start_bridge(config, said)
     with Listener(broker.port) as listener:
         listener.wait_for(f"{ROOT}/mic/listening", "online")
         listener.wait_for(f"{ROOT}/recorder", "online")
-        home.recorder.terminate()
+        recorder.terminate()
+        recorder.wait()
         listener.wait_for(f"{ROOT}/mic/listening", "offline")
         listener.wait_for(f"{ROOT}/recorder", "offline")
-        home.recorder = home.start_recorder()
+        recorder = start_recorder(config, sounds, "general", said)
         listener.wait_for(f"{ROOT}/mic/listening", "online")
-        home.bridge.kill()
+        bridge.send_signal(signal.SIGSTOP)  # for longer than a recorder may be silent
+        time.sleep(17)
+        bridge.send_signal(signal.SIGCONT)
+        seen = len(listener.messages)
+        listener.wait_until(lambda: f"{ROOT}/mic/heard" in _topics(listener, seen))
+        assert f"{ROOT}/mic/listening" not in _topics(listener, seen)
+        bridge.kill()
+        bridge.wait()
         listener.wait_for(f"{ROOT}/bridge", "offline")
+    recorder.kill()
+    recorder.wait()
 
 
-def test_a_bridge_that_was_stopped_for_long_does_not_say_that_the_recorder_was_away(home, broker):
-    with Listener(broker.port) as listener:
-        listener.wait_for(f"{ROOT}/mic/listening", "online")
-        home.bridge.send_signal(signal.SIGSTOP)
-        listener.wait_until(lambda: False) if False else None
-        _wait(17)
-        home.bridge.send_signal(signal.SIGCONT)
-        listener.wait_until(lambda: "online" in listener.payloads(f"{ROOT}/bridge"))
-        _wait(1)
-        assert "offline" not in listener.payloads(f"{ROOT}/mic/listening")
+def _topics(listener, first):
+    return {topic for _, topic, _, _ in listener.messages[first:]}
 
 
-def _wait(seconds):
-    from threading import Event  # noqa: PLC0415
-
-    Event().wait(seconds)
+def test_the_classes_of_a_log_are_told_of_before_one_of_them_is_heard(home, broker):
+    home.hears("silence")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
+        listener.wait_for(f"{COUGHING}/on")
+        topics = [topic for _, topic, _, _ in listener.messages]
+        config = json.loads(listener.values[DISCOVERY])
+    assert topics.index(DISCOVERY) < topics.index(f"{COUGHING}/on")
+    assert config["components"]["event"]["event_types"] == [c for c in GENERAL if c != "silence"]

@@ -1,13 +1,13 @@
 """What people say of an event becomes marks in the review layers of its logs."""
 
 import time
+from itertools import pairwise
 from pathlib import Path
 
 from hearthlog.analyzer.bridge.errors import BridgeError
 from hearthlog.analyzer.bridge.event_record import Event
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, log_name
 from hearthlog.schemas.mcap.statistics import time_span
@@ -48,8 +48,8 @@ def correct_event(folder: Path, node: str, event: Event, label: str, reviewer: s
         spans = _segments(list(logs), event)
         made = time.time_ns()
         layers = []
-        for log, (first, last) in logs.items():
-            pieces = ((max(a, first), min(b, last)) for a, b in spans)
+        for log, (first, end) in logs.items():
+            pieces = ((max(a, first), min(b, end)) for a, b in spans)
             marks = [
                 Mark(event.microphone, a, b, label, reviewer, made, LIVE)
                 for a, b in pieces
@@ -65,19 +65,19 @@ def correct_event(folder: Path, node: str, event: Event, label: str, reviewer: s
 
 
 def _logs_of(folder: Path, node: str, event: Event) -> dict[Path, tuple[int, int]]:
-    """Return the logs of the time of an event, and when each begins and ends."""
-    spans = {}
+    """Return the logs of the time of an event, and which part of that time each has."""
+    begins = {}
     for log in reversed(find_logs(folder)):
         name = log_name(log)
-        if name.node != node or name.layer:
-            continue
-        span = time_span(log)
+        span = time_span(log) if name.node == node and not name.layer else None
         if span is None or span[0] > event.end:
             continue
         if span[1] < event.start:
             break
-        spans[log] = (span[0], span[1] + FRAME_NANOSECONDS)
-    return dict(sorted(spans.items()))
+        begins[log] = span[0]
+    logs = sorted(begins)
+    edges = [event.start, *(begins[log] for log in logs[1:]), event.end]
+    return dict(zip(logs, pairwise(edges), strict=True)) if logs else {}
 
 
 def _segments(logs: list[Path], event: Event) -> list[tuple[int, int]]:

@@ -87,9 +87,7 @@ def _check_node(home: "HomeLogs", node: str) -> None:
         raise DataError(f"no logs of the recorder {node!r} (node in the configuration); {there}")
 
 
-def _span(
-    home: "HomeLogs", node: str, first: int | None, last: int | None
-) -> tuple[int, int]:
+def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> tuple[int, int]:
     """Return the span that is asked for, within what the logs have."""
     from hearthlog.analyzer.bridge.alerts.read_logs import span_of
 
@@ -97,7 +95,8 @@ def _span(
     first = begin if first is None else first
     last = until if last is None else last
     if first >= last or first >= until or last <= begin:
-        wrong_use(f"the logs are of {_utc(begin)} to {_utc(until)}; --start and --end leave nothing")
+        there = f"{_utc(begin)} to {_utc(until)}"
+        wrong_use(f"the logs are of {there}; --start and --end leave nothing")
     return first, last
 
 
@@ -145,9 +144,7 @@ def _unknown(rings: "Sequence[Ring]") -> int:
     return sum(not ring.is_known for ring in rings)
 
 
-def _as_json(
-    found: "dict[str, list[Ring]]", span: tuple[int, int], zone: tzinfo
-) -> dict[str, Any]:
+def _as_json(found: "dict[str, list[Ring]]", span: tuple[int, int], zone: tzinfo) -> dict[str, Any]:
     from hearthlog.analyzer.bridge.day import iso_time
 
     return {

@@ -69,14 +69,16 @@ class Delivery:
         first, longest = self._pauses
         pause = first
         while not self._stop.wait(_LOOK_SECONDS):
-            if self._tell(target):
+            told, failed = self._tell(target)
+            if told:
                 pause = first
-                continue
-            self._stop.wait(pause)
-            pause = min(2 * pause, longest)
+            if failed:
+                self._stop.wait(pause)
+                pause = min(2 * pause, longest)
 
-    def _tell(self, target: Target) -> bool:
-        """Tell a target of all that waits for it; False if it could not be told."""
+    def _tell(self, target: Target) -> tuple[int, bool]:
+        """Tell a target of all that waits for it; return of how much, and whether it failed."""
+        told = 0
         for ring in self._outbox.waiting_for(target.name, time.time_ns()):
             if self._stop.is_set():
                 break
@@ -89,9 +91,10 @@ class Delivery:
                     f"{target.place}: an alert could not be told ({reason}); it is kept, and tried "
                     "again, a quarter of an hour apart at most"
                 )
-                return False
+                return told, True
             self._outbox.note_told(target.name, ring)
-        return True
+            told += 1
+        return told, False
 
 
 def message(ring: Ring, zone: tzinfo, now: int | None = None) -> str:

@@ -54,7 +54,7 @@ class _Rule(BaseModel):
     name: str = Field(
         min_length=1, max_length=60, pattern=r"^[^\x00-\x1f\x7f]+$", description="Shown; unique."
     )
-    cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")  # type: ignore[assignment]
+    cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")
     quiet_hours: list[_Hours] = Field(
         default=[], description='When a ring waits until they end, as ["22:00-06:30"].'
     )
@@ -137,14 +137,14 @@ class LongerThan(_SoundRule):
 
     rule: Literal["longer_than"]
     longer_than: Window
-    pause: Pause = Field(default="10s", validate_default=True, description="That ends a sound.")  # type: ignore[assignment]
+    pause: Pause = Field(default="10s", validate_default=True, description="That ends a sound.")
 
 
 class RecorderSilent(_Rule):
     """Nothing from the recorder for a time, not even what it says of its health."""
 
     rule: Literal["recorder_silent"]
-    silent_for: Window = Field(default="10m", validate_default=True)  # type: ignore[assignment]
+    silent_for: Window = Field(default="10m", validate_default=True)
 
 
 class UnlikeUsual(_SoundRule):
@@ -159,7 +159,7 @@ class UnlikeUsual(_SoundRule):
     margin: float = Field(
         default=0.25, ge=0.0, le=10.0, description="Share beyond the highest and the lowest."
     )
-    at: TimeOfDay = Field(default="08:00", validate_default=True)  # type: ignore[assignment]
+    at: TimeOfDay = Field(default="08:00", validate_default=True)
     least_share: float = Field(
         default=0.75, gt=0.0, le=1.0, description="That has to be heard for it to be compared."
     )

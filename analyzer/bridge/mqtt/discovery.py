@@ -1,5 +1,7 @@
 """What Home Assistant is told of a microphone: its device, and everything that it shows of it."""
 
+import json
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,12 +9,10 @@ from hearthlog._version import __version__
 from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
-_AGE = 60  # seconds after which what was not said again is unknown
-
 
 def device_id(node: str, microphone: str) -> str:
-    """Return what names the device of a microphone in Home Assistant."""
-    return f"hearthlog_{identifier(node)}_{microphone}"
+    """Return what names the device of a microphone in Home Assistant: no other has this name."""
+    return f"hearthlog-{identifier(node)}-{microphone}"
 
 
 def discovery(
@@ -37,12 +37,12 @@ def discovery(
     own = device_id(topics.node, microphone)
     sounds = [name for name in classes if name != SILENCE]
     components = _of_microphone(topics, microphone, sounds)
-    for name in sounds:
-        components |= _of_class(topics, microphone, name)
+    for name, words in _words(sounds).items():
+        components |= _of_class(topics, microphone, name, words)
     for key, component in components.items():
-        component["unique_id"] = f"{own}_{key}"
+        component["unique_id"] = f"{own}-{key}"
     for name in gone:
-        removed = _of_class(topics, microphone, name)
+        removed = _of_class(topics, microphone, name, name)
         components |= {key: {"p": component["p"]} for key, component in removed.items()}
     return {
         "device": {
@@ -76,8 +76,7 @@ def _of_microphone(
             "device_class": "enum",
             "options": [SILENCE, *sounds],
             "state_topic": at("heard"),
-            "value_template": "{{ value_json.label }}",
-            "json_attributes_topic": at("heard"),
+            "value_template": "{{ value_json.label }}",  # not its confidence, kept at each change
             "icon": "mdi:ear-hearing",
         },
         "sound": {
@@ -93,7 +92,6 @@ def _of_microphone(
             "state_class": "measurement",
             "state_topic": at("level"),
             "suggested_display_precision": 0,
-            "expire_after": _AGE,
             "icon": "mdi:volume-high",
         },
         "event": {
@@ -136,8 +134,15 @@ def _of_microphone(
     }
 
 
-def _of_class(topics: Topics, microphone: str, name: str) -> dict[str, dict[str, Any]]:
-    words, key = in_words(name), identifier(name)
+def _words(names: Sequence[str]) -> dict[str, str]:
+    """Return what people call classes; Home Assistant refuses two triggers of one name."""
+    words = {name: in_words(name) for name in names}
+    times = Counter(words.values())
+    return {name: said if times[said] == 1 else f"{said} ({name})" for name, said in words.items()}
+
+
+def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[str, dict[str, Any]]:
+    key = identifier(name)
 
     def at(kind: str) -> str:
         return topics.of_class(microphone, name, kind)
@@ -173,6 +178,11 @@ def _of_class(topics: Topics, microphone: str, name: str) -> dict[str, dict[str,
             "value_template": "{{ value_json.event_type }}",
             "type": "heard",
             "subtype": words,
-            "payload": name,
+            "payload": _untemplated(name),
         },
     }
+
+
+def _untemplated(text: str) -> str:
+    """Write a text so that Home Assistant, which fills in templates, takes it as it is."""
+    return "{{ " + json.dumps(text, ensure_ascii=False) + " }}" if "{" in text else text

@@ -62,10 +62,12 @@ class Topics(NamedTuple):
 
 
 def identifier(text: str) -> str:
-    """Make a text part of an identifier: other characters than `a-z0-9` become `_2b_`.
+    """Make a text part of an identifier, which no other text gives.
 
     Parameters
     ----------
     text : str
+        Other characters than `a-z0-9_` become `_2b_`, and so does a `_` that could be read so.
     """
-    return re.sub(r"[^a-z0-9_]", lambda match: f"_{ord(match[0]):x}_", text)
+    escaped = r"[^a-z0-9_]|_(?=[0-9a-f]+[^a-z0-9])"
+    return re.sub(escaped, lambda match: f"_{ord(match[0]):x}_", text)

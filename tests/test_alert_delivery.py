@@ -1,0 +1,280 @@
+"""Rings wait on the disk until everybody was told of them, whatever happens."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from datetime import UTC
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from hearthlog.analyzer.bridge.alerts.delivery import Delivery, message
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.ring import Ring
+from hearthlog.analyzer.bridge.alerts.targets import read_targets
+from hearthlog.analyzer.bridge.errors import BridgeError
+
+# Apprise asks for it where there is one.
+pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
+SECOND = 1_000_000_000
+WAIT = 30  # seconds, for what comes at once
+
+
+def ring(number, due=0):
+    return Ring("coughs", number * SECOND, f"alert {number}", is_known=True, due=due)
+
+
+def wait_for(condition):
+    until = time.monotonic() + WAIT
+    while not condition():
+        assert time.monotonic() < until, "waited for nothing"
+        time.sleep(0.02)
+
+
+@contextmanager
+def server(port=0):
+    """A server that takes what is posted to it; yields its port and the texts."""
+    texts = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self):
+            length = int(self.headers["Content-Length"])
+            texts.append(json.loads(self.rfile.read(length))["message"])
+            self.send_response(200)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    class Server(ThreadingHTTPServer):
+        daemon_threads = True
+        block_on_close = False
+
+    with Server(("127.0.0.1", port), Handler) as own:
+        threading.Thread(target=own.serve_forever, daemon=True).start()
+        yield own.server_port, texts
+        own.shutdown()
+
+
+def addresses(folder, *lines):
+    file = folder / "urls"
+    file.write_text("\n".join(["# secret", *lines]))
+    file.chmod(0o600)
+    return file
+
+
+def free_port():
+    with socket.socket() as own:
+        own.bind(("127.0.0.1", 0))
+        return own.getsockname()[1]
+
+
+def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):
+    outbox = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
+    outbox.put([ring(1), ring(2, due=9), ring(1)])
+    assert outbox.waiting_for("a", 8) == [ring(1)]
+    outbox.note_told("a", ring(1))
+    again = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
+    assert again.waiting_for("a", 10) == [ring(2, due=9)]
+    assert again.waiting_for("b", 10) == [ring(1), ring(2, due=9)]
+    again.note_told("b", ring(1))
+    assert [path.name for path in (tmp_path / "box").iterdir()] == [f"{ring(2).id}.json"]
+    # Told meanwhile; evaluated once more, for the bridge had no time to remember.
+    again.put([ring(1)])
+    assert len(again) == 1
+
+
+def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
+    said = []
+    outbox = Outbox(tmp_path, ["a"], said.append, most=3)
+    outbox.put(ring(number) for number in range(1, 6))
+    assert [each.time // SECOND for each in outbox.waiting_for("a", 1)] == [3, 4, 5]
+    assert len(list(tmp_path.iterdir())) == 3
+    assert said == [
+        (
+            f"{tmp_path}: 3 alerts wait to be told, and the oldest are dropped; see above which "
+            "target cannot be reached, and mend it, or take it out of urls_file"
+        )
+    ]
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"rule": 1}', "\0" * 9, "[" * 100_000])
+def test_a_file_that_is_no_ring_is_named_and_left_alone(content, tmp_path):
+    (tmp_path / "1-x.json").write_text(content)
+    said = []
+    outbox = Outbox(tmp_path, ["a"], said.append)
+    assert len(outbox) == 0
+    assert said == [f"{tmp_path}/1-x.json: no alert that was kept here; remove it"]
+
+
+def test_a_folder_that_takes_nothing_is_said_and_the_ring_told_all_the_same(tmp_path):
+    said = []
+    outbox = Outbox(tmp_path / "box", ["a"], said.append)
+    (tmp_path / "box").rmdir()
+    outbox.put([ring(1)])
+    assert outbox.waiting_for("a", 1) == [ring(1)]
+    assert len(said) == 1
+    assert "until it can, alerts are only kept in memory" in said[0]
+
+
+def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
+    port, said = free_port(), []
+    targets = read_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), said.append)
+    outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+    outbox.put([ring(1), ring(2)])
+    delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=0.01)
+    try:
+        wait_for(lambda: len(said) > 1)
+        with server(port) as (_, texts):
+            wait_for(lambda: not len(outbox))
+            assert [text[-7:] for text in [t.removesuffix(" (told late)") for t in texts]] == [
+                "alert 1",
+                "alert 2",
+            ]
+    finally:
+        delivery.close()
+    assert len(set(said)) == 1
+    assert said[0].startswith(f"json://127.0.0.1:{port}/: an alert could not be told (")
+    assert not list((tmp_path / "box").iterdir())
+
+
+def test_a_target_that_never_answers_holds_up_neither_the_others_nor_the_end(tmp_path):
+    said = []
+    with socket.socket() as mute, server() as (port, texts):
+        mute.bind(("127.0.0.1", 0))
+        mute.listen()
+        dead = f"json://127.0.0.1:{mute.getsockname()[1]}?cto=1&rto=1"
+        targets = read_targets(addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), said.append)
+        outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+        outbox.put([ring(1)])
+        delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=60.0)
+        wait_for(lambda: texts)
+        wait_for(lambda: said)
+        delivery.close()
+    assert len(texts) == 1
+    assert outbox.waiting_for(targets[0].name, 1) == [ring(1)]
+    assert outbox.waiting_for(targets[1].name, 1) == []
+
+
+def test_the_pauses_after_a_failure_grow_to_a_quarter_of_an_hour_and_begin_anew(tmp_path):
+    answers = ["down"] * 9 + [""] + ["down"] * 2
+
+    class Failing:
+        name = place = "a"
+
+        def deliver(self, *_):
+            return answers.pop(0)
+
+    waits = []
+
+    class Stop:
+        def wait(self, seconds):
+            waits.append(seconds)
+            return not answers
+
+        def is_set(self):
+            return False
+
+    outbox = Outbox(tmp_path, ["a"], pytest.fail)
+    outbox.put([ring(1), ring(2)])
+    delivery = Delivery(outbox, [], "home", UTC, lambda _: None)
+    delivery._stop = Stop()
+    delivery._run(Failing())
+    pauses = [seconds for seconds in waits if seconds != 0.5]
+    assert pauses == [5, 10, 20, 40, 80, 160, 320, 640, 900, 5, 10]
+
+
+def test_a_ring_is_told_with_its_time_and_late_as_late():
+    late = Ring("it", 1_772_348_400 * SECOND, "None", is_known=True, due=1_772_348_400 * SECOND)
+    assert message(late, UTC, late.due + SECOND) == "2026-03-01 07:00: None"
+    assert message(late, UTC, late.due + 3600 * SECOND) == "2026-03-01 07:00: None (told late)"
+    waited = late._replace(due=late.due + 3600 * SECOND)
+    assert message(waited, UTC, waited.due + SECOND) == "2026-03-01 07:00: None"
+
+
+def test_a_line_that_is_no_address_is_named_by_its_number_and_not_told(tmp_path):
+    file = addresses(tmp_path, "json://127.0.0.1", "", "nosuch://user:hush@there")
+    with pytest.raises(BridgeError) as error:
+        read_targets(file, pytest.fail)
+    assert str(error.value).startswith(f"{file}, line 4: no address that Apprise knows")
+    assert "hush" not in str(error.value)
+
+
+def test_a_file_without_an_address_and_one_that_is_not_there_are_refused(tmp_path):
+    with pytest.raises(BridgeError, match="no address in it"):
+        read_targets(addresses(tmp_path), pytest.fail)
+    with pytest.raises(BridgeError, match="no such file of addresses"):
+        read_targets(tmp_path / "none", pytest.fail)
+
+
+def test_a_file_of_secrets_that_everybody_may_read_is_said(tmp_path):
+    said = []
+    file = addresses(tmp_path, "json://127.0.0.1")
+    file.chmod(0o644)
+    (target,) = read_targets(file, said.append)
+    assert said == [
+        f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}"
+    ]
+    assert target.place == "json://127.0.0.1/"
+
+
+def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
+    said = []
+    file = addresses(tmp_path, f"json://user:hush@127.0.0.1:{free_port()}")
+    targets = read_targets(file, said.append)
+    outbox = Outbox(tmp_path / "box", ["x", *(each.name for each in targets)], said.append)
+    outbox.put([ring(1)])
+    delivery = Delivery(outbox, targets, "home", UTC, said.append)
+    wait_for(lambda: said)
+    delivery.close()
+    outbox.note_told(targets[0].name, ring(1))
+    (kept,) = (tmp_path / "box").iterdir()
+    assert "hush" not in kept.read_text() + "".join(said)
+
+
+DELIVERING = """
+import sys, time
+from datetime import UTC
+from pathlib import Path
+from hearthlog.analyzer.bridge.alerts.delivery import Delivery
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.ring import Ring
+from hearthlog.analyzer.bridge.alerts.targets import read_targets
+folder = Path(sys.argv[1])
+targets = read_targets(folder / "urls", print)
+outbox = Outbox(folder / "box", [each.name for each in targets], print)
+outbox.put(Ring("coughs", n, f"alert {n}", True, 0) for n in map(int, sys.argv[2:]))
+print("kept", flush=True)
+delivery = Delivery(outbox, targets, "home", UTC, print, first_pause=0.01)
+while len(outbox):
+    time.sleep(0.01)
+"""
+
+
+def test_a_bridge_that_is_killed_again_and_again_tells_of_every_ring(tmp_path):
+    """At most the one that was under way at a kill is told twice."""
+    kills = 4
+    with server() as (port, texts):
+        addresses(tmp_path, f"json://127.0.0.1:{port}")
+        everything = range(1, 121)
+        for start in range(kills + 1):
+            new = everything if start == 0 else ()
+            command = [sys.executable, "-c", DELIVERING, tmp_path, *map(str, new)]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            assert process.stdout.readline() == "kept\n"
+            if start < kills:
+                told = len(texts)
+                wait_for(lambda told=told: len(texts) >= told + 5)
+                process.send_signal(signal.SIGKILL)
+            process.communicate(timeout=WAIT)
+            assert process.returncode == (-signal.SIGKILL if start < kills else 0)
+        numbers = [int(text.removesuffix(" (told late)").rpartition(" ")[2]) for text in texts]
+    assert set(numbers) == set(everything)
+    assert len(numbers) <= len(everything) + kills
+    assert not list((tmp_path / "box").glob("*.json"))

@@ -1,0 +1,358 @@
+"""Alerts while a log is written: the same as on replay, and told once, also after a restart."""
+
+import json
+import shutil
+import time
+from contextlib import contextmanager
+from datetime import UTC, date
+from threading import Event, Thread
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import HOUR, midnight, write_day
+from pydantic import TypeAdapter
+
+from hearthlog.analyzer.bridge.alerts.evaluate import rings
+from hearthlog.analyzer.bridge.alerts.live_home import LiveHome
+from hearthlog.analyzer.bridge.alerts.memory import Memory
+from hearthlog.analyzer.bridge.alerts.open_run import Label
+from hearthlog.analyzer.bridge.alerts.outbox import Outbox
+from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
+from hearthlog.analyzer.bridge.alerts.read_logs import read_heard
+from hearthlog.analyzer.bridge.alerts.ring import RuleState
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule
+from hearthlog.analyzer.bridge.alerts.settings import DeliverySettings
+from hearthlog.analyzer.bridge.alerts.watch import RuleWatch
+from hearthlog.analyzer.bridge.errors import BridgeError
+from hearthlog.analyzer.bridge.home import Home
+from hearthlog.analyzer.bridge.run import Bridge
+from hearthlog.analyzer.bridge.state_folder import state_folder
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.models.features.auros21.names import FEATURE_NAMES
+from hearthlog.schemas.logs.columns import read_columns
+from hearthlog.schemas.logs.files import find_logs, log_path
+from hearthlog.schemas.logs.log_stream import TopicBatch
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages.topics import topics_of
+
+SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+CLASSES = ["silence", "speech", "coughing", "tap_water"]
+DAY = date(2026, 3, 2)
+
+
+def rule(kind, name="it", **keys):
+    return TypeAdapter(AlertRule).validate_python({"name": name, "rule": kind, **keys})
+
+
+COUGHS = rule("more_than", "coughs", count=2, window="1h", **{"class": "coughing"})
+WATER = rule("longer_than", "water", longer_than="10m", **{"class": "tap_water"})
+QUIET = rule("none_by", "quiet", since="01:00", by="03:00", **{"class": "speech"})
+DEAF = rule("none_by", "deaf", since="03:00", by="04:30", **{"class": "speech"})
+SPEECH = rule("more_than", "speech", minutes=8, window="20m", cooldown="10m", **{"class": "speech"})
+
+
+def labels_of(columns):
+    """What each second of the day is labelled as, as far as it was heard."""
+    labels = {}
+    fields = (columns[name].tolist() for name in ("header.stamp", "duration", "label"))
+    for start, duration, label in zip(*fields, strict=True):
+        labels |= dict.fromkeys(range(start // SECOND, (start + duration) // SECOND), label)
+    return labels
+
+
+def test_what_is_followed_live_rings_as_on_replay(tmp_path):
+    """Long sounds have no segment yet when they ring, nor has a long silence when it is judged."""
+    rng = np.random.default_rng(4)
+    events = [(second, 2.0, "coughing", 0.9) for second in rng.uniform(0, 5 * HOUR, 30)]
+    events += [(600.0 + 3600 * n, 1500.0, "tap_water", 0.9) for n in range(2)]
+    events += [(16_300.0, 700.0, "speech", 0.8), (17_100.0, 700.0, "speech", 0.8)]
+    about = {"classes": CLASSES, "hours": range(6), "gaps": [(11_000, 4000, "unplugged")]}
+    write_day(tmp_path / "logs", DAY, events, **about)
+    begin = midnight(DAY)
+    (columns,) = read_columns(find_logs(tmp_path), ["/mic/segment"]).values()
+    gaps = read_columns(find_logs(tmp_path), ["/mic/gap"])["/mic/gap"]
+    labels = labels_of(columns)
+    rules = [COUGHS, WATER, QUIET, DEAF, SPEECH]
+    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
+    memory = Memory(tmp_path / "rules.json", pytest.fail)
+    watch = RuleWatch(rules, UTC, outbox, memory, pytest.fail, begin + MINUTE)
+    live, now, found, until = LiveHome(begin, 30 * SECOND), begin + MINUTE, [], 0
+    edge = begin
+    while now < begin + 5.5 * HOUR * SECOND:
+        live.push([columns.between(edge, now), gaps.between(edge, now)])
+        for second in range(edge // SECOND, now // SECOND):
+            if second in labels:
+                live.add_label("mic", Label(second * SECOND, labels[second], 0.9), CLASSES)
+        until = live.known_until(now)
+        found += watch.evaluate(live.heard, pytest.fail, until, now)
+        live.forget_before(watch.needed_from(now))
+        edge, now = now, now + int(rng.integers(1, 40)) * SECOND
+    heard = read_heard(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
+    expected = [rings(one, heard, begin + MINUTE, until, UTC)[0] for one in rules]
+    assert sorted(found) == sorted(ring for own in expected for ring in own)
+    assert [len(own) > 0 for own in expected] == [True] * 5
+    assert [ring.is_known for own in expected[2:4] for ring in own] == [True, False]
+    assert outbox.waiting_for("x", 1 << 62) == sorted(found, key=lambda ring: ring.time)
+
+
+def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
+    tmp_path,
+):
+    events = [(HOUR + 60.0 * n, 2.0, "coughing", 0.9) for n in range(3)]
+    write_day(tmp_path / "logs", DAY, events, classes=CLASSES)
+    begin = midnight(DAY)
+    heard = read_heard(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
+    for down_hours, expected in ((20, 1), (30, 0)):
+        folder = tmp_path / str(down_hours)
+        outbox = Outbox(folder / "box", ["x"], pytest.fail)
+        memory = Memory(folder / "rules.json", pytest.fail)
+
+        def start(now, memory=memory, outbox=outbox):
+            return RuleWatch([COUGHS], UTC, outbox, memory, pytest.fail, now)
+
+        start(begin).save(begin)
+        now = begin + down_hours * HOUR * SECOND
+        for _ in range(2):  # the second bridge is killed before it has remembered, the third not
+            shutil.copy(folder / "rules.json", folder / "before")
+            assert len(start(now).evaluate(lambda: heard, pytest.fail, now, now)) == expected
+            shutil.copy(folder / "before", folder / "rules.json")
+        assert len(outbox) == expected
+        start(now).evaluate(lambda: heard, pytest.fail, now, now)
+        start(now).save(now)
+        assert start(now).evaluate(lambda: heard, pytest.fail, now + SECOND, now + SECOND) == []
+
+
+def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
+    said = []
+    path = tmp_path / "rules.json"
+    memory = Memory(path, said.append)
+    progress = memory.load([COUGHS])
+    progress["coughs"].until, progress["coughs"].state = 7, RuleState(5, has_rung=True)
+    memory.save([COUGHS], progress)
+    assert memory.load([COUGHS])["coughs"].state == RuleState(5, has_rung=True)
+    changed = COUGHS.model_copy(update={"count": 3})
+    assert memory.load([changed])["coughs"].until == 0
+    assert said == []
+    path.write_text('{"x": 3}')
+    assert memory.load([COUGHS])["coughs"].until == 0
+    assert said == [f"{path}: cannot be read; all rules begin anew"]
+
+
+def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
+    said = []
+    memory = Memory(tmp_path / "rules.json", said.append)
+    progress = memory.load([COUGHS])
+    progress["coughs"].until = 9 * HOUR * SECOND
+    memory.save([COUGHS], progress)
+    outbox = Outbox(tmp_path / "box", ["x"], said.append)
+    watch = RuleWatch([COUGHS], UTC, outbox, memory, said.append, HOUR * SECOND)
+    assert watch.start < HOUR * SECOND
+    assert said == ["coughs: was evaluated up to a time to come; did the clock run ahead?"]
+
+
+class Recorder(Thread):
+    """Writes a log up to now, and on: silence, three coughs, then water of which is no segment."""
+
+    def __init__(self, root):
+        super().__init__(daemon=True)
+        now = time.time_ns() // SECOND * SECOND
+        self.stop, self.water = Event(), now - 15 * MINUTE
+        topics = topics_of("mic", FEATURE_NAMES, CLASSES)
+        path = log_path(root, "home", now - HOUR * SECOND)
+        self.writer = LogWriter(path, topics, {"node": "home"})
+        rows = [(now - HOUR * SECOND, "silence")]
+        for cough in range(3):
+            start = now - (40 - cough) * MINUTE
+            rows += [(start, "coughing"), (start + 2 * SECOND, "silence")]
+        starts = np.array([start for start, _ in rows])
+        ends = np.append(starts[1:], self.water)
+        fields = {
+            "header.stamp": starts,
+            "header.frame_id": "mic",
+            "duration": ends - starts,
+            "label": [label for _, label in rows],
+            "confidence": np.full(len(rows), 0.9, np.float32),
+        }
+        self.writer.write_columns([TopicBatch("/mic/segment", ends, fields)])
+        self.writer.flush()
+        self.start()
+
+    def run(self):
+        while not self.stop.is_set():
+            times = np.array([time.time_ns()])
+            fields = {
+                "header.stamp": times,
+                "header.frame_id": "mic",
+                "frame": times,
+                "label": ["tap_water"],
+                "confidence": np.array([0.9], np.float32),
+                "novelty": np.zeros(1, np.float32),
+                "probabilities": np.zeros((1, len(CLASSES)), np.float32),
+            }
+            self.writer.write_columns([TopicBatch("/mic/label", times, fields)])
+            self.writer.flush()
+            self.stop.wait(0.1)
+        self.writer.finish()
+
+
+@contextmanager
+def bridge(root, rules, told, said):
+    """A bridge that tells of rings of some rules."""
+    home, stop = Home(root / "logs", "home", ZoneInfo("Europe/Vienna")), Event()
+
+    def tell(*ring):
+        told.append(ring)
+
+    own = AlertsOutput(rules, DeliverySettings(), home, root / "state", said.append, tell)
+    running = Bridge(home, time.time_ns() - HOUR * SECOND, {"alerts": own}, said.append)
+    thread = Thread(target=running.run, args=(stop,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(30)
+
+
+def wait_for(condition):
+    until = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < until, "waited for nothing"
+        time.sleep(0.05)
+
+
+def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tmp_path):
+    told, said = [], []
+    recorder = Recorder(tmp_path / "logs")
+    try:
+        with bridge(tmp_path, [COUGHS, WATER], told, said):
+            wait_for(lambda: len(told) == 2)
+        assert {name for name, _, _ in told} == {"coughs", "water"}
+        texts = {name: text for name, text, _ in told}
+        assert "Coughing: 3 times in the last 1 h, more than 2" in texts["coughs"]
+        assert "Water tap for longer than 10 min, since " in texts["water"]
+        assert not list((tmp_path / "state" / "alerts" / "outbox").iterdir())
+        other = rule("recorder_silent", "other")
+        late = COUGHS.model_copy(update={"name": "late"})
+        with bridge(tmp_path, [COUGHS, WATER, other, late], told, said):
+            wait_for(lambda: len(told) > 2)
+        assert [name for name, _, _ in told[2:]] == ["late"]
+    finally:
+        recorder.stop.set()
+        recorder.join()
+    assert said == []
+
+
+def test_rules_of_which_nobody_would_be_told_are_refused(tmp_path):
+    home = Home(tmp_path, "home", UTC)
+    with pytest.raises(BridgeError, match="nobody would be told; name urls_file in"):
+        AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail)
+
+
+def test_the_state_is_where_it_is_configured_or_where_systemd_says_or_beside_the_logs(
+    tmp_path, monkeypatch
+):
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert state_folder(None, tmp_path / "logs") == tmp_path / "bridge"
+    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path}/a:{tmp_path}/b")
+    assert state_folder(None, tmp_path / "logs") == tmp_path / "a"
+    assert state_folder(tmp_path / "c" / "d", tmp_path / "logs").is_dir()
+    (tmp_path / "file").touch()
+    with pytest.raises(BridgeError, match=r"cannot be made \(.+\); name another one"):
+        state_folder(tmp_path / "file" / "d", tmp_path)
+
+
+CONFIG = """
+[[bridge.alert]]
+name = "coughs"
+rule = "more_than"
+class = "coughing"
+count = 2
+window = "1h"
+quiet_hours = ["22:00-06:30"]
+
+[[bridge.alert]]
+name = "no speech"
+rule = "none_by"
+class = "speech"
+since = "00:30"
+by = "03:30"
+"""
+
+
+@pytest.fixture(scope="module")
+def two_days(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("alerts")
+    (folder / "home.toml").write_text(CONFIG)
+    events = [(HOUR + 60.0 * n, 2.0, "coughing", 0.9) for n in range(3)]
+    about = {"classes": CLASSES, "timezone": "Europe/Vienna"}
+    write_day(folder / "logs", DAY, events, **about)
+    hours = range(2, 24)
+    write_day(folder / "logs", DAY.replace(day=3), hours=hours, **about)
+    return folder
+
+
+def test_a_replay_prints_each_ring_and_how_often_each_rule_rings(two_days, hearthlog):
+    done = hearthlog("alerts", "replay", two_days / "logs", "--config", two_days / "home.toml")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        (
+            "2026-03-02 02:02  coughs: Coughing: 3 times in the last 1 h, more than 2 "
+            "(told at 2026-03-02 06:30)"
+        ),
+        "2026-03-02 03:30  no speech: Talking: none from 00:30 to 03:30",
+        (
+            "2026-03-03 03:30  no speech: Talking from 00:30 to 03:30: not known, for only 33 % "
+            "of that time was heard"
+        ),
+        "",
+        "name       rule       rings  a week  not known",
+        "coughs     more_than      1     3.6          0",
+        "no speech  none_by        2     7.1          1",
+        "2 days, 2026-03-02 02:00 to 2026-03-04 00:59, Europe/Vienna",
+    ]
+
+
+def test_a_replay_as_json_is_of_the_span_that_is_asked_for(two_days, hearthlog):
+    options = ["--start", "2026-03-02T12:00", "--json", "--config", two_days / "home.toml"]
+    done = hearthlog("alerts", "replay", two_days / "logs", *options)
+    result = json.loads(done.stdout)
+    assert result["start"] == "2026-03-02T13:00:00.000+01:00"
+    assert result["rules"]["coughs"] == []
+    assert [ring["known"] for ring in result["rules"]["no speech"]] == [False]
+
+
+def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(
+    two_days, hearthlog, tmp_path
+):
+    shutil.copytree(two_days, tmp_path / "home")
+    log = find_logs(tmp_path / "home" / "logs")[10]
+    log.write_bytes(log.read_bytes()[:100])
+    options = ["--config", two_days / "home.toml"]
+    done = hearthlog("alerts", "replay", tmp_path / "home" / "logs", *options)
+    assert done.returncode == 3
+    assert str(log) in done.stderr
+    assert "coughs     more_than      1" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "status", "says"),
+    [
+        ("", [], 2, "has no rule; docs/alerts.md says how"),
+        (f'node = "flat"\n{CONFIG}', [], 1, "no logs of the recorder 'flat' (node in the"),
+        (CONFIG, ["--end", "2026-01-01"], 2, "--start and --end leave nothing"),
+        (CONFIG + "loud = 1\n", [], 2, "unknown key"),
+        (CONFIG, ["--timezone", "Europe/Atlantis"], 1, "is no time zone"),
+    ],
+)
+def test_a_replay_of_what_makes_no_sense_is_one_line(  # noqa: PLR0913, PLR0917
+    content, options, status, says, two_days, hearthlog, tmp_path
+):
+    (tmp_path / "home.toml").write_text(content)
+    options = ["--config", tmp_path / "home.toml", *options]
+    done = hearthlog("alerts", "replay", two_days / "logs", *options)
+    assert (done.returncode, done.stdout) == (status, "")
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1

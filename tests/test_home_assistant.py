@@ -1,0 +1,297 @@
+"""A real Home Assistant shows what a recorder hears, and its automations act on it."""
+
+import json
+import re
+import signal
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import pytest
+import yaml
+from brokers import Broker, Listener
+from homeassistant import HomeAssistant, Household, end, hass_of, versions, wait_for
+
+pytestmark = pytest.mark.timeout(600)
+
+DEVICE = "Hearthlog home mic"
+ON, SENSOR = "binary_sensor.hearthlog_home_mic_", "sensor.hearthlog_home_mic_"
+EVENT = "event.hearthlog_home_mic_event"
+GENERAL = {
+    "music": "music",
+    "speech": "talking",
+    "phone_ring": "telephone_ringing",
+    "coughing": "coughing",
+    "yelling": "shouting",
+    "objects_activity": "household_sounds",
+    "unknown": "not_sure",
+}
+BATHROOM = {
+    "flushing_water": "toilet_flush",
+    "tap_water": "water_tap",
+    "other": "other_sounds",
+    "unknown": "not_sure",
+}
+ALWAYS = {f"{ON}{name}" for name in ("listening", "recorder", "problem")}
+PAGE = Path(__file__).parents[1] / "docs" / "home-assistant.md"
+HARMLESS = (  # of a Home Assistant without all of its packages
+    "homeassistant.bootstrap",
+    "aiohttp_fast_zlib",
+    "homeassistant.components.camera.img_util",
+)
+
+
+def entities_of(classes):
+    """Name the entities of a microphone whose model has these classes."""
+    always = {*ALWAYS, f"{ON}any_sound", f"{SENSOR}heard", f"{SENSOR}level", EVENT}
+    counts = "today", "last_night", "last_heard"
+    return (
+        always
+        | {f"{ON}{name}" for name in classes.values()}
+        | {f"{SENSOR}{name}_{kind}" for name in classes.values() for kind in counts}
+    )
+
+
+@pytest.fixture(scope="module", params=versions())
+def home(request, tmp_path_factory):
+    """A Home Assistant, and a home in which somebody coughs every half minute."""
+    hass = hass_of(request.param)
+    folder = tmp_path_factory.mktemp("home_assistant")
+    broker = Broker(folder)
+    home = HomeAssistant(hass, folder / "ha")
+    home.household = Household(folder / "home", broker.port)
+    try:
+        home.household.record()
+        home.household.tell()
+        home.connect(broker.port)
+        with Listener(broker.port, "lab/#") as home.told:
+            wait_for(lambda: home.state(f"{SENSOR}coughing_today") not in {None, "unknown"}, 60)
+            yield home
+    finally:
+        home.stop()
+        home.household.close()
+        broker.kill()
+
+
+def is_well(home):
+    """Tell whether all entities of the general model are there, and available."""
+    states = home.states()
+    return states.keys() == entities_of(GENERAL) and not any(
+        each["state"] == "unavailable" for each in states.values()
+    )
+
+
+def device_id(home):
+    """Return what Home Assistant calls the device."""
+    devices = home.ask(type="config/device_registry/list")
+    (found,) = [each for each in devices if each["name"] == DEVICE]
+    assert found["manufacturer"] == "hearthlog"
+    return found["id"]
+
+
+def triggers(home):
+    """Return what the device offers as a trigger of MQTT: type and subtype."""
+    offered = home.ask(type="device_automation/trigger/list", device_id=device_id(home))
+    return {(each["type"], each["subtype"]) for each in offered if each["domain"] == "mqtt"}
+
+
+def publishes(topic, payload):
+    """Return an action that says something to the broker."""
+    return [{"action": "mqtt.publish", "data": {"topic": topic, "payload": payload}}]
+
+
+def test_everything_that_is_heard_is_an_entity_of_one_device(home):
+    wait_for(lambda: is_well(home), 60)
+    wait_for(lambda: home.state(f"{SENSOR}coughing_today") != "0", 60)
+    device = device_id(home)
+    registry = home.ask(type="config/entity_registry/list")
+    assert {each["entity_id"] for each in registry if each["device_id"] == device} == entities_of(
+        GENERAL
+    )
+    states = home.states()
+    assert states[f"{ON}recorder"]["state"] == states[f"{ON}listening"]["state"] == "on"
+    assert states[f"{ON}problem"]["state"] == "off"
+    assert states[f"{ON}music"]["state"] == "off"
+    assert states[f"{SENSOR}music_today"]["state"] == "0"
+    assert states[f"{SENSOR}music_last_heard"]["state"] == "unknown"
+    assert states[f"{SENSOR}heard"]["state"] in {"silence", *GENERAL}
+    assert states[f"{SENSOR}heard"]["attributes"]["options"] == ["silence", *classes(home)]
+    last = datetime.fromisoformat(states[f"{SENSOR}coughing_last_heard"]["state"])
+    assert timedelta() < datetime.now(UTC) - last < timedelta(seconds=60)
+    event = states[EVENT]["attributes"]
+    assert event["event_type"] in GENERAL
+    assert {"id", "start", "end", "seconds", "confidence"} < event.keys()
+    assert event["event_types"] == classes(home)
+
+
+def classes(home):
+    return home.states()[EVENT]["attributes"]["event_types"]
+
+
+def test_a_sound_can_be_chosen_as_a_trigger_of_the_device_and_it_fires(home):
+    heard = {("heard", name.replace("_", " ").capitalize()) for name in GENERAL.values()}
+    assert triggers(home) == heard
+    wanted = {"trigger": "device", "domain": "mqtt", "device_id": device_id(home)}
+    home.automate(
+        "device_trigger",
+        triggers=[wanted | {"type": "heard", "subtype": "Coughing"}],
+        actions=publishes("lab/device", "{{ trigger.payload }}"),
+    )
+    home.automate(
+        "other_trigger",
+        triggers=[wanted | {"type": "heard", "subtype": "Music"}],
+        actions=publishes("lab/music", "{{ trigger.payload }}"),
+    )
+    event = json.loads(home.told.wait_for("lab/device", seconds=60))
+    assert event["event_type"] == "coughing"
+    assert "lab/music" not in home.told.values
+
+
+def test_automations_on_the_event_and_on_the_sound_fire(home):
+    home.automate(
+        "event",
+        triggers=[{"trigger": "state", "entity_id": EVENT}],
+        conditions="{{ trigger.to_state.attributes.event_type == 'coughing' }}",
+        actions=publishes("lab/event", "{{ trigger.to_state.attributes.start }}"),
+    )
+    home.automate(
+        "sound",
+        triggers=[
+            {"trigger": "state", "entity_id": f"{ON}coughing", "from": "off", "to": "on"},
+        ],
+        actions=publishes("lab/sound", "{{ trigger.to_state.state }}"),
+    )
+    started = datetime.fromisoformat(home.told.wait_for("lab/event", seconds=60))
+    assert timedelta() < datetime.now(UTC) - started < timedelta(seconds=30)
+    assert home.told.wait_for("lab/sound", seconds=60) == "on"
+
+
+def test_counts_and_times_are_numbers_and_times_for_long_term_statistics(home):
+    listed = home.ask(type="recorder/list_statistic_ids")
+    kept = {each["statistic_id"]: each for each in listed}
+    for name in GENERAL.values():
+        for kind in ("today", "last_night"):
+            assert kept[f"{SENSOR}{name}_{kind}"]["has_sum"]
+    assert home.ask(type="recorder/validate_statistics") == {}
+
+
+def test_a_blueprint_notifies_of_a_sound_that_is_heard_again_and_again(home):
+    use = {"path": "hearthlog/notify_on_sound.yaml"}
+    often = {"sound": f"{ON}coughing", "times": 2, "minutes": 2, "cooldown": 1}
+    rare = often | {"times": 4, "minutes": 1}
+    for name, given in (("often", often), ("rare", rare)):
+        notify = publishes(f"lab/{name}", "{{ message }}")
+        home.automate(name, use_blueprint=use | {"input": given | {"notify": notify}})
+    text = home.told.wait_for("lab/often", seconds=120)
+    assert text == "Hearthlog home mic Coughing: 2 times within 2 minutes"
+    time.sleep(50)  # two coughs that are of the cooldown
+    assert len(home.told.payloads("lab/often")) == 1
+    home.told.wait_until(lambda: len(home.told.payloads("lab/often")) == 2, 120)
+    assert "lab/rare" not in home.told.values
+    for name in ("often", "rare"):
+        home.forget(name)
+
+
+def test_a_blueprint_notifies_of_a_sound_that_is_not_heard(home):
+    now = datetime.now(ZoneInfo("Europe/Vienna"))
+    times = {"since": f"{now - timedelta(minutes=2):%H:%M:%S}"}
+    times["by"] = f"{now + timedelta(seconds=10):%H:%M:%S}"
+    use = {"path": "hearthlog/not_heard_by.yaml"}
+    for name in ("coughing", "music"):
+        given = {"last_heard": f"{SENSOR}{name}_last_heard", "listening": f"{ON}listening"}
+        notify = publishes(f"lab/no_{name}", "{{ message }}")
+        home.automate(name, use_blueprint=use | {"input": given | times | {"notify": notify}})
+    text = home.told.wait_for("lab/no_music")
+    since = times["since"][:5]
+    assert text.startswith(f"Hearthlog home mic Music last heard: not since {since}.")
+    time.sleep(2)
+    assert "lab/no_coughing" not in home.told.values
+    for name in ("coughing", "music"):
+        home.forget(name)
+
+
+def test_the_cards_of_the_page_show_entities_that_are_there(home):
+    (text,) = re.findall(r"^```yaml\n(type: .*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    card = yaml.safe_load(text)
+    home.ask(
+        type="lovelace/config/save",
+        config={"title": "Home", "views": [{"title": "Sounds", "cards": [card]}]},
+    )
+    shown = set(re.findall(r"\b[a-z_]+\.hearthlog_[a-z_]+", text))
+    assert shown
+    assert shown <= home.states().keys()
+
+
+def test_all_is_unavailable_while_the_recorder_is_not_running_but_for_that_it_is_not(home):
+    wait_for(lambda: is_well(home), 60)
+    assert end(home.household.recorder) == 0
+    stopped = time.monotonic()
+    wait_for(lambda: home.state(f"{ON}coughing") == "unavailable", 20)
+    assert time.monotonic() - stopped > 5
+    states = home.states()
+    assert states[f"{ON}recorder"]["state"] == states[f"{ON}listening"]["state"] == "off"
+    available = {name for name, each in states.items() if each["state"] != "unavailable"}
+    assert available == ALWAYS
+    home.household.record()
+    wait_for(lambda: is_well(home), 30)
+    assert home.state(f"{ON}listening") == "on"
+
+
+def test_all_is_unavailable_when_the_bridge_is_killed_until_there_is_one_again(home):
+    count = int(home.state(f"{SENSOR}coughing_today"))
+    end(home.household.bridge, signal.SIGKILL)
+    wait_for(lambda: {each["state"] for each in home.states().values()} == {"unavailable"}, 5)
+    home.household.tell()
+    wait_for(lambda: is_well(home), 30)
+    assert int(home.state(f"{SENSOR}coughing_today")) >= count
+
+
+def test_a_home_assistant_that_starts_again_shows_everything_and_its_automations_fire(home):
+    home.stop()
+    before = len(home.told.payloads("lab/device"))
+    home.start()
+    wait_for(lambda: is_well(home), 30)
+    assert home.state(f"{ON}recorder") == "on"
+    assert triggers(home) == {("heard", name) for name in words(GENERAL)}
+    home.told.wait_until(lambda: len(home.told.payloads("lab/device")) > before, 60)
+
+
+def words(names):
+    return {name.replace("_", " ").capitalize() for name in names.values()}
+
+
+def test_classes_that_go_with_another_model_are_gone_and_new_ones_are_there(home):
+    end(home.household.recorder)
+    home.household.record("bathroom")
+    wait_for(lambda: home.states().keys() == entities_of(BATHROOM), 40)
+    assert triggers(home) == {("heard", name) for name in words(BATHROOM)}
+    assert classes(home) == list(BATHROOM)
+    wait_for(lambda: home.state(f"{ON}toilet_flush") == "off", 20)
+
+
+def test_classes_that_went_while_there_was_no_bridge_are_gone_too(home):
+    end(home.household.recorder)
+    end(home.household.bridge, signal.SIGKILL)
+    home.household.record()
+    time.sleep(5)
+    home.household.tell()
+    wait_for(lambda: is_well(home), 60)
+    assert triggers(home) == {("heard", name) for name in words(GENERAL)}
+    wait_for(lambda: home.state(f"{SENSOR}coughing_today") not in {"0", "unknown"}, 60)
+
+
+def test_what_is_gone_does_not_come_back_when_home_assistant_starts_again(home):
+    home.stop()
+    home.start()
+    wait_for(lambda: is_well(home), 30)
+
+
+def test_home_assistant_has_nothing_to_complain_of(home):
+    complaints = [
+        line
+        for line in home.log.splitlines()
+        if re.search(r" (WARNING|ERROR|CRITICAL) ", line)
+        and not any(f"[{name}]" in line for name in HARMLESS)
+    ]
+    assert complaints == []
